@@ -1,7 +1,7 @@
 """retrim: re-train neural flight policies in seconds, in flight.
 
-Pretrain a policy in a differentiable simulator and fly it on a plant. In flight, learn the error of the simulator from
-the last seconds, re-train the policy in the corrected simulator, and replace it while the vehicle keeps flying.
+Pretrain a policy in a differentiable simulator and fly it on a plant. In flight, learn the simulator's error from the
+last few seconds, re-train the policy in the corrected simulator, and replace it while the vehicle keeps flying.
 
 Names are imported on first use, so that ``import retrim`` is fast. ``__init__.pyi`` lists them.
 """
@@ -12,10 +12,10 @@ from importlib.metadata import version
 
 import lazy_loader
 
-# These variables only matter if they are set before the first import of the package that reads them; values set by the
-# user are kept. XLA logs every program that its compile cache loads on a machine with different tuning flags.
+# These variables take effect only if they are set before the first import of the package that reads them. Values set by
+# the user are kept. XLA logs every program that its compile cache loads on a machine with different tuning flags.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-# The plant crazyflow needs SciPy with the array API, and reports an error if SciPy was imported before.
+# The crazyflow plant needs SciPy's array API, and reports an error if SciPy was imported before this variable was set.
 if "scipy" not in sys.modules:
     os.environ.setdefault("SCIPY_ARRAY_API", "1")
 

@@ -1,7 +1,7 @@
-"""Exceptions of retrim, with a common base class. Each message is one line of limited length."""
+"""Exceptions that retrim raises, with a common base class. Each message is one line of limited length."""
 
 LONGEST = 480
-"""Maximum length of a message [characters]; invalid input can have megabytes."""
+"""Maximum length of a message [characters]; invalid input can be megabytes long."""
 CUT = " ... "
 
 
@@ -14,10 +14,10 @@ class RetrimError(Exception):
 
 
 def one_line(text: str, most: int = LONGEST) -> str:
-    """Return a text as one printable line: control characters are escaped, and the middle of a long text is omitted.
+    """Return a text as one printable line, with control characters escaped and the middle of a long text omitted.
 
     Args:
-        text: Any text, also from an untrusted source.
+        text: Any text, even from an untrusted source.
         most: Maximum length of the line [characters].
     """
     if len(text) > 4 * most:  # escaping megabytes is slow
@@ -30,12 +30,12 @@ def one_line(text: str, most: int = LONGEST) -> str:
 
 
 def printable(text: str) -> str:
-    """Escape the control characters of a text, except line feeds, so that it cannot control a terminal."""
+    """Escape the control characters in a text, except line feeds, so that it cannot control a terminal."""
     return "".join(sign if sign.isprintable() or sign == "\n" else ascii(sign)[1:-1] for sign in text)
 
 
 def excerpt(value: object, most: int = 60, *, quotes: bool = True) -> str:
-    """Return a value from a file for a message: in quotation marks, escaped, and shortened.
+    """Return a value from a file, quoted, escaped and shortened for a message.
 
     Args:
         value: Any value.
@@ -52,7 +52,7 @@ class ConfigError(RetrimError, ValueError):
 
 
 class FrameError(ConfigError):
-    """A task, observation or controller that cannot be rotated into another frame."""
+    """A task, observation or controller that cannot be rotated into a different frame."""
 
 
 class PlantError(RetrimError, RuntimeError):
@@ -60,11 +60,11 @@ class PlantError(RetrimError, RuntimeError):
 
 
 class JobError(RetrimError, RuntimeError):
-    """Work that was sent to another process failed there, or no process could be reached to do it."""
+    """Work sent to another process failed there, or no process could be reached."""
 
 
 class MessageError(RetrimError, ValueError):
-    """Bytes that must not be used: they are truncated, damaged, of another kind, or have values that are not finite."""
+    """Bytes that must not be used: they are truncated or damaged, have the wrong kind, or are not finite."""
 
 
 class CheckpointError(RetrimError, ValueError):
@@ -72,8 +72,8 @@ class CheckpointError(RetrimError, ValueError):
 
 
 class LogError(RetrimError, ValueError):
-    """A flight log that cannot be read, or whose columns cannot have the meaning that the column map states."""
+    """A flight log that cannot be read, or whose columns cannot have the meaning stated in the column map."""
 
 
 class TrainingError(RetrimError, RuntimeError):
-    """Training that failed: its loss is not a number."""
+    """Training failed because its loss is not a number."""

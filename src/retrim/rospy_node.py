@@ -1,4 +1,4 @@
-"""Find rospy and start its node. rospy is a system package (Debian: ``python3-rospy``), not one of a package index.
+"""Find rospy and start its node. rospy is a system package (Debian: ``python3-rospy``); it is not on package indexes.
 
 No other file imports rospy.
 """
@@ -15,14 +15,14 @@ from urllib.parse import urlparse
 from .errors import ConfigError
 
 SYSTEM = Path("/usr/lib/python3/dist-packages")
-"""Package folder of Debian, which virtual environments do not search."""
+"""Debian's package folder, which virtual environments do not search."""
 
 
 def join(master: str) -> Any:
     """Make this process a ROS 1 node, unless it is one already, and return rospy.
 
     Args:
-        master: Address of the rosmaster, as ``http://127.0.0.1:11311``.
+        master: Address of the rosmaster, such as ``http://127.0.0.1:11311``.
 
     Raises:
         ConfigError: rospy is not installed, or the rosmaster cannot be reached.
@@ -41,7 +41,7 @@ def join(master: str) -> Any:
 
 
 def system_module(name: str) -> ModuleType:
-    """Return a ROS module; system packages are searched after those of the environment.
+    """Return a ROS module, searching system packages after those of the environment.
 
     Raises:
         ConfigError: The module is not installed.

@@ -22,7 +22,7 @@ def ending_signals() -> list[signal.Signals]:
 
 @contextlib.contextmanager
 def handled_by(handler: Handler) -> Iterator[None]:
-    """Call a function on the signals that end a command. This works in the main thread, and has no effect in others."""
+    """Call a function on each signal that ends a command; outside the main thread, this has no effect."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -41,7 +41,7 @@ def handled_by(handler: Handler) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stopped_by(stop: threading.Event) -> Iterator[None]:
-    """Make the signals set ``stop`` and raise KeyboardInterrupt; ``stop`` stays set if JAX swallows the exception."""
+    """Make ending signals set ``stop`` and raise KeyboardInterrupt; it stays set if JAX swallows the exception."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -60,7 +60,7 @@ def stopped_by(stop: threading.Event) -> Iterator[None]:
 
 
 def leave_lost_terminal() -> None:
-    """Redirect standard outputs of a closed terminal to the null device, since writes to them would raise errors."""
+    """Redirect the standard outputs of a closed terminal to the null device, since writes would raise errors."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):
             if stat.S_ISCHR(os.fstat(descriptor).st_mode) and not os.isatty(descriptor):

@@ -1,6 +1,6 @@
 """The paper "Learning on the Fly" with retrim: its tables, ablations, learned baselines and the demonstration.
 
-retrim never imports this package. It finds the commands and the methods ``datt`` and ``raptor`` by entry points.
+retrim never imports this package. It finds the commands, and the methods ``datt`` and ``raptor``, through entry points.
 """
 
 COMMANDS = {
@@ -14,4 +14,4 @@ COMMANDS = {
         "retrim_paper.cli.gauntlet",
     ),
 }
-"""Commands of the command line: help and module, by name."""
+"""Help text and module of each command, by name."""

@@ -1,4 +1,4 @@
-"""Components of an ablation: the differences between our presets and those of the paper, one change each."""
+"""Components of an ablation: each is one difference between our presets and those of the paper."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,11 +12,11 @@ NEVER = {"update_every": 3600.0}
 
 @dataclass(frozen=True)
 class Lever:
-    """One change of a preset or of the flight method."""
+    """One change to a preset or to the flight method."""
 
     label: str
     changes: dict[str, Any] = field(default_factory=dict)
-    """Changed keys of the preset, in the format of :func:`retrim.changed`."""
+    """Changed preset keys, in the format of :func:`retrim.changed`."""
     method: str = "full"
 
 
@@ -24,7 +24,7 @@ CONTROL = (
     Lever("base policy", method="base"),
     Lever("base policy + integral action", method="base-i"),
 )
-"""Controls without learning."""
+"""Control methods without learning."""
 
 LAYERS_OFF = (
     Lever("**all levers**"),
@@ -80,4 +80,4 @@ ON: dict[str, tuple[Lever, ...]] = {
         Lever("+ lag, past commands and delay", {"actuator_tau": 0.033, "command_history": 2, "delay_ticks": 1}),
     ),
 }
-"""Components by task, each added to the preset of the paper."""
+"""Components by task, each added to the paper's preset."""

@@ -15,11 +15,11 @@ from retrim.physics.vehicle import Vehicle, small
 
 
 def conditions(preset: Preset, sensors: str = "ideal") -> dict[str, Scenario]:
-    """Return the scenarios of a preset by name: at hover, or on every reference that it was trained on.
+    """Return a preset's scenarios by name: at hover, or on every reference of its training.
 
     Args:
         preset: Preset of the policy.
-        sensors: Sensor model of every condition. If it is not ``ideal``, conditions that name their own sensors or use
+        sensors: Sensor model for every condition. If it is not ``ideal``, conditions that name their own sensors or use
             a plant without sensors are omitted.
     """
     result = _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
@@ -61,11 +61,11 @@ FLOWN = {
     "none-rough": ("none", "rough"),
     "gusts-rough": ("gusts", "rough"),
 }
-"""Conditions on each reference: disturbance and sensors."""
+"""Conditions on each reference: the disturbance and the sensors, by name."""
 
 
 def fault_conditions(preset: Preset) -> dict[str, Scenario]:
-    """Return faults of the measurements and of the vehicle by name, each combined with a small push.
+    """Return measurement and vehicle faults by name, each combined with a small push.
 
     Args:
         preset: Preset of a hover policy.
@@ -123,7 +123,7 @@ def _at_hover() -> dict[str, Scenario]:
 def _like(
     like: Vehicle, name: str, *, mass: float = 1.0, thrust: float = 1.0, inertia: float = 1.0, motor_tau: float = 1.0
 ) -> VehicleSpec:
-    """Return a scaled copy of a vehicle. Arguments are factors; the propellers are derived from the thrust."""
+    """Return a scaled copy of a vehicle; the numbers are factors, and the propellers are derived from the thrust."""
     return VehicleSpec(
         name=name,
         mass=mass * float(like.mass),
@@ -142,7 +142,7 @@ def _three(values: Array) -> tuple[float, float, float]:
 
 
 def _random_vehicle(like: Vehicle, n: int) -> VehicleSpec:
-    """Return a vehicle with 0.7 to 1.6 times the mass of another one, and random inertia, thrust and motor lag."""
+    """Return a vehicle with 0.7 to 1.6 times the mass of ``like``, and random inertia, thrust and motor lag."""
     draw = np.random.default_rng(n)
     mass = float(draw.uniform(0.7, 1.6))
     inertia, thrust, motors = mass * draw.uniform(0.8, 1.25), draw.uniform(0.8, 1.2), draw.uniform(0.7, 2.0)

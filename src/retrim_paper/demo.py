@@ -1,4 +1,4 @@
-"""Demonstration of the whole loop in a minute: pretrain, push, adapt, another vehicle; tables and pictures."""
+"""Demonstration of the whole loop in a minute: pretrain, push, adapt, and fly a second vehicle."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from .tables.hover import PAPER
 from .tables.levels import LEVELS, level_table
 
 SHOWN = ("base", "full")
-MOST = 4  # starts of the second quadrotor
+MOST = 4  # largest number of starts for the second quadrotor
 WHY = {
     "hover/retrim": "an observer answers within milliseconds; a closed-form residual and short updates follow",
     "hover/fast": "the paper's loop with a command delay in the model, trained in seconds",
@@ -38,7 +38,7 @@ class Shown(NamedTuple):
     tables: list[TableSection]
     pictures: list[Path]
     best: Path
-    """The picture to look at first."""
+    """Picture to look at first."""
 
 
 def demonstrate(
@@ -49,17 +49,17 @@ def demonstrate(
     Then a policy for many vehicles flies a second quadrotor, whose rate loop is slow.
 
     Args:
-        name: Preset of a hover policy.
-        plant: Plant of the flights.
+        name: Preset for a hover policy.
+        plant: Plant for the flights.
         run: Run whose folder receives the results.
         reporter: Receives lines and progress.
         seconds: Length of a flight.
         starts: Flights per disturbance and method.
-        seed: Seed of training, starts and flights.
+        seed: Seed for training, starts and flights.
         slow: Whether the second quadrotor is flown.
 
     Returns:
-        Tables and pictures; None if pretraining was interrupted.
+        The tables and pictures; None if pretraining was interrupted.
 
     Raises:
         ConfigError: A name does not exist, or a size is out of range.

@@ -34,17 +34,17 @@ from retrim.runtime.together import fly_together
 PUSH, PLANT = "push-x=2", "bem"  # the paper's push: 2 m/s^2 along +x
 ROLLOUTS, ROLLOUT_S = 50, 3.0
 FIT_EPOCHS, POLICY_EPOCHS, ENVS = 200, 100, 100
-CHUNK = 10  # epochs of one program
+CHUNK = 10  # epochs per program
 SCORED_S = 10.0  # [s]
 
 
 class Choice(NamedTuple):
-    """A way to simulate and to differentiate."""
+    """A way to simulate and differentiate."""
 
     rotors: bool
-    """Whether the model has rotors, thrust map, drag and rate controller, at 1 kHz; otherwise it is a point mass."""
+    """Whether the model has rotors, a thrust map, drag and a rate controller at 1 kHz; otherwise it is a point mass."""
     own_gradient: bool
-    """Whether the gradient is that of the simulated model; otherwise it is the point mass's."""
+    """Whether the gradient comes from the simulated model; otherwise it comes from the point mass."""
     backprop: bool
     """Whether gradients flow through the residual, too."""
 
@@ -60,18 +60,18 @@ CHOICES = {
 
 
 class Trained(NamedTuple):
-    """Result of one choice."""
+    """Training result for one choice."""
 
     policy: AbstractPolicy
     compile_s: float
     epoch_s: list[float]
-    """Mean time of an epoch in each program that was run [s]."""
+    """Mean epoch time in each executed program [s]."""
     residual_rms: float
     """Root mean square error of the residual fit [m/s^2]."""
 
 
 def flown(setup: Setup, policy: AbstractPolicy, n: int, seconds: float, seed: int) -> list[Log]:
-    """Fly a policy without learning from random starts, on the study's plant, as one batch."""
+    """Fly a policy from random starts without learning, on the study's plant, as one batch."""
     plants = [Scenario(PUSH, PLANT).make(setup.preset.vehicle, dt=setup.preset.dt) for _ in range(n)]
     controller = PolicyController(setup.flight_task.observation_in_flight, policy)
     return fly_together(
@@ -83,12 +83,12 @@ def flown(setup: Setup, policy: AbstractPolicy, n: int, seconds: float, seed: in
 
 
 def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDynamics[Any]:
-    """Return the model of a choice, for simulation and for the gradient.
+    """Return the model for a choice, used for simulation and for the gradient.
 
     Args:
         setup: Vehicle and control period.
-        residual: Residual that was fitted to the simulated model.
-        choice: Way to simulate and to differentiate.
+        residual: Residual fitted to the simulated model.
+        choice: Way to simulate and differentiate.
     """
     simple = PointMass(setup.preset.dt)
     forward = Hybrid(_nominal(setup, choice), residual, backprop=choice.backprop)
@@ -99,16 +99,16 @@ def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDyna
 
 def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Key[Array, ""], choice: Choice, *,
               fit_epochs: int = FIT_EPOCHS, epochs: int = POLICY_EPOCHS, envs: int = ENVS) -> Trained:  # fmt: skip
-    """Fit one residual network to flights, and re-train the policy with it.
+    """Fit one residual network to flights and re-train the policy with it.
 
     Args:
-        setup: Preset of the policy.
-        policy: Policy that training starts from.
+        setup: Set-up of the policy.
+        policy: Policy from which training starts.
         logs: Logs of the flights.
         key: Random key; consumed.
-        choice: Way to simulate and to differentiate.
-        fit_epochs: Epochs of the residual network.
-        epochs: Epochs of the policy; a multiple of ten.
+        choice: Way to simulate and differentiate.
+        fit_epochs: Training epochs for the residual network.
+        epochs: Training epochs for the policy; a multiple of ten.
         envs: Roll-outs per epoch.
     """
     k_fit, k_train = random.split(key)
@@ -124,7 +124,7 @@ def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Ke
     optimiser = _of_policy(adapt.learning_rate, adapt.max_grad_norm or math.inf, epochs)
     state = PolicyState(policy, optimiser.init(policy.params))
     times = list[float]()
-    for k in random.split(k_train, 1 + epochs // CHUNK):  # the first one compiles, and is not kept
+    for k in random.split(k_train, 1 + epochs // CHUNK):  # the first run compiles; its result is discarded
         began = time.perf_counter()
         after, _ = jax.block_until_ready(train_chunk(state, env, k, optimiser, CHUNK, envs))
         times.append(time.perf_counter() - began)
@@ -140,15 +140,15 @@ def _nominal(setup: Setup, choice: Choice) -> AbstractDynamics[Any]:
 
 @functools.cache
 def _adam(learning_rate: float) -> optax.GradientTransformation:
-    """Return Adam, the same object for the same rate, so that programs with it are compiled once."""
+    """Return Adam; the same rate gives the same object, so programs that use it are compiled once."""
     return optax.adam(learning_rate)
 
 
 @functools.cache
 def _of_policy(learning_rate: float, max_grad_norm: float, epochs: int) -> optax.GradientTransformation:
-    """Return the optimiser of the policy, cached so that its programs are compiled once.
+    """Return the policy optimiser, cached so that its programs are compiled once.
 
-    The preset's gradient clipping, then Adam with a rate that falls to zero, as in updates in flight.
+    It applies the preset's gradient clipping, then Adam with a rate that falls to zero, as updates in flight do.
     """
     rate = optax.cosine_decay_schedule(learning_rate, epochs)
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(rate))
@@ -156,7 +156,7 @@ def _of_policy(learning_rate: float, max_grad_norm: float, epochs: int) -> optax
 
 @eqx.filter_jit
 def _rows(windows: Window, nominal: AbstractDynamics[Any], delay_ticks: int) -> Targets:
-    """Return the targets of many windows (leading axis), concatenated."""
+    """Return the concatenated targets of many windows (leading axis)."""
     many = jax.vmap(lambda window: residual_targets(window, nominal, delay_ticks=delay_ticks))(windows)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), many)  # type: ignore[no-any-return]
 

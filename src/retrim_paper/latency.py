@@ -1,4 +1,7 @@
-"""Latency of messages between two processes. ``python -m retrim_paper.latency`` is the sending process."""
+"""Latency of messages between two processes.
+
+``python -m retrim_paper.latency`` runs the sending process.
+"""
 
 import os
 import shutil
@@ -18,16 +21,16 @@ from retrim.transport.shared_memory import SharedMemoryBus
 
 SIZES = {"a measurement": 500, "the policy of hover/retrim": 74_000, "the policy of hover/paper": 1_100_000}
 """Size of each kind of message [bytes]."""
-COUNT = 200  # messages of each size
-EVERY = 0.02  # [s] between two messages
+COUNT = 200  # number of messages of each size
+EVERY = 0.02  # [s], time between two messages
 TOPICS = {"message": 2_000_000}
-FIRST = 10  # first messages, which do not count: connections are being made
-JOINED = 0.5  # [s], time for both ends to find each other
-LONGEST, ANSWERS = 60.0, 20.0  # [s], time limits: all messages of a size arrive, a rosmaster answers
+FIRST = 10  # number of first messages that do not count, since connections are still being made
+JOINED = 0.5  # [s], time in which both ends find each other
+LONGEST, ANSWERS = 60.0, 20.0  # [s], time limits for all messages of a size, and for a rosmaster's answer
 
 
 def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
-    """Return the latencies of messages [s], by the monotonic clock that both processes share.
+    """Return the message latencies [s], measured by the monotonic clock that both processes share.
 
     Args:
         bus: Receiving end of the bus.
@@ -53,7 +56,7 @@ def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
 
 
 def write(bus: Bus, size: int) -> None:
-    """Send messages that contain their time of sending."""
+    """Send messages that contain their send times."""
     time.sleep(JOINED)
     rest = bytes(size - 16)
     for number in range(FIRST + COUNT):
@@ -64,7 +67,7 @@ def write(bus: Bus, size: int) -> None:
 
 
 def free_port() -> int:
-    """Return an unused port of the loopback address."""
+    """Return an unused port at the loopback address."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])
 
@@ -95,9 +98,9 @@ def rosmaster() -> Iterator[Address | None]:
 
 @contextmanager
 def two_machines() -> Iterator[tuple[str, Sequence[str]] | None]:
-    """Create a second network namespace, with a virtual cable to this one.
+    """Create a second network namespace with a virtual cable to this one.
 
-    Yield the address of this namespace, and the words that run a command in the other; None without permission.
+    Yield the address of this namespace and the words that run a command in the other one, or None without permission.
     """
     name, inside = f"retrim{os.getpid()}", ("ip", "netns", "exec", f"retrim{os.getpid()}")
     here, there = f"rt{os.getpid() % 10**6}a", f"rt{os.getpid() % 10**6}b"
@@ -121,7 +124,7 @@ def two_machines() -> Iterator[tuple[str, Sequence[str]] | None]:
 
 
 def other_process(where: str) -> list[str]:
-    """Return the command of the other process, without the size; ``where`` is a folder or an address."""
+    """Return the command for the other process, without the size; ``where`` is a folder or an address."""
     return [*PYTHON, "retrim_paper.latency", where]
 
 

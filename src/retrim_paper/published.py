@@ -1,4 +1,4 @@
-"""Figures of the blade-element plant compared with published ones."""
+"""Comparison of the blade-element plant's figures with published ones."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ GOLDEN_HOVER = (
 
 
 def published() -> list[dict[str, Any]]:
-    """Return our figures with the published ones."""
+    """Return our figures next to the published ones."""
     big, little = five_inch(), three_inch()
     still = Settled(big, 1109.15, 0.0, 0.0)
     low = Settled(little, 1548.8, 0.0, 0.0)
@@ -56,12 +56,12 @@ class Settled:
 
 @eqx.filter_jit
 def settled_rotor(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> tuple[BladeForces, Inflow]:
-    """Return forces and inflow of a rotor in steady air.
+    """Return the forces and the inflow of a rotor in steady air.
 
     Args:
         prop: Propeller of the rotor.
-        omega: Speed of the rotor [rad/s].
-        v_hor: Speed of the air in the rotor plane [m/s].
+        omega: Rotor speed [rad/s].
+        v_hor: Air speed in the rotor plane [m/s].
         v_ver: Speed along the rotor axis, positive when descending [m/s].
     """
     return rotor(prop, omega, v_hor, v_ver, Inflow.above(omega.dtype), steps=16)

@@ -1,4 +1,4 @@
-"""Second part of the demonstration: a quadrotor with a rate loop of 100 ms, which no method knows."""
+"""Second part of the demonstration: a quadrotor with a 100 ms rate loop, which is unknown to the methods."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ LABELS = {"base": "policy for a faster vehicle", "indi": "INDI", "base-id": "pol
 
 
 def slow_quadrotor() -> VehicleSpec:
-    """Return a quadrotor like the small one, with body rates that lag by 100 ms (yaw: 200 ms)."""
+    """Return a quadrotor like the small one, but with body rates that lag by 100 ms (yaw: 200 ms)."""
     like = small()
     inertia, rates, drag = (tuple(np.asarray(each).tolist()) for each in (like.inertia, like.omega_max, like.drag_area))
     return VehicleSpec(
@@ -52,12 +52,12 @@ def slow_quadrotor() -> VehicleSpec:
 
 
 class Entrant(NamedTuple):
-    """A method of the comparison."""
+    """A method in the comparison."""
 
     study: Study
     method: str
     vehicle: str
-    """Knowledge of the method about the vehicle."""
+    """What the method is told about the vehicle."""
 
 
 class SlowVehicle(NamedTuple):
@@ -71,18 +71,18 @@ class SlowVehicle(NamedTuple):
 def fly_slow_vehicle(
     known: Study, family: Preset, run: Run, reporter: Reporter, *, starts: int, seed: int
 ) -> SlowVehicle | None:
-    """Fly a quadrotor with a slow rate loop: a policy for another vehicle, INDI, and a policy for many vehicles.
+    """Fly a quadrotor with a slow rate loop by a policy for a different vehicle, INDI, and a policy for many vehicles.
 
     Args:
         known: Policy for one vehicle.
-        family: Preset of a policy for many vehicles; it is trained here.
+        family: Preset for a policy for many vehicles, which is trained here.
         run: Run whose folder receives the picture.
         reporter: Receives lines and progress.
         starts: Flights per method.
-        seed: Seed of training, starts and flights.
+        seed: Seed for training, starts and flights.
 
     Returns:
-        Table, rows and pictures; None if the run was interrupted.
+        The table, the rows and the pictures; None if the run was interrupted.
     """
     scenario = Scenario(PUSH, plant="second-order", vehicle=slow_quadrotor(), delay=DELAY)
     reporter.say(f"a second quadrotor: body rates lag by 100 ms, commands by {1000 * DELAY:.0f} ms; no method knows it")

@@ -1,4 +1,4 @@
-"""Rolling buffer of the last seconds of flight."""
+"""Rolling buffer of the last few seconds of flight."""
 
 from collections import deque
 from typing import Any
@@ -17,7 +17,7 @@ class RollingBuffer:
     def __init__(self, size: int) -> None:
         if size < 2:
             raise ValueError(f"RollingBuffer: size = {size} must be at least 2, for one difference of velocity")
-        # NumPy leaves: each tick is converted once, and not again for every window that contains it.
+        # The leaves are NumPy arrays: each tick is converted once, and not again for every window that contains it.
         self._rows: deque[tuple[float, float, list[np.ndarray]]] = deque(maxlen=size)
         self._structure: Any = None
         self._size = size
@@ -26,7 +26,7 @@ class RollingBuffer:
         return len(self._rows)
 
     def push(self, t: float, x: State, u: Command, age: float = 0.0) -> None:
-        """Append the measured state at the tick of time ``t`` [s], its ``age`` [s], and the command issued at it."""
+        """Append the state measured at time ``t`` [s], its ``age`` [s], and the command issued at this tick."""
         leaves, self._structure = jax.tree.flatten((x, u))
         self._rows.append((t, age, [np.asarray(leaf) for leaf in leaves]))
 
@@ -41,7 +41,7 @@ class RollingBuffer:
         self._rows.clear()
 
     def window(self) -> Window:
-        """Return a snapshot of fixed shape; while it fills, copies of the oldest tick, marked invalid, come first.
+        """Return a snapshot of fixed shape; while the buffer fills, invalid copies of the oldest tick come first.
 
         Raises:
             ValueError: The buffer is empty.

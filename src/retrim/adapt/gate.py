@@ -1,4 +1,4 @@
-"""The gate: a re-trained policy must be finite, and not worse than the current one, before it may fly."""
+"""The gate: to fly, a re-trained policy must be finite and not worse than the current one."""
 
 from typing import Any
 
@@ -21,14 +21,14 @@ class Verdict(eqx.Module):
     finite: Bool[Array, ""]
     """True if all weights of the candidate are finite."""
     candidate: Float[Array, ""]
-    """Cost of the candidate: minus the mean reward of its roll-outs."""
+    """Cost of the candidate: the negative mean reward of its roll-outs."""
     incumbent: Float[Array, ""]
     """Cost of the policy in flight."""
     trusted: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.array(True))
-    """True if enough measurements of the window are consistent with each other."""
+    """True if enough measurements in the window are consistent with each other."""
 
     def provided(self, trusted: Bool[Array, ""]) -> "Verdict":
-        """Return the verdict that admits the candidate only if the measurements are trusted, too."""
+        """Return a verdict that admits the candidate only if the measurements are also trusted."""
         return Verdict(self.admitted & trusted, self.finite, self.candidate, self.incumbent, trusted)
 
     def reason(self) -> str:

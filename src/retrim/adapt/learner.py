@@ -1,4 +1,4 @@
-"""The online learner: pure functions of a window of flight, without state of its own and without a clock."""
+"""The online learner: pure functions of a window of flight, without internal state and without a clock."""
 
 import dataclasses
 from typing import Any
@@ -37,9 +37,9 @@ VEHICLES = 2**30 + 5  # folded into the keys of starts to draw the vehicles at t
 class OnlineLearner(eqx.Module):
     """Learner from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array.
 
-    A custom learner is a subclass that overrides :meth:`retrain`, the training inside of the corrected model, or
+    A custom learner is a subclass. It overrides :meth:`retrain`, which trains in the corrected model, or
     :meth:`worker`, for a learner that JAX cannot trace. A function of a :class:`~retrim.LearnerRequest` builds it, and
-    ``adapt.learner`` of the preset names the function.
+    the preset names this function in ``adapt.learner``.
 
     Example::
 
@@ -52,14 +52,14 @@ class OnlineLearner(eqx.Module):
     """
 
     env: Env
-    """Task of the flight, nominal model and its delay; the model is independent of the plant."""
+    """The task of the flight, the nominal model and its delay; the model is independent of the plant."""
     residual_model: ResidualModel
     optimiser: AbstractPolicyOptimiser
     """Optimiser that re-trains the policy."""
     plant_delay_ticks: int = eqx.field(static=True)
     """Declared command delay of the plant [ticks], to pair accelerations with the commands that caused them."""
     num_updates: int = eqx.field(static=True)
-    """Optimiser steps of one policy update."""
+    """Optimiser steps per policy update."""
     num_envs: int = eqx.field(static=True)
     """Starts per optimiser step."""
     starts: AbstractStarts = TaskStarts()
@@ -71,10 +71,10 @@ class OnlineLearner(eqx.Module):
     vehicles: AbstractVehicles = OwnVehicle()
     """Vehicle of the flight: that of the model, or an identified one."""
     low_rank_optimiser: AbstractPolicyOptimiser | None = None
-    """Optimiser that re-trains a low-rank delta, of the same kind as ``optimiser``; None for ``optimiser`` itself."""
+    """Optimiser for a low-rank delta, of the same kind as ``optimiser``; None for ``optimiser`` itself."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` for sizes that cannot work."""
+        """Raise ``ValueError`` for invalid sizes."""
         for name in ("num_updates", "num_envs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"OnlineLearner.{name} = {getattr(self, name)} must be at least 1")
@@ -88,16 +88,16 @@ class OnlineLearner(eqx.Module):
 
     @eqx.filter_jit
     def fit_residual(self, state: Any, window: Window) -> tuple[Any, FitReport]:
-        """Fit the residual model to a window, starting from the last fit.
+        """Fit the residual model to a window, starting from the previous fit.
 
-        Measurements that contradict each other are left out. If they are more than half, the fit is not accepted.
+        Measurements that contradict each other are left out. If they make up more than half, the fit is not accepted.
 
         Args:
             state: State of the residual model.
             window: Ticks of flight.
 
         Returns:
-            The new state, or ``state`` if the fit is not finite or had no data, and a report.
+            The new state, or ``state`` if the fit is not accepted, and a report.
         """
         screening, delay = screen(window, self.env.dynamics.dt), self.plant_delay_ticks
         window = self.vehicles.apply_path(window)
@@ -118,9 +118,9 @@ class OnlineLearner(eqx.Module):
         """Re-train the policy by back-propagation in the corrected model, and judge the result.
 
         Gradients flow through the analytical model only. The gate simulates flights from eight starts that the update
-        did not use for training: four states of the window and four random starts of the task. Measurements that
-        contradict their neighbours are not used as starts, and the gate refuses every policy while more than half of
-        the measurements are contradictory.
+        did not use for training: four states from the window and four random starts from the task. Measurements that
+        contradict their neighbours are not used as starts. While more than half of the measurements are contradictory,
+        the gate refuses every policy.
 
         Args:
             state: Policy to start from.
@@ -153,7 +153,7 @@ class OnlineLearner(eqx.Module):
         return trained, verdict.provided(screening.trusted)
 
     def retrain(self, state: PolicyState, env: Env, starts: Start, key: Key[Array, ""]) -> PolicyState:
-        """Train the policy in the corrected model by back-propagation through time; JAX traces it.
+        """Train the policy in the corrected model by back-propagation through time; JAX traces this method.
 
         Args:
             state: Policy to start from, and the state of its optimiser.
@@ -162,7 +162,7 @@ class OnlineLearner(eqx.Module):
             key: Random key, consumed.
 
         Returns:
-            The trained policy, before trim and gate; structure and shapes are those of ``state``.
+            The trained policy, before trim and gate, with the structure and shapes of ``state``.
         """
         del key
         optimiser = (isinstance(state.policy, LoraPolicy) and self.low_rank_optimiser) or self.optimiser
@@ -170,7 +170,7 @@ class OnlineLearner(eqx.Module):
         return bptt(begun, env, starts, optimiser=optimiser.transformation(self.num_updates))[0]
 
     def worker(self, layer: Layer, state: LearnerState, key: Key[Array, ""]) -> Worker | None:
-        """Return a custom worker of a layer of learning; by default None, for the built-in one.
+        """Return a custom worker for a learning layer; None, the default, selects the built-in one.
 
         Args:
             layer: ``residual`` or ``policy``.

@@ -9,7 +9,7 @@ from ..learn.bptt import PolicyState
 
 
 class LearnerState(eqx.Module):
-    """Learned policy and residual. They are separate, so that two processes can own one each."""
+    """The learned policy and residual. They are separate, so that each can be owned by its own process."""
 
     policy: PolicyState
     residual: Any
@@ -24,4 +24,4 @@ class FitReport(eqx.Module):
     accepted: Bool[Array, ""]
     """False if the fit is not finite or no tick of the window could be used; the old state is then kept."""
     contradictions: Int[Array, "5"]
-    """Steps of the window that were left out, by reason; see :class:`~retrim.learn.screening.Screening`."""
+    """Number of window steps that were left out, by reason; see :class:`~retrim.learn.screening.Screening`."""

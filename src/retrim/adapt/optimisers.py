@@ -13,14 +13,14 @@ from ..learn.bptt import PolicyState
 
 
 class AbstractPolicyOptimiser(eqx.Module):
-    """Optimiser of policy updates. Every number is an array, so that a new value does not cause a new compilation."""
+    """Optimiser of policy updates. Every number is an array, so that a new value does not trigger a recompilation."""
 
     rate: eqx.AbstractVar[Float[Array, ""]]
     max_grad_norm: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
     def transformation(self, num_updates: int) -> optax.GradientTransformation:
-        """Return the optimiser of an update of ``num_updates`` steps."""
+        """Return the optimiser for an update of ``num_updates`` steps."""
 
     @abc.abstractmethod
     def begin(self, state: PolicyState, num_updates: int) -> PolicyState:
@@ -28,7 +28,7 @@ class AbstractPolicyOptimiser(eqx.Module):
 
 
 class FreshAdam(AbstractPolicyOptimiser):
-    """Each update starts a fresh Adam, whose rate decays to zero with a cosine schedule (the paper)."""
+    """A fresh Adam for each update, whose rate decays to zero with a cosine schedule (as in the paper)."""
 
     rate: Float[Array, ""]
     """Learning rate at the start of an update."""
@@ -45,17 +45,17 @@ class FreshAdam(AbstractPolicyOptimiser):
         )
 
     def begin(self, state: PolicyState, num_updates: int) -> PolicyState:
-        """Reset the moments of the last update."""
+        """Reset the moments of the previous update."""
         return PolicyState(state.policy, self.transformation(num_updates).init(state.policy.params))
 
 
 class CarriedAdam(AbstractPolicyOptimiser):
-    """One Adam of constant rate for the whole flight, whose momentum starts from rest in each update.
+    """One Adam with a constant rate for the whole flight; its momentum starts from rest in each update.
 
-    The scale of the gradients is carried over, but their direction is not: otherwise an update that was refused, or
-    that was learned across a change of the world, would push every later one in the same direction. The first moment
-    has no bias correction, so that every update, also the first, begins gently: along a constant gradient five steps
-    move 1.3 rates.
+    The scale of the gradients is carried over, but their direction is not. Otherwise an update that was refused, or
+    that was learned across a change of the world, would push every later one in the same direction. The first moment is
+    not bias-corrected, so that every update, including the first, begins gently: along a constant gradient, five steps
+    move by 1.3 times the rate.
     """
 
     rate: Float[Array, ""]

@@ -1,4 +1,4 @@
-"""Starts of the roll-outs of an update."""
+"""Starts of an update's roll-outs."""
 
 import abc
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from ..tasks.task import AbstractTask, Start
 
 
 class AbstractStarts(eqx.Module):
-    """Draws the starts of an update."""
+    """Source of an update's starts."""
 
     @abc.abstractmethod
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
@@ -24,7 +24,7 @@ class AbstractStarts(eqx.Module):
 
 
 class TaskStarts(AbstractStarts):
-    """Starts of pretraining (the paper)."""
+    """The starts of pretraining (as in the paper)."""
 
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
         """Draw from the task."""
@@ -32,15 +32,15 @@ class TaskStarts(AbstractStarts):
 
 
 class FlownStarts(AbstractStarts):
-    """Most starts from recent states of the flight, the others from the task, so that the policy does not forget.
+    """Most starts come from recent states of the flight, the others from the task, so that the policy does not forget.
 
-    Distant starts with few environments give noisy gradients, and the resulting policy jitters by centimetres.
+    With few environments, distant starts give noisy gradients, and the resulting policy jitters by centimetres.
     """
 
     spread: Float[Array, ""]
-    """Standard deviation that is added to position [m] and velocity [m/s]."""
+    """Standard deviation of the noise that is added to position [m] and velocity [m/s]."""
     from_task: int = eqx.field(static=True, default=2)
-    """Number of environments of each step whose starts are drawn from the task."""
+    """Number of environments per step whose starts are drawn from the task."""
 
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
         """Draw from the window and from the task."""

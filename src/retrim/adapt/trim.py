@@ -1,7 +1,7 @@
 """The trim: the command of a re-trained policy at the point where the vehicle should come to rest.
 
-An update improves a policy over the next seconds, but moves its rest point by a millimetre, each time in another
-direction. The rest point does not need training: it is the point where the policy commands hover.
+An update improves a policy over the next few seconds, but moves its rest point by a millimetre, each time in a
+different direction. The rest point does not need training: it is the point where the policy commands hover.
 """
 
 import abc
@@ -32,7 +32,7 @@ class AbstractTrim(eqx.Module):
 
 
 class Untrimmed(AbstractTrim):
-    """No correction (the paper)."""
+    """No correction (as in the paper)."""
 
     def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:
         """Return the policy unchanged."""
@@ -42,8 +42,8 @@ class Untrimmed(AbstractTrim):
 class RestTrim(AbstractTrim):
     """Shifts the policy's output so that it commands hover at rest at home, with the heading of the flight.
 
-    In the frame of the effective gravity, that command keeps the vehicle there also under a disturbance. Use it for
-    tasks that rest at home and leave the heading free: the vehicle keeps its present heading.
+    In the frame of the effective gravity, this command keeps the vehicle there even under a disturbance. Use this trim
+    for tasks that rest at home and leave the heading free: the vehicle keeps its present heading.
     """
 
     def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:

@@ -28,7 +28,7 @@ class ResidualUpdate:
     state: Any
     """New state of the residual model."""
     excluded: Counts = NOTHING
-    """Number of steps that were excluded from the fit, by reason, see :class:`~retrim.learn.screening.Screening`."""
+    """Number of steps that were excluded from the fit, by reason; see :class:`~retrim.learn.screening.Screening`."""
 
     def note(self) -> str:
         """Return one line for the log."""
@@ -85,7 +85,7 @@ KINDS: dict[type, str] = {ResidualUpdate: "residual", PolicyUpdate: "policy", Re
 
 
 def pack_update(update: Update) -> bytes:
-    """Return the bytes of an update; the inverse of :func:`unpack_update`."""
+    """Return the bytes of an update; this is the inverse of :func:`unpack_update`."""
     plain = {f.name: getattr(update, f.name) for f in fields(update) if f.name != "state"}
     return wire.pack(getattr(update, "state", ()), kind=KINDS[type(update)], about={"update": json.dumps(plain)})
 
@@ -102,7 +102,7 @@ def unpack_update(data: bytes, like: LearnerState, *, source: str) -> Update:
         The update.
 
     Raises:
-        MessageError: The message is truncated, damaged, of another kind or shape, or not finite.
+        MessageError: The message is truncated or damaged, has the wrong kind or shape, or is not finite.
     """
     kind = wire.kind_of(data, source=source)
     types = {name: cls for cls, name in KINDS.items()}

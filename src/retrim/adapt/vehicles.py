@@ -1,4 +1,4 @@
-"""The vehicle of a window of flight: that of the model, or one of a family, identified from the window."""
+"""The vehicle in a window of flight: that of the model, or a member of a family, identified from the window."""
 
 import abc
 import dataclasses
@@ -19,17 +19,17 @@ from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from ..tasks.task import Start
 
-# Ticks between two estimates. Each estimate sets the noise level of the measurements after it, so fewer estimates cost
+# Ticks between two estimates. Each estimate sets the noise level for the measurements after it, so fewer estimates cost
 # accuracy.
 PIECE = 5
 
 
 class AbstractVehicles(eqx.Module):
-    """Knowledge of the learners about the vehicle."""
+    """The learners' knowledge about the vehicle."""
 
     @abc.abstractmethod
     def identify(self, window: Window) -> "Identification | None":
-        """Return the identification of the vehicle from a window; None if the vehicle is that of the model.
+        """Identify the vehicle from a window; return None if the vehicle is that of the model.
 
         Args:
             window: Ticks of flight.
@@ -74,17 +74,17 @@ class Identification(NamedTuple):
 
     belief: PathBelief
     path: CommandPath
-    """Most likely path, with the gain of the thrust."""
+    """Most likely path, including the thrust gain."""
 
 
 class IdentifiedVehicle(AbstractVehicles):
-    """A vehicle of a family. Updates train on samples of the belief about the vehicle."""
+    """A vehicle from a family; updates train on samples from the belief about the vehicle."""
 
     estimator: PathEstimator
     family: PathFamily
 
     def identify(self, window: Window) -> Identification:
-        """Return the identification of the vehicle from commands and attitudes of a window.
+        """Identify the vehicle from the commands and attitudes in a window.
 
         Args:
             window: Ticks of flight.
@@ -127,7 +127,7 @@ class IdentifiedVehicle(AbstractVehicles):
 
 
 def estimate_path(estimator: PathEstimator, window: Window) -> PathEstimate:
-    """Return the estimate of the command path from a window of flight.
+    """Estimate the command path from a window of flight.
 
     Args:
         estimator: Estimator of the path.

@@ -1,4 +1,4 @@
-"""Coordinates in which a learner trains the policy: those of the world, or of the frame of the effective gravity."""
+"""Coordinates in which a learner trains the policy: those of the world frame, or of the effective-gravity frame."""
 
 import abc
 import dataclasses
@@ -16,7 +16,7 @@ from ..physics.state import Command, State
 
 
 class AbstractView(eqx.Module):
-    """The environment of an update; the policy flies in the same coordinates."""
+    """Provides the environment of an update; the policy flies in the same coordinates."""
 
     @abc.abstractmethod
     def __call__(self, env: Env, residual: Residual) -> Env:
@@ -29,7 +29,7 @@ class AbstractView(eqx.Module):
 
 
 class WorldView(AbstractView):
-    """The coordinates of the world (the paper)."""
+    """The coordinates of the world (as in the paper)."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual, and the identified lag and bias of the body rates, to the model."""
@@ -43,19 +43,19 @@ class GravityView(AbstractView):
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model; the controller compensates it with the frame, and also a bias of the rates."""
+        """Add the residual to the model; the controller compensates for it with the frame, and also for a rate bias."""
         env = with_lag(env, turning_of(residual))
         return dataclasses.replace(env.with_residual(residual), frame_disturbance=NormLimited(residual, self.limit))
 
 
 class RestView(AbstractView):
-    """The frame of the effective gravity at rest at home, in every state: a constant frame keeps old images valid."""
+    """The frame of the effective gravity at rest at home, for every state; a constant frame keeps old images valid."""
 
     limit: Float[Array, ""]
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model; the frame compensates its value at rest, but not a bias of the rates."""
+        """Add the residual to the model; the frame compensates for its value at rest, but not for a rate bias."""
         home = env.task.home()
         d = capped(residual(State.at(home), Command.hover(home.dtype)), self.limit)
         env = as_it_turns(env, turning_of(residual))

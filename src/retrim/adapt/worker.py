@@ -1,4 +1,4 @@
-"""Interface of a worker: one layer of learning, independent of clock and process."""
+"""Interface of a worker: one learning layer, independent of clock and process."""
 
 import abc
 from typing import Any
@@ -8,10 +8,10 @@ from .updates import Layer, Update
 
 
 class Worker(abc.ABC):
-    """Computation of one layer of learning on one window.
+    """Computation of one learning layer on one window.
 
-    The state of a worker advances only when it receives its own update as published. So a result that is dropped on the
-    way (because of a new flight or a lost message) never becomes the base of the next one.
+    A worker's state advances only when the worker receives its own update after publication. A result that is dropped
+    on the way (because of a new flight or a lost message) therefore never becomes the base of the next one.
     """
 
     layer: Layer
@@ -25,7 +25,7 @@ class Worker(abc.ABC):
         """Receive a published update of this or another layer."""
 
     def follow(self, learner: Any) -> None:
-        """Continue on another reference.
+        """Continue on a different reference.
 
         Args:
             learner: Online learner of the new reference.

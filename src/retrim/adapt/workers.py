@@ -1,4 +1,4 @@
-"""The two workers of an online learner: one fits the residual, one re-trains the policy."""
+"""The two workers of an online learner: one fits the residual, and one re-trains the policy."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ def residual_update(computed_from: float, state: Any, report: FitReport) -> Resi
 
 
 def policy_update(computed_from: float, state: PolicyState, verdict: Verdict) -> PolicyUpdate | Rejection:
-    """Return the message for a finished update of the policy."""
+    """Return the message for a finished policy update."""
     if not verdict.admitted:
         return Rejection(computed_from, "policy", verdict.reason())
     return PolicyUpdate(computed_from, float(verdict.candidate), float(verdict.incumbent), state)
@@ -53,7 +53,7 @@ class ResidualWorker(Worker):
         return self._residual
 
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
-        """Fit to ``window``."""
+        """Fit the residual to ``window``."""
         with suitable_device(self._residual, 1):
             fitted, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
         return residual_update(float(window.t[-1]), fitted, report)
@@ -107,10 +107,10 @@ class PolicyWorker(Worker):
 
 
 def make_worker(learner: OnlineLearner, layer: Layer, state: LearnerState, key: Key[Array, ""]) -> Worker:
-    """Return the worker of a layer of learning.
+    """Return the worker for a learning layer.
 
     Args:
-        learner: Learner of the flight; it may have a worker of its own.
+        learner: Learner of the flight; it may provide its own worker.
         layer: ``residual`` or ``policy``.
         state: Learner state at the start of the flight.
         key: Random key, consumed.

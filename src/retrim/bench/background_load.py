@@ -1,4 +1,4 @@
-"""Measures policy updates per second during a flight: learner on one core, plant and pilot on another, in real time."""
+"""Measures policy updates per second during a real-time flight: learner on one core, plant and pilot on another."""
 
 import json
 import os
@@ -24,7 +24,7 @@ PRESET = "hover/retrim"
 
 
 def policies() -> dict[str, Any]:
-    """Fit and re-train as fast as one core permits, during a flight at 50 Hz on another; return the row.
+    """Fit and re-train as fast as one core permits, during a flight at 50 Hz on another; return the table row.
 
     Raises:
         OSError: The flight did not begin or did not continue, or the system does not let a process choose its core.

@@ -1,4 +1,4 @@
-"""Benchmarks with several vehicles at once: flights of a plant, and policy updates of a fleet."""
+"""Benchmarks with several vehicles at once: flights on a plant, and policy updates for a fleet."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +29,7 @@ Update = Callable[[Key[Array, ""]], tuple[PolicyState, Verdict]]
 
 
 def eight_flights() -> dict[str, Any]:
-    """Time eight flights of 30 s on bem; plant and policy are one program; two threads run four flights each."""
+    """Time eight flights of 30 s on bem: plant and policy are one program, and two threads run four flights each."""
     setup = Setup.from_preset("hover/fast")
     controller = PolicyController(setup.flight_task.observation_in_flight, setup.new_policy(random.key(0)))
     simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
@@ -48,17 +48,17 @@ def eight_flights() -> dict[str, Any]:
 
 
 def one_after_another() -> dict[str, Any]:
-    """Time eight updates in one program that makes them in turn; return the row of the table."""
+    """Time eight updates in one program that makes them in turn; return the table row."""
     return _as_one(lambda one, keys: lax.map(one, keys))
 
 
 def side_by_side() -> dict[str, Any]:
-    """Time eight updates in one program that makes them all at once; return the row of the table."""
+    """Time eight updates in one program that makes them all at once; return the table row."""
     return _as_one(lambda one, keys: jax.vmap(one)(keys))
 
 
 def on_threads() -> dict[str, Any]:
-    """Time eight updates of one program on two threads; return the row of the table."""
+    """Time eight updates by one program on two threads; return the table row."""
     learner, policy, fitted, window = _learnt()
     keys = random.split(random.key(0), FLEET)
 

@@ -11,7 +11,7 @@ from ..learn.window import Window
 
 
 def learner_in_flight(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Window]:
-    """Return a learner, its state before the first fit, and a full window of flight under the large disturbance."""
+    """Return a learner, its state before the first fit, and a full flight window under the large disturbance."""
     setup = Setup.from_preset(load(name))
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     return setup.learner, state, full_window(setup)

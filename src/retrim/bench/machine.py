@@ -1,4 +1,4 @@
-"""Measures the machine's own rate, so that relative figures are comparable between machines."""
+"""Measures the machine's own rate, so that relative figures can be compared between machines."""
 
 import os
 import statistics
@@ -12,14 +12,14 @@ from jax import lax
 
 ROWS, WIDTH, STEPS = 10, 512, 1000
 UNIT_FLOP = 2.0 * ROWS * WIDTH * WIDTH * STEPS
-"""Operations of a unit: a scan of 1,000 products of 10 rows with a 512 x 512 matrix, the main part of a roll-out."""
+"""Operations in a unit: a scan of 1,000 products of 10 rows and a 512 x 512 matrix, the main part of a roll-out."""
 
 
 def on_core(i: int) -> None:
     """Keep this process, and the threads that JAX will start, on one of the cores available to it.
 
     Args:
-        i: Index of the core; -1 for the last.
+        i: Index of the core; -1 for the last core.
 
     Raises:
         OSError: The system does not let a process choose its core.
@@ -41,11 +41,11 @@ def last_core() -> int:
 
 
 def unit() -> Callable[[], float]:
-    """Return a function that measures the current time of one unit [s], the median of three runs."""
+    """Return a function that measures the current time of one unit [s], as the median of three runs."""
     rows, weight = jnp.ones((ROWS, WIDTH)), jnp.full((WIDTH, WIDTH), 1.0 / WIDTH)
 
     @jax.jit
-    def scanned(x: Any, weight: Any) -> Any:  # a constant weight would get the layout of another kind of product
+    def scanned(x: Any, weight: Any) -> Any:  # a constant weight would get the layout of a different kind of product
         return lax.scan(lambda x, _: (x @ weight, None), x, None, length=STEPS)[0]
 
     jax.block_until_ready(scanned(rows, weight))
@@ -53,7 +53,7 @@ def unit() -> Callable[[], float]:
 
 
 def rates() -> dict[str, float]:
-    """Return the best rates of the machine: a large product, the product of a roll-out, and copying of memory."""
+    """Return the machine's best rates for a large product, the product of a roll-out, and a memory copy."""
     large, long = jnp.ones((2048, 2048)), jnp.ones(2**25)
     product, copy = jax.jit(lambda a: a @ a), jax.jit(lambda a: a + 1.0)
     return {

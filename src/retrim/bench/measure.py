@@ -1,4 +1,4 @@
-"""Runs each benchmark in a process of its own, and writes the document of all."""
+"""Runs each benchmark in its own process, and writes a document with all results."""
 
 import json
 import os
@@ -34,7 +34,7 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
     """Run benchmarks, and write ``bench.md`` and ``bench.json``.
 
     Returns:
-        Whether all of them ran.
+        Whether all benchmarks ran.
 
     Raises:
         ConfigError: There is no such benchmark.
@@ -88,7 +88,10 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _measured(name: str, cache: Path) -> dict[str, Any]:
-    """Return the row of one benchmark in a fresh interpreter; ``cache`` is empty at first and used if requested."""
+    """Run one benchmark in a fresh interpreter, and return its row.
+
+    The folder ``cache`` is empty at first; a benchmark uses it only on request.
+    """
     environment = {"RETRIM_COMPILE_CACHE": "0", "TF_CPP_MIN_LOG_LEVEL": "3"}
     if WORKS[name].cached:
         environment |= {
@@ -102,7 +105,10 @@ def _measured(name: str, cache: Path) -> dict[str, Any]:
 
 
 def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, Any]:
-    """Return the printed result of a separate process; on one core, without accelerator, else without preallocation."""
+    """Return the result that a separate process prints.
+
+    On one core, the process has no accelerator; otherwise, it does not preallocate memory.
+    """
     inherited = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
     inherited |= {"JAX_PLATFORMS": "cpu"} if cores == "one" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     ran = subprocess.run(

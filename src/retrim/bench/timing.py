@@ -17,7 +17,7 @@ class Work:
     title: str
     goal: str
     do: Callable[[], dict[str, Any]]
-    """Returns compile_s, run_s and remarks."""
+    """Function that returns compile_s, run_s and remarks."""
     paper: str = "-"
     """Time reported in the paper, on an RTX 4090."""
     cached: bool = False
@@ -25,13 +25,13 @@ class Work:
     one_core: bool = False
     """Whether it also runs on one core."""
     two_cores: bool = False
-    """Whether it needs two cores and chooses among them."""
+    """Whether it needs two cores and the right to choose between them."""
 
 
 def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
-    """Return the median time of some runs, and the compile time, in seconds and in units of the machine.
+    """Return the median time of several runs, in seconds and in machine units, and the compile time.
 
-    A unit is timed before and after each run, because other processes load the machine.
+    A unit is timed before and after each run, because other processes may load the machine.
     """
     now = unit()
     units, took = [now()], []

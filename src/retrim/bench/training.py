@@ -14,7 +14,7 @@ from .timing import compiled, timed
 
 
 def pretrain(name: str, runs: int) -> dict[str, Any]:
-    """Time pretraining without an encoder, with another seed for each run; the row includes the policies' errors."""
+    """Time pretraining without an encoder, with a new seed for each run; the row includes the policies' errors."""
     setup = Setup.from_preset(load(name))
     p, optimiser = setup.preset.pretrain, setup.optimiser
     policy = setup.new_policy(random.key(0))
@@ -38,7 +38,7 @@ def pretrain(name: str, runs: int) -> dict[str, Any]:
 
 
 def encode_and_pretrain(name: str) -> dict[str, Any]:
-    """Time the training of encoder and policy for a vision preset."""
+    """Time the training of the encoder and the policy for a vision preset."""
     setup, watch = Setup.from_preset(load(name)), Stopwatch()
     policy, _ = train(setup, 0)
     row = {"compile_s": watch.compile_s, "run_s": watch.total_s - watch.compile_s}

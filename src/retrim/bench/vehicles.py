@@ -40,7 +40,7 @@ PUSH = "small"
 
 
 def live_fleet(n: int) -> dict[str, Any]:
-    """Fly ``n`` vehicles in real time on one core while one process learns for all on another; return the row.
+    """Fly ``n`` vehicles in real time on one core while one process learns for all on another; return the table row.
 
     Raises:
         OSError: The vehicles did not complete the flight.
@@ -77,7 +77,7 @@ class Air:
         self.tick = 0
 
     def plans(self) -> list[tuple[str, LearnerPlan]]:
-        """Return the plan of the learner of each vehicle and layer."""
+        """Return the learner plans, one for each vehicle and layer."""
         return [
             (layer, plan_of(layer, replace(self.spec, seed=i), self.spec.start, 0, bus.folder, frozenset(), 0))
             for i, bus in enumerate(self.buses)
@@ -98,11 +98,11 @@ class Air:
         self.tick += 1
 
     def updates(self) -> int:
-        """Return the number of policy updates of all vehicles so far, including those that the gate refused."""
+        """Return the number of policy updates of all vehicles so far, including those that the gate rejected."""
         return sum(int(last_note(bus, "learner.policy").get("learnt", 0)) for bus in self.buses)
 
     def compile(self) -> None:
-        """Compile the program of a tick; the simulated result is dropped."""
+        """Compile the program of a tick; the simulated result is discarded."""
         u = jnp.asarray(self._accepted, dtype=float)
         jax.block_until_ready(_step(self._simulations, self._flown, u, jnp.asarray(0)))
 
@@ -151,7 +151,7 @@ def main() -> None:
 
 
 def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
-    """Fly for some seconds, and return the figures."""
+    """Fly all vehicles for a fixed time, and return the results."""
     began = time.monotonic()
     for layer, plan in air.plans():
         fleet.start(layer, plan, place / "vehicle.log")

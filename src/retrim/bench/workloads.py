@@ -1,4 +1,4 @@
-"""The benchmarks. ``python -m retrim.bench.workloads NAME`` runs one and prints JSON."""
+"""The benchmarks; ``python -m retrim.bench.workloads NAME`` runs one and prints its result as JSON."""
 
 import json
 import resource
@@ -30,7 +30,7 @@ from .vehicles import live_fleet
 
 
 def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
-    """Time a policy update; it has three products per step of training and one per tick of the gate."""
+    """Time a policy update; it needs three products per training step and one per tick of the gate."""
     learner, state, window = learner_in_flight(name)
     if lora:
         policy = Setup.from_preset(load(name)).low_rank(state.policy.policy, random.key(2))
@@ -50,7 +50,7 @@ def _residual(name: str = "hover/paper") -> dict[str, Any]:
 
 
 def _programs() -> dict[str, Any]:
-    """Trace and compile, or load, all programs of a flight: policy, plant, residual fit, policy update."""
+    """Trace and compile, or load, all programs of a flight: policy, plant, residual fit and policy update."""
     watch, preset = Stopwatch(), load("hover/fast")
     policy = Setup.from_preset(preset).new_policy(random.key(0))
     Fleet(preset, policy, [Scenario("large")], starts=1, seconds=3.0).warm_up()
@@ -58,7 +58,7 @@ def _programs() -> dict[str, Any]:
 
 
 def _tick() -> dict[str, Any]:
-    """Time a flight without adaptation: plant, observation, policy, checks."""
+    """Time a flight without adaptation: plant, observation, policy and checks."""
     setup = Setup.from_preset("hover/fast")
     policy, plant, x0 = setup.new_policy(random.key(0)), Scenario().make(), setup.flight_starts(1)[0]
     began = time.perf_counter()
@@ -164,7 +164,7 @@ WORKS: dict[str, Work] = {
 
 
 def main() -> None:
-    """Run the benchmark that the command line names, on one core if its second word is ``one``; print the row."""
+    """Run the benchmark that the command line names, on one core if the second word is ``one``; print the row."""
     if sys.argv[2:] == ["one"]:
         on_core(0)
     if sys.argv[1] == "machine":

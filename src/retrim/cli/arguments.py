@@ -1,4 +1,4 @@
-"""Options of a command: weights, preset and reference, from files and names, checked against each other."""
+"""Options of the commands: weights, presets and references, from files and names, checked for consistency."""
 
 import dataclasses
 from collections.abc import Collection
@@ -28,13 +28,13 @@ from .options import listed, option
 def loaded(
     policy: Path | None, resume: Path | None, delta: Path | None = None, *, trust: Collection[str] = ()
 ) -> tuple[AbstractPolicy, Preset, LearnerState | None]:
-    """Return weights, preset, and the learner state of an earlier flight.
+    """Return the weights, the preset, and the learner state of an earlier flight or None.
 
     Args:
-        policy: A policy, or the folder that holds one.
-        resume: Instead of a policy: the learner state of an earlier flight.
-        delta: A low-rank delta to put on the policy.
-        trust: Python names that a file may hold, as ``mine:task``.
+        policy: A policy, or the folder that contains one.
+        resume: Learner state of an earlier flight, given instead of a policy.
+        delta: A low-rank delta to add to the policy.
+        trust: Python names that a file may contain, e.g. ``mine:task``.
 
     Raises:
         ConfigError: Both or neither of ``policy`` and ``resume`` are given, or ``delta`` together with ``resume``.
@@ -87,7 +87,7 @@ RESIDUAL = f"Residual model: {listed(RESIDUALS)}, or module:name; by default tha
 
 @dataclasses.dataclass(frozen=True)
 class FlightArguments:
-    """Conditions of a flight, as the options of a command."""
+    """Conditions of a flight, as command-line options."""
 
     disturbance: Annotated[str | None, option(DISTURBANCE, optional=True)] = None
     plant: Annotated[str, option(PLANT)] = "bem"
@@ -120,10 +120,10 @@ class FlightArguments:
 
 
 def with_residual(preset: Preset, residual: str | None, state: LearnerState | None) -> Preset:
-    """Return a preset with the given residual model, or unchanged without one.
+    """Return the preset with the given residual model, or unchanged if none is given.
 
     Raises:
-        ConfigError: No residual model has this name, or the flight resumes a learner state, which has its own.
+        ConfigError: The residual model does not exist, or the flight resumes a learner state, which has its own model.
     """
     if residual is None:
         return preset
@@ -133,14 +133,14 @@ def with_residual(preset: Preset, residual: str | None, state: LearnerState | No
 
 
 def reference_of_flight(preset: Preset, name: str | None) -> str | None:
-    """Return the reference of a tracking flight; None for another task.
+    """Return the reference of a tracking flight; None for other tasks.
 
     Args:
         preset: Preset of the policy.
-        name: Name of the reference; None for the reference of training.
+        name: Name of the reference; None for the training reference.
 
     Raises:
-        ConfigError: The policy cannot follow it.
+        ConfigError: The policy cannot follow this reference.
     """
     if preset.track is None:
         if name is not None:
@@ -177,7 +177,7 @@ def same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
 
 
 def _without_excitation(value: Any) -> Any:
-    """Return a value of a preset; for a family without the excitation, which the weights do not depend on."""
+    """Return a preset value; for a family, reset the excitation, on which the weights do not depend."""
     return dataclasses.replace(value, excitation=False) if isinstance(value, Family) else value
 
 
@@ -197,12 +197,12 @@ def training_preset(
     Args:
         task: Name of a task.
         preset: Name of a preset; by default the task's own.
-        config: TOML file on top of it.
-        vehicle: Vehicle to train for, on top of both.
-        reference: Reference to track, on top of both.
-        residual: Residual model of later adaptation, on top of both.
-        trust: Python names that the file may hold, as ``mine:task``.
-        **pretrain: Values of the table ``pretrain``, on top of both; None leaves a value unchanged.
+        config: TOML file with values that replace those of the preset.
+        vehicle: Vehicle to train for; overrides preset and file.
+        reference: Reference to track; overrides preset and file.
+        residual: Residual model for later adaptation; overrides preset and file.
+        trust: Python names that the file may contain, e.g. ``mine:task``.
+        **pretrain: Values of the table ``pretrain``; they override preset and file, and None leaves a value unchanged.
 
     Raises:
         ConfigError: A name, key or value is invalid.
@@ -224,5 +224,5 @@ def training_preset(
 
 
 def _table(value: Any) -> dict[str, Any]:
-    """Return a dataclass as a plain dictionary; None as an empty one."""
+    """Return a dataclass as a plain dictionary, or an empty dictionary for None."""
     return {} if value is None else dataclasses.asdict(value)

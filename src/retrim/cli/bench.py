@@ -11,7 +11,7 @@ from .console import RichReporter, show_paths, started
 
 
 def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Callable[[threading.Event], int]:
-    """Measure the run time of workloads of the paper's runtime study and of this project, each in its own process.
+    """Measure the run times of the paper's and this project's workloads, each in its own process.
 
     Args:
         works: Workloads to measure; all by default.

@@ -1,4 +1,4 @@
-"""Output of the commands: lines and progress, for terminals and log files."""
+"""Output of the commands: text and progress, for terminals and log files."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -58,14 +58,14 @@ def _lines(title: str) -> Advance:
 
 
 def started(run: Run) -> Run:
-    """Return the run, and report if it resumes or overwrites an earlier one."""
+    """Print a message if a run resumes or overwrites an earlier one, and return the run."""
     if said := run.of_earlier():
         console.print(said, markup=False, soft_wrap=True)
     return run
 
 
 def refuse(message: str) -> int:
-    """Print an error in one line, and return its exit code."""
+    """Print an error on one line, and return the exit code."""
     console.print(f"[bold red]retrim:[/] {escape(one_line(message))}", soft_wrap=True)
     return 1
 

@@ -28,11 +28,11 @@ def check_vehicle_file(path: Path | None) -> None:
 
 
 def save_flight_vehicle(flight: Flight, setup: Setup, path: Path | None) -> tuple[list[Path], int]:
-    """Write the vehicle that is identified from a flight; return the written files and the exit code.
+    """Write the vehicle that was identified from a flight; return the written files and the exit code.
 
     Args:
         flight: Flight to identify the vehicle from.
-        setup: Set-up of the policy in the flight.
+        setup: Set-up of the policy that flew.
         path: File to write; None if the option is not given.
     """
     if path is None:

@@ -42,23 +42,23 @@ def fly(
     trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Fly a policy on a plant, unchanged and, with --adapt full or lora, with adaptation in flight.
+    """Fly a policy on a plant, unchanged and, with --adapt full or lora, re-trained in flight.
 
     Args:
-        policy: A policy.safetensors, or the folder that holds one.
-        resume: Instead of a policy: learner_state.safetensors of an earlier flight, from which to continue.
+        policy: A policy.safetensors, or the folder that contains one.
+        resume: A learner_state.safetensors of an earlier flight, from which to continue; used instead of a policy.
         delta: A low-rank delta.safetensors of an earlier flight, to add to the policy.
         flight: Plant, vehicle and disturbances of the flight.
         adapt: Method of the flight; full and lora re-train the policy in flight.
         residual: Residual model of the learners.
         config: TOML file with values that replace those of the policy's preset, for example a table [adapt].
-        latency: fixed: learning takes the flight time of the preset, so that a run is reproducible bit for bit;
-            measured: it takes the measured computing time.
-        seconds: Length of a flight; 30 s for hover, 60 s for tracking by default.
-        starts: Number of flights, each from another start.
+        latency: Flight time that learning takes: fixed (the time in the preset, so that a run is reproducible bit for
+            bit), or measured (the computing time).
+        seconds: Length of each flight; by default 30 s for hover and 60 s for tracking.
+        starts: Number of flights, each from a different start.
         seed: Seed of the starts, the learners and the random parts of the scenario, 0 to 4294967295.
         save_vehicle: Vehicle file (TOML) to write, with the vehicle identified in the last flight, for pretraining.
-        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
+        trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
         out: Folder for results.json, events.jsonl, logs/, learned parameters and the picture; a new one under runs/ by
             default.
     """
@@ -68,7 +68,7 @@ def fly(
         if flight.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
                 raise ConfigError("a vehicle is flown live: without --delta, --config, --starts and --latency")
-            from .live import live  # here: other flights do not need this module
+            from .live import live  # imported here, because other flights do not need it
 
             return live(
                 policy, resume, flight=flight, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed,

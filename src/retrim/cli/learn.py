@@ -22,10 +22,11 @@ def learn(
     One process can learn for several flights. Ctrl-C ends it; the flights continue with their last policies.
 
     Args:
-        addresses: Addresses of flights: zenoh:HOST:PORT of a flight computer, or ros:HOST:PORT/quad1 of a rosmaster
-            and a vehicle.
-        key: File with the key that the flights have, too, or RETRIM_KEY; needed for flights on other machines.
-        trust: Python name that a flight may send, as mine:task; its code is run here. Repeat the option for each name.
+        addresses: Addresses of the flights: zenoh:HOST:PORT for a flight computer, or ros:HOST:PORT/quad1 for a
+            rosmaster and a vehicle.
+        key: File with the key that the flights also have; by default the key in RETRIM_KEY. Flights on other machines
+            need one.
+        trust: Python name that a flight may send, e.g. mine:task; its code is run here. Repeat it for each name.
     """
 
     def ordered(stop: threading.Event) -> int:

@@ -59,33 +59,33 @@ def live(
     trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Fly in real time and learn at the same time, with processes for control, for each learner, and for the plant.
+    """Fly in real time and learn at the same time, with separate processes for control, each learner and the plant.
 
-    Ctrl-C lands the vehicle. A flight without `--seconds` ends in this way, and its exit code is 0.
+    Ctrl-C lands the vehicle. A flight without `--seconds` ends in this way, with exit code 0.
 
     Args:
-        policy: A policy.safetensors, or the folder that holds one; without one, a policy is trained first.
+        policy: A policy.safetensors, or the folder that contains one; by default, a policy is trained first.
         resume: A learner_state.safetensors of an earlier flight, from which to continue.
         preset: Preset to train with if there is neither --policy nor --resume.
         flight: Plant, vehicle and disturbances of the flight.
         adapt: Method of the flight; full and lora re-train the policy in flight.
         residual: Residual model of the learners.
         seconds: Length of the flight; until Ctrl-C by default.
-        fence: Largest distance from the reference along any axis before the fallback controller takes over [m].
-        policy_age: Largest age of the flight data of a learned policy before the fallback takes over [s]; unlimited by
-            default.
+        fence: Distance from the reference along any axis at which the fallback controller takes over [m].
+        policy_age: Age of a learned policy's flight data at which the fallback controller takes over [s]; by default
+            unlimited.
         seed: Seed of the start, the learners and the random parts of the scenario.
         learners: Address at which learners on another machine, started by `retrim learn`, reach this one:
-            zenoh:HOST:PORT (this machine listens there), or ros:HOST:PORT of a rosmaster. By default they run here.
-        key: File with the key that `retrim learn` has, too, or RETRIM_KEY; needed for learners on another machine.
-        page: Show the flight in a browser, with controls, also with `--seconds`. Without `--seconds`, this is the
-            default.
+            zenoh:HOST:PORT (this machine listens there), or ros:HOST:PORT of a rosmaster. By default, they run here.
+        key: File with the key that `retrim learn` also has; by default the key in RETRIM_KEY. Learners on another
+            machine need one.
+        page: Show the flight in a browser, with controls. Without `--seconds`, this is the default.
         no_page: Show the flight in the terminal only.
-        page_host: Address that the page listens on. The printed address has a token, which every request needs.
+        page_host: Address that the page listens on. The printed address contains a token, which every request needs.
         page_port: Port of the page; the next free port if it is in use.
-        record: FILE.mcap for Foxglove and PlotJuggler, by default flight.mcap in the folder; or FILE.rrd for rerun.
+        record: FILE.mcap for Foxglove and PlotJuggler, or FILE.rrd for rerun; by default flight.mcap in the folder.
         save_vehicle: Vehicle file (TOML) to write, with the vehicle identified in the flight, for pretraining.
-        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
+        trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
         out: Folder for the results of the flight; a new one under runs/ by default.
     """
 

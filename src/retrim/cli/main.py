@@ -1,6 +1,6 @@
-"""Entry point of the command line: it selects the command, and turns errors into one line and an exit code.
+"""Entry point of the command line: it selects the command, and turns errors into a one-line message and an exit code.
 
-Modules of commands are imported only when they are needed, so that --help is fast.
+Command modules are imported only when they are needed, so that --help is fast.
 """
 
 import os
@@ -25,11 +25,11 @@ COMMANDS = {
 }
 TRACEBACK = "--traceback"
 GROUP = "retrim.commands"
-"""Entry points of other packages that add commands: dictionaries from a name to help and module."""
+"""Group of entry points that add commands: each is a dictionary from a name to its help text and module."""
 
 
 def commands() -> dict[str, tuple[str, str]]:
-    """Return help and module of every command, by name."""
+    """Return the help text and module of every command, by name."""
     result = {name: (about, f"{PACKAGE}.{name}") for name, about in COMMANDS.items()}
     for entry in entry_points(group=GROUP):
         result |= entry.load()
@@ -40,7 +40,7 @@ def describe(known: Mapping[str, tuple[str, str]]) -> str:
     """Return the help of the command line.
 
     Args:
-        known: Help and module of every command, by name.
+        known: Help text and module of every command, by name.
     """
     width = max(map(len, known)) + 2
     return "\n".join(
@@ -62,8 +62,8 @@ def describe(known: Mapping[str, tuple[str, str]]) -> str:
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command and exit.
 
-    Exit codes: 0 for success, 1 for an error with a message, 2 for wrong usage, 130 for an interruption; results up to
-    then are kept.
+    Exit codes: 0 for success, 1 for an error with a message, 2 for wrong usage, 130 for an interruption. Results
+    from before an interruption are kept.
 
     Args:
         words: Command and options; ``sys.argv`` by default.

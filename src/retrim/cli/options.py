@@ -1,4 +1,4 @@
-"""Help texts of options: placeholders instead of types, names from the registries, no default where there is none."""
+"""Help texts of options: placeholders instead of types, names from the registries, and no default if it is None."""
 
 import functools
 import inspect
@@ -29,7 +29,7 @@ def option(text: str, *, optional: bool = False) -> Any:
 
 
 def readable(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command whose optional options show a placeholder, and no default.
+    """Return a command whose optional options show a placeholder and no default.
 
     Args:
         command: Function whose arguments are the options; None is the default of an optional one.
@@ -49,12 +49,12 @@ def readable(command: Callable[..., Any]) -> Callable[..., Any]:
 
     same.__annotations__ = {each.name: each.annotation for each in parameters} | {"return": hints.get("return", Any)}
     vars(same)["__signature__"] = signature.replace(parameters=parameters)
-    del same.__wrapped__  # the signature of the wrapper is the one that counts
+    del same.__wrapped__  # only the wrapper's own signature is used
     return same
 
 
 def _of_hint(hint: Any) -> dict[str, Any]:
-    """Return the settings of an option with a type that includes None; empty for any other type."""
+    """Return the settings of an option whose type includes None; empty for any other type."""
     if get_origin(hint) not in (Union, types.UnionType) or type(None) not in get_args(hint):
         return {}
     rest = [each for each in get_args(hint) if each is not type(None)]

@@ -34,15 +34,15 @@ def pretrain(
 
     Args:
         task: Task of the policy: hover, track, vision, or module:name of a custom task.
-        preset: Preset to train with, as hover/retrim or hover/paper; by default that of the task.
-        vehicle: Vehicle to train for: small, large, kingfisher, a vehicle file, as my_quad.toml, or module:name.
-        reference: Reference to track: circle, figure8, star, a CSV file, module:name, or a family, as circle+star.
+        preset: Preset to train with, such as hover/retrim or hover/paper; by default that of the task.
+        vehicle: Vehicle to train for: small, large, kingfisher, a vehicle file such as my_quad.toml, or module:name.
+        reference: Reference to track: circle, figure8, star, a CSV file, module:name, or a family such as circle+star.
         residual: Residual model for later adaptation: ensemble, regression, layered, linear, or module:name.
         config: TOML file with values that replace those of the preset, for example a table [pretrain].
         updates: Number of optimiser steps; by default that of the preset.
         envs: Number of starts per step; by default that of the preset.
         seed: Seed of the initial weights and of the starts, 0 to 4294967295.
-        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
+        trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
         out: Folder for policy.safetensors and results.json; a new one under runs/ by default.
     """
 

@@ -19,10 +19,10 @@ def replay(
     asked: tyro.conf.OmitArgPrefixes[tyro.conf.UseAppendAction[Replay]] = Replay(),  # noqa: B008
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Read a flight log, and report the error of the nominal model and how well it is predicted; identify, adapt.
+    """Read a flight log, report the nominal model's error and how well it is predicted, and identify or adapt.
 
     Args:
-        log: Log file: CSV, NPZ, ULog of PX4, bag of ROS 1 or 2, or MCAP; the last three need the extra `logs`.
+        log: Log file: CSV, NPZ, PX4 ULog, ROS 1 or 2 bag, or MCAP; the last three need the extra `logs`.
         asked: Options of the replay.
         out: Folder for the report, its picture, vehicle.toml and the policy; a new one under runs/ by default.
     """

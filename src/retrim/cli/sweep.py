@@ -17,15 +17,15 @@ def sweep(
 ) -> Callable[[threading.Event], int]:
     """Fly every combination of a sweep file: presets x scenarios x methods x seeds.
 
-    The folder contains the policies and the result of every flight while the sweep runs. After an interruption or a
-    kill, the same command with the same --out continues the sweep.
+    Policies and flight results are written to the folder while the sweep runs. After an interruption or a kill, the
+    same command with the same --out continues the sweep.
 
     Args:
-        file: TOML file with any of: presets, seeds, methods, disturbances, plants, vehicles, sensors, references,
-            starts, seconds, and a table [overlay] with values that replace those of the presets.
+        file: TOML file with any of these keys: presets, seeds, methods, disturbances, plants, vehicles, sensors,
+            references, starts, seconds, and a table [overlay] with values that replace those of the presets.
         on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers run the training and the flights.
-        trust: Python name that a file may contain, as mine:task; its code is run. Repeat the option for each name.
-        out: Folder for sweep.md, sweep.json and sweep.png; by default runs/ and the file's name.
+        trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
+        out: Folder for sweep.md, sweep.json and sweep.png; by default runs/sweep-NAME, named after the file.
     """
 
     def ordered(stop: threading.Event) -> int:

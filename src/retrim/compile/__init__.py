@@ -1,4 +1,4 @@
-"""Compile functions of JAX to NumPy programs, for controllers that run without JAX.
+"""Compile JAX functions to NumPy programs, for controllers that run without JAX.
 
-``trace`` and ``expressions`` need JAX and write the program before take-off. ``ops`` runs it and needs NumPy alone.
+``trace`` and ``expressions`` need JAX and write the program before take-off. ``ops`` runs it and needs only NumPy.
 """

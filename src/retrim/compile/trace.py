@@ -1,9 +1,9 @@
 """Conversion of controllers to NumPy source, so that the control process does not need JAX.
 
 A controller is traced once, before take-off. Each operation of the trace becomes one line of NumPy. Values that depend
-on constants only are computed during the conversion. Values that depend on parameters but not on inputs are computed
-when the parameters change. All other values are computed each tick. Learned and classical controllers, built-in or
-user-defined, thus fly in real time with the same definition that trains in JAX.
+only on constants are computed during the conversion. Values that depend on parameters but not on inputs are computed
+when the parameters change. All other values are computed each tick. Controllers thus fly in real time with the
+same definition that trains in JAX, whether they are learned or classical, built-in or user-defined.
 """
 
 import re
@@ -27,11 +27,11 @@ NUMBER = ".reshape(())"
 """Expression that converts a block of one element to a scalar."""
 BLOCK = re.compile(r"(\w+)\[(\d+:\d+(?:, \d+:\d+)*)\]")
 Ref = tuple[str, int]
-"""Name of a value in the source, and kind of its dependency: constant, parameter or input."""
+"""Name of a value in the source, and the kind of its dependency: constant, parameter or input."""
 
 
 def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) -> ProgramSource:
-    """Return a function of two pytrees as a program.
+    """Convert a function of two pytrees to a program.
 
     Args:
         function: ``function(parameters, inputs)`` returns a pytree; it is traced with JAX.
@@ -115,7 +115,7 @@ class _Writer:
         return [self._line(f"{whole[0]}[{i}]", [whole]) for i in range(len(eqn.outvars))]
 
     def _line(self, text: str, operands: Sequence[Ref]) -> Ref:
-        """Return the name of an expression of operands; identical expressions are written once."""
+        """Return the name of an expression; identical expressions are written once."""
         text, operands = self._number(text, operands)
         kind = max((kind for _, kind in operands), default=CONSTANT)
         if kind == CONSTANT:

@@ -1,7 +1,7 @@
 """Classical baseline controllers. They receive the declared delay, lag and limits of the vehicle.
 
 ``retrim reproduce tuning`` tuned their settings with separate pushes, starts and seeds, once for a measured state and
-once for a pose estimated from keypoints: see docs/results/tuning.md and tuning_keypoints.md.
+once for a pose estimated from keypoints. See docs/results/tuning.md and tuning_keypoints.md.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,7 +35,7 @@ Settings = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Baseline:
-    """A controller without policy, its settings, and the ranges of their search."""
+    """A controller without a policy, its settings, and their search ranges."""
 
     label: str
     """Name in tables."""
@@ -44,9 +44,9 @@ class Baseline:
     settings: Settings
     """Settings for a measured state."""
     settings_from_keypoints: Settings
-    """Settings for a pose that a filter estimates from keypoints. It is late and noisy, so slower loops fly better."""
+    """Settings for a pose estimated from keypoints. The estimate is late and noisy, so slower loops fly better."""
     ranges: Mapping[str, tuple[float, float]]
-    """Smallest and largest value of the search, which draws uniformly in the logarithm."""
+    """Smallest and largest value of each setting in the search, which draws log-uniformly."""
     cost: int = 1
     """Relative cost of a rollout; the tuning search divides its number of candidates by it."""
 
@@ -55,13 +55,13 @@ class Baseline:
         return self.make(setup, self.settings_for(setup), random.key(0) if key is None else key)
 
     def settings_for(self, setup: "Setup") -> Settings:
-        """Return the settings for the observation of the set-up: a measured state, or keypoints."""
+        """Return the settings that suit the observation of the set-up: a measured state or keypoints."""
         seen = isinstance(setup.flight_task.observation_in_flight, OccludedKeypoints)
         return self.settings_from_keypoints if seen else self.settings
 
 
 def prediction_of(setup: "Setup") -> Prediction:
-    """Return the nominal model of the vehicle of a preset."""
+    """Return the nominal model of a preset's vehicle."""
     path = declared_path(setup.preset, setup.vehicle)
     if lag_of(setup.preset, setup.vehicle) is None:
         path = CommandPath(path.delay, ActuatorResponse.of(ACTUATOR_LAG, ACTUATOR_LAG))
@@ -69,7 +69,7 @@ def prediction_of(setup: "Setup") -> Prediction:
 
 
 def slowness(setup: "Setup") -> float:
-    """Return the ratio of command delay plus rate lag to its value in the tuning search, at least 1."""
+    """Return the ratio of command delay plus rate lag to its value in the tuning search; at least 1."""
     path = declared_path(setup.preset, setup.vehicle)
     delay, lag = float(path.delay), float(path.response.rate_lag[0])
     return max(1.0, (delay + lag) / (delay + ACTUATOR_LAG))

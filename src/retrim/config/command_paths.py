@@ -2,9 +2,9 @@
 
 | where | delay | lag |
 |---|---|---|
-| preset | `delay_ticks` of the model, `plant_delay_ticks` of the plant | `actuator_tau` |
-| vehicle file | `command_delay`, of both | `rate_lag`, `rate_damping`, `motor_tau` |
-| scenario | `delay`, of the simulated plant | that of the simulated vehicle |
+| preset | `delay_ticks` for the model, `plant_delay_ticks` for the plant | `actuator_tau` |
+| vehicle file | `command_delay`, for both | `rate_lag`, `rate_damping`, `motor_tau` |
+| scenario | `delay`, for the simulated plant | that of the simulated vehicle |
 """
 
 import jax.numpy as jnp
@@ -24,11 +24,11 @@ ACTUATOR_LAG = 0.033  # [s]: typical lag of small quadrotors, for presets withou
 
 
 def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
-    """Return the time constants of thrust and rates [s], or None for a model without lag.
+    """Return the time constants of the thrust and body rates [s], or None for a model without lag.
 
-    A vehicle with known rate lag has its own time constants. Published vehicles have the time constants of the preset.
-    For other vehicles, the body rates have the rise times of the simulated rate loop, and the thrust has the time
-    constant of the motors.
+    A vehicle with a known rate lag uses its own time constants. Published vehicles use those of the preset. For other
+    vehicles, the body rates use the rise times of the simulated rate loop, and the thrust uses the time constant of
+    the motors.
     """
     if vehicle.rate_lag is not None:
         return Command(vehicle.motor_tau, vehicle.rate_lag)
@@ -39,7 +39,7 @@ def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
 
 
 def response_of(preset: Preset, vehicle: Vehicle) -> ActuatorResponse | None:
-    """Return the response of thrust and rates to commands in the model of a preset, or None for a model without lag."""
+    """Return the response of thrust and rates to commands in a preset's model, or None for a model without lag."""
     lag = lag_of(preset, vehicle)
     if lag is None:
         return None
@@ -48,7 +48,7 @@ def response_of(preset: Preset, vehicle: Vehicle) -> ActuatorResponse | None:
 
 
 def delayed(preset: Preset) -> Preset:
-    """Return a preset with the command delay of its vehicle file, if there is one, in the model and the declared plant.
+    """Return the preset with the command delay of its vehicle file, if any, in the model and in the declared plant.
 
     Raises:
         ConfigError: The delay has more ticks than a preset supports.
@@ -84,5 +84,5 @@ def _delay(preset: Preset, ticks: int) -> float:
 
 
 def longest_delay(preset: Preset) -> float:
-    """Return the longest delay that command queues can store [s]; the same for all usual presets."""
+    """Return the longest delay that command queues can store [s]; it is the same for all usual presets."""
     return max(LONGEST_DELAY, preset.dt * max(preset.delay_ticks, preset.plant_delay_ticks))

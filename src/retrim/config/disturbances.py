@@ -16,7 +16,7 @@ from .sizes import name_and_size
 DisturbanceFactory = Callable[[Key[Array, ""], float | None], Disturbance]
 """Function of a random key and a size (or None, the default size) that returns a disturbance."""
 
-SEED_TAG = 2**30 + 3  # folded into seeds, so that disturbances share no key with starts, learners and sensors
+SEED_TAG = 2**30 + 3  # folded into seeds, so that disturbances do not share keys with starts, learners or sensors
 
 DISTURBANCES: Registry[DisturbanceFactory] = Registry("disturbance", example="sums as wind+payload=0.1, or module:name")
 register_disturbance = DISTURBANCES.register
@@ -26,7 +26,7 @@ def disturbance(names: str, seed: int = 0) -> Disturbance:
     """Return a disturbance by name.
 
     Args:
-        names: Name, as ``wind``; name with a size, as ``wind=6``; or a sum, as ``wind=6+payload``.
+        names: Name, e.g. ``wind``; name with a size, e.g. ``wind=6``; or a sum, e.g. ``wind=6+payload``.
         seed: Seed of the random parts of the disturbance.
 
     Raises:
@@ -69,7 +69,7 @@ def _diagonal(speed: float) -> Array:
 
 
 def _fan(key: Key[Array, ""], size: float | None) -> Disturbance:
-    # The outlet is 1.5 m from the goal (0, 0, 1), diagonally; by default 4 m/s reach the goal.
+    # The outlet is 1.5 m from the goal (0, 0, 1), diagonally; by default, the wind is 4 m/s at the goal.
     outlet, direction = jnp.array([-1.06, -1.06, 1.0]), jnp.array([1.0, 1.0, 0.0])
     return Fan.of(outlet, direction, speed=_bounded(size, 6.0, 0.0, 20.0, "m/s"), width=0.3, key=key)
 

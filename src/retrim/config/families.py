@@ -1,4 +1,4 @@
-"""The vehicle family of a preset, and the flight components that only such presets have."""
+"""The vehicle family of a preset, and the flight components that only presets with a family use."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ from .tasks import find_task
 from .vehicle_file import VehicleSpec
 
 TRUST = 2.0  # assumed error factor of a delay or lag in a vehicle file
-# [m], largest distance in the input: from farther away, the policy tilts more than a weak vehicle can lift.
+# [m]: largest distance from the target in the policy's input. Farther away, it tilts more than a weak vehicle can lift.
 REACH = 0.5
 LEAST = 0.01  # [s]: assumed error of a short delay or lag
 
@@ -48,7 +48,7 @@ def make_family(preset: Preset) -> PathFamily | None:
 
 
 def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
-    """Return the belief about a vehicle before take-off. Values of its file may be wrong by a factor of two.
+    """Return the belief about a vehicle before take-off; values in its file may be wrong by a factor of two.
 
     Args:
         preset: Preset whose vehicle may come from a vehicle file.
@@ -75,8 +75,8 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy
     """Return a policy with the observation used in flight.
 
     Args:
-        preset: Preset of the policy. In a task without reference, the distance from the target in the input of a policy
-            for a family is limited; if the task rests at home, the policy is shifted so that it commands hover there.
+        preset: Preset of the policy. For a family and a task without a reference, the observed distance from the target
+            is limited. If this task rests at home, the policy is also shifted so that it commands hover there.
         task: Task of the flight.
         policy: Policy of the flight.
     """
@@ -89,7 +89,7 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy
 
 
 def track_actuators(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:
-    """Return a controller that receives the present thrust and body rates, if its preset is for a family of vehicles.
+    """Return a controller that receives the current thrust and body rates, if its preset is for a family of vehicles.
 
     Args:
         controller: Controller of a policy.
@@ -132,7 +132,7 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
 
 
 def declared_vehicle(preset: Preset) -> Float[Array, "2"] | None:
-    """Return command delay and rate lag of the vehicle file [s], or None if the file does not state both."""
+    """Return the command delay and rate lag in the vehicle file [s], or None if the file does not state both."""
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None or vehicle.rate_lag is None:
         return None

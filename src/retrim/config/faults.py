@@ -36,7 +36,7 @@ def measurement_fault(name: str) -> AbstractMeasurementFault | None:
     """Return a measurement fault by name.
 
     Args:
-        name: Name, as ``late``, or name with a size, as ``late=3``; ``none`` returns None.
+        name: Name, e.g. ``late``, or name with a size, e.g. ``late=3``; the result for ``none`` is None.
 
     Raises:
         ConfigError: The fault does not exist, or does not accept this size.

@@ -17,11 +17,11 @@ LIGHTEST, HEAVIEST = 0.03, 3.0  # [kg]
 RATE_LAG = (0.015, 0.15)  # [s]: lightest and heaviest vehicle
 DELAY = (0.0, 0.06)  # [s]
 THRUST_LAG = (0.01, 0.08)  # [s]
-SPREAD, DELAY_SPREAD = 0.2, 0.012  # standard deviation of the logarithm of lags, and of the delay [s]
+SPREAD, DELAY_SPREAD = 0.2, 0.012  # standard deviations of the log-lags, and of the delay [s]
 DAMPING = (0.4, 1.2)
-THRUST_GAIN = (0.6, 1.6)  # thrust over commanded thrust
+THRUST_GAIN = (0.6, 1.6)  # ratio of thrust to commanded thrust
 THRUST_TO_WEIGHT = (1.6, 5.0)  # at full command, if the gain were 1
-LEAST_THRUST = 1.4  # thrust at full command over weight
+LEAST_THRUST = 1.4  # smallest ratio of the thrust at full command to the weight
 SEED_TAG = 46
 
 
@@ -34,11 +34,11 @@ class HiddenVehicle:
     size: float
     """Size factor: 0 for the lightest vehicle, 1 for the heaviest."""
     thrust_gain: float
-    """Thrust over commanded thrust."""
+    """Ratio of thrust to commanded thrust."""
 
     @property
     def rate_lag(self) -> float:
-        """Time constant of roll and pitch rate [s]."""
+        """Time constant of the roll and pitch rates [s]."""
         assert self.spec.rate_lag is not None
         return self.spec.rate_lag[0]
 
@@ -50,13 +50,13 @@ class HiddenVehicle:
 
     @property
     def delay(self) -> float:
-        """Delay of commands [s]."""
+        """Command delay [s]."""
         assert self.spec.command_delay is not None
         return self.spec.command_delay
 
     @property
     def thrust_to_weight(self) -> float:
-        """Thrust at full command over weight."""
+        """Ratio of the thrust at full command to the weight."""
         return self.thrust_gain * self.spec.thrust_max / (self.spec.mass * STANDARD_GRAVITY)
 
     def scenario(self, disturbance: str, *, sensors: str = "ideal", reference: str | None = None) -> Scenario:
@@ -83,7 +83,7 @@ def draw_vehicles(count: int, seed: int = 0) -> list[HiddenVehicle]:
 
     Args:
         count: Number of vehicles.
-        seed: The first ``count`` vehicles of a seed are the same for every count.
+        seed: Seed of the population; for one seed, the first vehicles are the same for every ``count``.
     """
     return [_draw(np.random.default_rng((SEED_TAG, seed, n)), n) for n in range(count)]
 

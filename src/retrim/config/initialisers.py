@@ -1,4 +1,4 @@
-"""Random objects of a set-up, apart from training: untrained policies, starts of flights, and low-rank deltas."""
+"""Random objects of a set-up, apart from training: untrained policies, flight starts, and low-rank deltas."""
 
 from functools import partial
 
@@ -22,24 +22,24 @@ LOW_RANK_TAG = 2**30 + 4  # folded into the key of a learner, for its initial de
 
 @partial(jax.jit, static_argnames=("size", "hidden"))
 def untrained(size: int, vehicle: Vehicle, key: Key[Array, ""], hidden: tuple[int, ...]) -> Policy:
-    """Return an untrained policy. All set-ups with the same sizes share the compiled program.
+    """Return an untrained policy; set-ups with the same sizes share the compiled program.
 
     Args:
         size: Size of the observation.
         vehicle: Vehicle with the command limits.
-        key: Consumed.
+        key: Random key; consumed.
         hidden: Widths of the hidden layers.
     """
     return Policy.of(size, vehicle, key=key, hidden=hidden)
 
 
 def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:
-    """Return ``n`` starts: +- 1 m per axis from ``home``, 18 degrees about each axis, 0.1 m/s.
+    """Return ``n`` starts: +- 1 m per axis from ``home``, 18 degrees about each axis, and 0.1 m/s.
 
     Args:
         home: Centre of the starts, world frame [m].
         n: Number of starts.
-        seed: The same seed gives the same starts.
+        seed: Seed; the same seed gives the same starts.
     """
     batch = _starts(home, random.fold_in(random.key(seed), START_TAG), n)
     return [jax.tree.map(lambda leaf, i=i: jax.device_put(np.asarray(leaf)[i]), batch) for i in range(n)]

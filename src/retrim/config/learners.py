@@ -1,4 +1,4 @@
-"""Nominal model, optimiser, settings of the online learner and control frame of a preset."""
+"""The nominal model, optimiser, online-learner settings and control frame of a preset."""
 
 import functools
 import math
@@ -33,9 +33,9 @@ from .command_paths import declared_path, longest_delay, response_of
 from .presets import Preset, Pretrain
 from .tasks import find_task
 
-OBSERVER_TAU = 0.05  # [s]: half of this is unstable if the delay of the plant is 40 ms longer than declared
+OBSERVER_TAU = 0.05  # [s]: half this value is unstable if the plant's delay is 40 ms longer than declared
 WANDER = 4.0  # [m/s^2] in one second: random walk of the disturbance
-# The same for a family: its stiffer policy turns noise of the estimate into motion. Without noise both are equal.
+# The same for a family: its stiffer policy turns estimation noise into motion. Without noise, both are equal.
 FAMILY_WANDER = 1.0
 TILT_LIMIT = 6.0  # [m/s^2]: largest disturbance that rotates a frame, so that gravity keeps a downward component
 
@@ -62,9 +62,9 @@ def learner_settings(
     """Return the settings of an online learner, by field.
 
     Args:
-        preset: Preset, whose table [adapt] has the parameters.
+        preset: Preset with the parameters in its table [adapt].
         env: Environment of the flight.
-        optimiser: Builds the optimiser of policy updates from learning rate and largest norm of a gradient.
+        optimiser: Function of a learning rate and a largest gradient norm that returns the optimiser of policy updates.
 
     Raises:
         ConfigError: The preset rotates the frame of a task that cannot be rotated, or trims a task that does not rest.
@@ -97,11 +97,11 @@ def _view(preset: Preset, task: AbstractTask) -> AbstractView:
 
 
 def check_frame(preset: Preset, task: AbstractTask) -> None:
-    """Raise if a preset does not support the frame of effective gravity.
+    """Raise an error if a preset does not support the frame of effective gravity.
 
     Raises:
         ConfigError: The task cannot be rotated, or its policy sees keypoints without a pose filter. The message names
-            the task, and the part that cannot be rotated.
+            the task and the part that cannot be rotated.
     """
     seen = task.observation_in_flight
     if isinstance(seen, Keypoints):
@@ -118,14 +118,14 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 def effective_gravity_frame(
     controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known: FittedResidual | None = None
 ) -> GravityFrame | PoseFrame:
-    """Return a controller in the frame of effective gravity, from a disturbance observer or from its own pose filter.
+    """Return a controller in the frame of effective gravity, which an observer or its own pose filter estimates.
 
     Args:
         controller: Controller that can be rotated into this frame.
         preset: Preset with the control period and the declared delay of the observer.
         vehicle: Vehicle with the command limits and the lag of the observer.
         known: Learned residual, with the learned bias of the body rates. The observer estimates the remaining
-            disturbance. A pose filter does not use it, and estimates the whole disturbance.
+            disturbance. A pose filter ignores the residual and estimates the whole disturbance.
     """
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):

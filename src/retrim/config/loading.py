@@ -1,4 +1,7 @@
-"""Load presets from names, TOML files, flags and JSON. Every mistake gives an error message of one line."""
+"""Load presets by name and from TOML files, flags and JSON.
+
+Every mistake raises an error with a one-line message.
+"""
 
 import dataclasses
 import json
@@ -22,9 +25,9 @@ def load(name: str, overlay: Path | None = None, *, trust: Collection[str] = ())
     """Return a preset.
 
     Args:
-        name: Name, as ``hover/fast``; ``PRESETS`` contains all of them.
+        name: Name, e.g. ``hover/fast``; ``PRESETS`` contains all names.
         overlay: TOML file with values that replace those of the preset.
-        trust: Python names that the file may contain, as ``mine:task``.
+        trust: Python names that the file may contain, e.g. ``mine:task``.
 
     Raises:
         ConfigError: There is no such preset, or the file cannot be used.
@@ -35,10 +38,12 @@ def load(name: str, overlay: Path | None = None, *, trust: Collection[str] = ())
 
 
 def load_for(task: str, name: str) -> Preset:
-    """Return a preset for a task. ``fast`` is short for ``hover/fast``; custom tasks use the hover presets.
+    """Return a preset for a task.
+
+    For the hover task, ``fast`` is short for ``hover/fast``. Custom tasks use the hover presets.
 
     Raises:
-        ConfigError: The preset does not exist, or is for another task.
+        ConfigError: The preset does not exist, or is for a different task.
     """
     preset = load(f"{task}/{name}" if f"{task}/{name}" in PRESETS else name)
     if preset.task == task:
@@ -49,15 +54,16 @@ def load_for(task: str, name: str) -> Preset:
 
 
 def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> Preset:
-    """Return a preset, with values replaced by those of a TOML file.
+    """Return a preset with values replaced by those of a TOML file.
 
     Args:
         preset: Preset with the values to replace.
         overlay: TOML file; the path of a vehicle file in it is relative to its folder.
-        trust: Python names that the file may contain, as ``mine:task``.
+        trust: Python names that the file may contain, e.g. ``mine:task``.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, has an invalid key or value, or an untrusted Python name.
+        ConfigError: The file cannot be read, is not TOML, or has an invalid key or value, or an untrusted
+            Python name.
     """
     above = beside(read_toml(overlay), overlay.parent)
     whole = validated(Preset, merged(values(preset), above), source=str(overlay))
@@ -82,7 +88,9 @@ def beside(above: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def with_vehicle(preset: Preset, vehicle: str | VehicleSpec) -> Preset:
-    """Return a preset for a vehicle. A vehicle file is stored by content, so that the preset is self-contained.
+    """Return a preset for a vehicle.
+
+    The preset stores the content of a vehicle file, so that it is self-contained.
 
     Raises:
         ConfigError: There is no such vehicle, or its file cannot be used.
@@ -97,9 +105,9 @@ def values(preset: Preset) -> dict[str, Any]:
 
 
 def parse(text: str | bytes, *, source: str) -> Preset:
-    """Return a preset from JSON, the inverse of :func:`dump`.
+    """Return a preset from JSON; this is the inverse of :func:`dump`.
 
-    Callers that read it from a file or a message must check its names (:func:`retrim.config.trust.check_trust`).
+    Callers that read the JSON from a file or a message must check its names (:func:`retrim.config.trust.check_trust`).
 
     Raises:
         ConfigError: The text is not a valid preset.
@@ -108,11 +116,11 @@ def parse(text: str | bytes, *, source: str) -> Preset:
 
 
 def missing_defaults(preset: Preset, text: str | bytes) -> dict[str, Any]:
-    """Return the values of a preset that are missing in its JSON, and so are defaults of this release, by dotted name.
+    """Return the preset values that are missing in its JSON, and so are defaults of this release, by dotted name.
 
     Args:
         preset: Result of :func:`parse` for the text.
-        text: JSON.
+        text: JSON of the preset.
     """
     return dict(_absent(values(preset), json.loads(text), ""))
 
@@ -126,7 +134,7 @@ def _absent(whole: dict[str, Any], given: Any, before: str) -> Iterator[tuple[st
 
 
 def changed(preset: Preset, **tables: Any) -> Preset:
-    """Return a preset with some values replaced, as in ``changed(preset, adapt={"num_updates": 5})``.
+    """Return a preset with some values replaced, e.g. ``changed(preset, adapt={"num_updates": 5})``.
 
     Args:
         preset: Preset with the values to replace.

@@ -37,7 +37,7 @@ class MethodRequest:
     policy: Any
     """Policy, or the network of a method that has its own."""
     key: Key[Array, ""] | None = None
-    """Seed of the random parts of the method; None for a deterministic method."""
+    """Random key of the method; None for a deterministic method."""
     latency: "Latency" = "fixed"
     state: LearnerState | None = None
     """Learner state of an earlier flight, from which to continue; None for a new one."""
@@ -58,7 +58,7 @@ class MethodRequest:
         )
 
     def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
-        """Return a state-feedback controller that suits the observation: with a pose filter if it observes keypoints.
+        """Adapt a state-feedback controller to the observation: add a pose filter if the policy observes keypoints.
 
         Args:
             controller: Controller that needs the state.
@@ -90,27 +90,27 @@ class MethodRequest:
 
 
 Prepare = Callable[["Setup", AbstractPolicy, Key[Array, ""]], AbstractPolicy | LoraPolicy]
-"""Returns the policy that the learners train, from set-up, policy and random key: the policy, or one with a delta."""
+"""Function of a set-up, a policy and a random key that returns the policy to train: the same, or one with a delta."""
 
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """A flight method. :func:`learning_method` makes the entry of a method that learns in flight."""
+    """A flight method; :func:`learning_method` makes the entry of a method that learns in flight."""
 
     make: Callable[[MethodRequest], Pilot]
     label: str
     """Name in tables."""
     on_board: Callable[["Setup", Plant], Plant] | None = None
-    """Adds an on-board motor controller to a plant; None for a method that commands thrust and body rates."""
+    """Function that adds an on-board motor controller to a plant; None if the method commands thrust and body rates."""
     learns: Prepare | None = None
-    """Prepares the policy for the learners; None for a method that does not learn in flight."""
+    """Function that prepares the policy for the learners; None for a method that does not learn in flight."""
 
     def fitted(self, setup: "Setup", plant: Plant) -> Plant:
         """Return the plant, modified as the method requires.
 
         Raises:
             ConfigError: The method does not support this plant.
-            PlantError: A package is not installed.
+            PlantError: A required package is not installed.
         """
         return plant if self.on_board is None else self.on_board(setup, plant)
 
@@ -123,7 +123,7 @@ def find_method(name: str) -> MethodEntry:
     """Return the entry of a method.
 
     Raises:
-        ConfigError: There is no method of that name, or the registered object is not a :class:`MethodEntry`.
+        ConfigError: There is no method with this name, or the registered object is not a :class:`MethodEntry`.
     """
     entry = METHODS.find(name)
     if not isinstance(entry, MethodEntry):
@@ -136,7 +136,7 @@ def learning_method(label: str, learns: Prepare) -> MethodEntry:
 
     Args:
         label: Name in tables.
-        learns: Prepares the policy for the learners.
+        learns: Function that prepares the policy for the learners.
     """
 
     def make(request: MethodRequest) -> Pilot:

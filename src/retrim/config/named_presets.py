@@ -1,4 +1,4 @@
-"""Named presets: those of the paper, that of the authors' code, and ours."""
+"""Named presets: those of the paper, one of the authors' code, and our own."""
 
 import dataclasses
 
@@ -120,7 +120,7 @@ PAPER_TRACK = Preset(
 )
 
 PRESETS: dict[str, Preset] = {
-    # Ours: the frame of effective gravity compensates in a second, and short bursts of learning reduce the rest.
+    # Ours: the frame of effective gravity compensates disturbances in a second; short learning bursts reduce the rest.
     "hover/retrim": RETRIM,
     # The same for any vehicle of a family, which is identified in flight.
     "hover/any": ANY,
@@ -130,14 +130,14 @@ PRESETS: dict[str, Preset] = {
     "track/any": TRACK_ANY,
     # The same at up to 8 m/s, for the kingfisher.
     "track/fast": TRACK_FAST,
-    # The loop of the paper with one tick of delay, the last two commands, and a small budget with the same final error.
+    # The paper's loop with one tick of delay, the last two commands, and a small budget with the same final error.
     "hover/fast": FAST,
     # The delay and the observation of the authors' code: 2 ticks, the last three commands, 200 x 200 x 150.
     "hover/released": Preset(
         name="hover/released", command_history=3, delay_ticks=2, pretrain=Pretrain(num_updates=200, num_envs=200)
     ),
-    # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150. The paper does not state learning rates of
-    # updates. At 1e-3 for all weights, the noise of ten starts changes the policy more than a small push does.
+    # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150. The paper does not state the learning rates
+    # of updates. At 1e-3 for all weights, the noise of ten starts changes the policy more than a small push does.
     "hover/paper": Preset(adapt=Adapt(learning_rate=5e-4, low_rank_learning_rate=1e-3)),
     # hover/fast at 100 Hz: the same times, with twice as many ticks.
     "hover/100hz": dataclasses.replace(
@@ -152,7 +152,7 @@ PRESETS: dict[str, Preset] = {
     ),
     # Ours: a preview of the reference, a sharp reward, one tick of delay and actuator lag in the model.
     "track/preview": TRACK,
-    # Tracking of the paper: reward, network, budgets and loop as printed, o = [p, R, v] with the tracking error.
+    # The paper's tracking: reward, network, budgets and loop as printed, o = [p, R, v] with the tracking error.
     "track/paper": PAPER_TRACK,
     # The same without the tracking error, in a literal reading of the paper: the policy cannot observe the phase of its
     # reference.
@@ -165,7 +165,7 @@ PRESETS: dict[str, Preset] = {
     "vision/occluded": OCCLUDED,
     # The same in the frame of effective gravity, estimated by its pose filter, with short bursts of learning.
     "vision/retrim": VISION_RETRIM,
-    # Sizes of the paper: raw pixels, 500 x 300, updates of 50 steps x 30 environments.
+    # The paper's sizes: raw pixels, 500 x 300, updates of 50 steps x 30 environments.
     "vision/paper": Preset(
         name="vision/paper",
         task="vision",

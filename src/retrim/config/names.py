@@ -1,4 +1,7 @@
-"""Valid characters of names. Names of presets, vehicles and tasks are written to pictures, pages and C headers."""
+"""Valid characters of names.
+
+The names of presets, vehicles and tasks are written to pictures, pages and C headers.
+"""
 
 import re
 from typing import Annotated
@@ -11,11 +14,11 @@ MOST = 64
 PLAIN = re.compile(rf"[\w./+ -]{{1,{MOST}}}", re.ASCII)
 PYTHON = re.compile(r"[\w.]{1,100}:\w{1,64}")
 LONGEST = 1024
-"""Maximum length of a path, and of several joined names [characters]."""
+"""Maximum length of a path or of several joined names [characters]."""
 
 
 def plain(name: str) -> str:
-    """Return a name if it consists of letters, digits, ``_ . / + -`` and spaces.
+    """Return the name if it consists of letters, digits, ``_ . / + -`` and spaces.
 
     Raises:
         ValueError: The name has other characters, is empty, or is too long.
@@ -26,7 +29,7 @@ def plain(name: str) -> str:
 
 
 def plain_or_python(name: str) -> str:
-    """Return a plain name or ``module:name``.
+    """Return the name if it is a plain name or ``module:name``.
 
     Raises:
         ValueError: The name has neither form.
@@ -35,7 +38,7 @@ def plain_or_python(name: str) -> str:
 
 
 def printable(name: str) -> str:
-    """Return a name or path if it is printable and of limited length.
+    """Return the name or path if it is printable and not too long.
 
     Raises:
         ValueError: The name is empty, too long, or not printable.
@@ -46,7 +49,7 @@ def printable(name: str) -> str:
 
 
 def plain_from(text: str) -> str:
-    """Return a plain name made from a text, with other characters replaced."""
+    """Return a plain name made from a text, with invalid characters replaced."""
     return re.sub(r"[^\w./+ -]", ".", text, flags=re.ASCII)[:MOST] or "unnamed"
 
 

@@ -26,7 +26,7 @@ class NetworkRequest:
     size: int
     """Length of the observation."""
     vehicle: Vehicle
-    """Vehicle with the limits of the commands."""
+    """Vehicle with the command limits."""
     key: Key[Array, ""]
     """Random key, consumed."""
 
@@ -44,7 +44,7 @@ def find_network(name: str) -> Callable[[NetworkRequest], Any]:
     """Return the function that builds a network.
 
     Raises:
-        ConfigError: There is no network of that name, or the registered object is not a function.
+        ConfigError: There is no network with this name, or the registered object is not a function.
     """
     make = NETWORKS.find(name)
     if not callable(make):

@@ -50,7 +50,7 @@ class PlantRequest:
     delay: float = DELAY
     """Command delay [s]."""
     address: str = ""
-    """Address of the vehicle; the default address of its link if empty."""
+    """Address of the vehicle; if empty, the default address of its link."""
     fault: AbstractMeasurementFault | None = None
     """Fault of the measurements; None for a plant without faults."""
 
@@ -63,7 +63,7 @@ class PlantEntry:
     about: str
     """Short description of the simulated system."""
     own_vehicle: str | None = None
-    """Name of its built-in vehicle; None if the plant simulates any vehicle."""
+    """Name of its built-in vehicle; None if the plant can simulate any vehicle."""
     has_sensors: bool = False
     """Whether it supports sensor models."""
     has_faults: bool = False
@@ -71,18 +71,18 @@ class PlantEntry:
     has_thrust_error: bool = False
     """Whether it supports an error of the thrust map."""
     has_delay: bool = False
-    """Whether it supports a chosen command delay."""
+    """Whether it supports a configurable command delay."""
     is_vehicle: bool = False
     """Whether it is a link to a vehicle, which runs in real time and whose world cannot be disturbed. An address may
-    follow its name, as in ``mavlink:udp:127.0.0.1:14540``, and it makes a
+    follow its name, e.g. ``mavlink:udp:127.0.0.1:14540``. The plant is then a
     :class:`~retrim.plants.bridges.vehicle_plant.VehiclePlant`."""
     has_world: bool = False
     """Whether retrim simulates the world around the vehicle, so that disturbances can be applied."""
     check_address: Callable[[str], object] | None = None
-    """Check of the address after the name of a vehicle; it raises ConfigError for an invalid one. None: no check."""
+    """Function that raises ConfigError if the address after a vehicle's name is invalid; None for no check."""
     needs: Callable[[], object] | None = None
-    """Check that required programs or packages are installed, called before training. It raises an error if one is
-    missing. None: no requirements."""
+    """Function, called before training, that raises an error if a required program or package is missing; None if there
+    are no requirements."""
 
 
 PLANTS: Registry[PlantEntry] = Registry("plant", example="module:name of a PlantEntry")

@@ -1,7 +1,7 @@
-"""Presets: all parameters of an experiment, as plain, validated values. :mod:`.named_presets` contains the named ones.
+"""Presets: all parameters of an experiment, as plain, validated values.
 
-A preset is a tree of frozen dataclasses. A TOML file and then command-line flags may replace its values. An unknown
-name or an impossible value raises an error that states its path.
+A preset is a tree of frozen dataclasses. :mod:`.named_presets` contains the named presets. A TOML file, and then
+command-line flags, may replace values. An unknown name or an impossible value raises an error that states its path.
 """
 
 import math
@@ -34,17 +34,18 @@ class Pretrain:
     horizon: Count = 150
     """Length of a roll-out [ticks]."""
     learning_rate: LearningRate = 5e-3
-    """Initial learning rate of Adam, with a cosine schedule to zero. Not in the paper; the authors' code has 5e-3."""
+    """Initial learning rate of Adam; a cosine schedule reduces it to zero. The paper does not state it; the authors'
+    code uses 5e-3."""
     adam_b2: float = Field(default=0.999, ge=0, lt=1, strict=True)
     """Second decay rate of Adam."""
     max_grad_norm: Positive | None = None
-    """Largest gradient norm; no clipping by default."""
+    """Largest gradient norm; by default, gradients are not clipped."""
     hidden_sizes: tuple[Count, ...] = Field(default=(512, 512), min_length=1, max_length=8)
-    """Widths of the hidden layers of the policy."""
+    """Widths of the hidden layers in the policy network."""
     network: Printable = "mlp"
-    """Network of the policy: mlp, a perceptron with ReLU, or module:name of a function that returns a network."""
+    """Policy network: mlp (a perceptron with ReLU), or module:name of a function that returns a network."""
     max_start_yaw: float = Field(default=math.pi, ge=0, le=math.pi, strict=True)
-    """Largest yaw angle of starts, in both directions [rad]."""
+    """Largest yaw angle of a start, in either direction [rad]."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -54,16 +55,16 @@ class Adapt:
     window: int = Field(default=100, ge=12, le=100_000, strict=True)
     """Length of the flight window that is kept [ticks]."""
     residual: Printable = "ensemble"
-    """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (an ensemble on the
-    remaining error of the regression), linear (19 features, carried along the flight), or module:name."""
+    """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (a regression, and
+    an ensemble for its remaining error), linear (19 features, learned over the whole flight), or module:name."""
     memory: Seconds = 0.5
-    """Regression: time after which the weight of a tick falls to 1/e of that of the newest [s]."""
+    """Regression: age at which the weight of a tick is 1/e of the newest tick's weight [s]."""
     thrust_prior: float = Field(default=0.05, gt=0, le=1.0, strict=True)
-    """Regression: prior standard deviation of the thrust gain [-]; one third more mass is a gain of -0.25."""
+    """Regression: prior standard deviation of the thrust gain [-]; one third more mass corresponds to -0.25."""
     fit_every: Seconds = 3.0
     """Time between residual fits [s]."""
     fit_steps: Count = 100
-    """Number of optimiser steps of one fit."""
+    """Number of optimiser steps per fit."""
     fit_learning_rate: LearningRate = 1e-2
     """Learning rate of Adam for the fit."""
     spectral_weight: float = Field(default=1e-3, ge=0, le=1e6, allow_inf_nan=False, strict=True)
@@ -71,32 +72,33 @@ class Adapt:
     update_every: Seconds = 5.0
     """Time between policy updates [s]."""
     num_updates: Count = 30
-    """Number of optimiser steps of one update."""
+    """Number of optimiser steps per update."""
     num_envs: Count = 10
     """Number of starts per step."""
     learning_rate: LearningRate = 1e-3
-    """Initial learning rate of Adam in an update, with a cosine schedule to zero."""
+    """Initial learning rate of Adam in an update; a cosine schedule reduces it to zero."""
     low_rank_learning_rate: LearningRate | None = None
-    """Learning rate for LoRA; by default that of all weights. A few directions must have the effect of all weights."""
+    """Learning rate for LoRA; by default the same as for all weights. A few directions must have the effect of all
+    weights."""
     max_grad_norm: Positive | None = None
-    """Largest gradient norm; no clipping by default."""
+    """Largest gradient norm; by default, gradients are not clipped."""
     learner: Printable = "bptt"
-    """Online learner: bptt, back-propagation through time in the corrected model, or module:name of a function of a
-    LearnerRequest."""
+    """Online learner: bptt (back-propagation through time in the corrected model), or module:name of a function that
+    takes a LearnerRequest."""
     optimiser: Printable = "fresh"
-    """Optimiser of updates. fresh: a new Adam for each update, whose rate falls to zero; carried: one Adam with a
-    constant rate; or module:name of an AbstractPolicyOptimiser."""
+    """Optimiser of policy updates: fresh (a new Adam for each update, whose rate falls to zero), carried (one Adam with
+    a constant rate), or module:name of an AbstractPolicyOptimiser."""
     task_starts: int | None = Field(default=None, ge=0, le=100_000, strict=True)
-    """Number of starts per step drawn from the task, by default all. The others are recent states of the vehicle."""
+    """Number of starts per step that are drawn from the task; by default all. The others are recent states."""
     start_noise: float = Field(default=0.1, ge=0, le=10.0, strict=True)
-    """Standard deviation of the noise on starts from the flight, position [m] and velocity [m/s]."""
+    """Standard deviation of the noise added to starts from the flight: position [m] and velocity [m/s]."""
     frame: Literal["world", "gravity"] = "world"
-    """Frame of flight and training. gravity: frame of effective gravity, from the prediction of the residual and a
-    disturbance observer. If the policy sees occluded keypoints, it comes from the pose filter, which does not need the
-    state."""
+    """Frame of flight and training. gravity: the frame of effective gravity, from the residual's prediction and a
+    disturbance observer. For a policy that sees occluded keypoints, the pose filter provides this frame without a
+    measured state."""
     trim: Literal["free", "rest"] = "free"
-    """Correction after an update. rest: the policy is shifted so that it commands hover at rest at home; free: no
-    correction."""
+    """Correction after an update. rest: the policy is shifted so that it commands hover when it is at rest at home;
+    free: no correction."""
     fit_latency: Seconds = 0.2
     """Flight time until a fitted residual is used [s]."""
     update_latency: Seconds = 1.0
@@ -105,53 +107,55 @@ class Adapt:
 
 @dataclass(frozen=True, config=STRICT)
 class Track:
-    """Parameters of tracking."""
+    """Parameters of the tracking task."""
 
     reference: Printable = "circle"
     """Training reference: circle, figure8, star, a CSV file, module:name, or several of these joined by +."""
     observation: Literal["blind", "relative", "both", "preview", "flat"] = "both"
     """Observation. blind: o = [p, R, v], without the reference; relative: o = [p - p_ref, R, v - v_ref]; both: o = [p,
     R, v, p - p_ref, v - v_ref]; preview: the reference relative to the vehicle, now and up to 0.4 s ahead; flat:
-    preview with acceleration and jerk."""
+    preview plus acceleration and jerk."""
     start_spread: Positive = 1.0
-    """Largest distance of starts from the reference, per axis [m]."""
+    """Largest distance of a start from the reference, per axis [m]."""
     felt_copies: int = Field(default=0, ge=0, le=100, strict=True)
     """Number of extra training copies of each reference, each in the effective gravity of a constant push."""
     felt_push: Positive = 4.0
-    """Largest push of these copies [m/s^2]."""
+    """Largest push in these copies [m/s^2]."""
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether the policy observes the future of its reference, so that one policy can follow several."""
+        """Whether the policy observes the future of its reference, so that one policy can follow several references."""
         return self.observation in ("preview", "flat")
 
 
 @dataclass(frozen=True, config=STRICT)
 class Vision:
-    """Parameters of hover from keypoints."""
+    """Parameters of hovering from keypoints."""
 
     occlusion: bool = Field(default=False, strict=True)
-    """In flight, points outside the image are not observed; otherwise all points are, as in the paper."""
+    """Whether points outside the image are hidden in flight; otherwise all points are observed, as in the paper."""
     pixel_noise: float = Field(default=0.0, ge=0, le=1000.0, strict=True)
-    """Standard deviation of a pixel coordinate, in training and flight [px]."""
+    """Standard deviation of the noise on pixel coordinates, in training and in flight [px]."""
     dropout: float = Field(default=0.0, ge=0, lt=1, strict=True)
-    """Probability that a visible point is missed in a frame; with occlusion only."""
+    """Probability that a visible point is missed in a frame; used only with occlusion."""
     whiten_pixels: bool = Field(default=False, strict=True)
     """Whether pixels are whitened over random short motions; otherwise raw pixels are used."""
     encoder_steps: int = Field(default=0, ge=0, le=1_000_000, strict=True)
-    """Number of optimiser steps of encoder pretraining, before policy training."""
+    """Number of optimiser steps that pretrain the encoder, before the policy is trained."""
     encoder_motions: Literal["near", "wild"] = "near"
     """Synthetic motions for encoder pretraining. near: those of a hovering vehicle; wild: about as large as those of a
-    random policy. Pixels are whitened over the near ones."""
+    random policy. Pixels are whitened over the near motions."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Family:
-    """Family of vehicles that one policy is trained for, as ranges of command paths. The policy observes the belief
-    about its vehicle, which comes from a vehicle file and from identification in flight."""
+    """Family of vehicles that one policy is trained for, as ranges of command paths.
+
+    The policy observes the belief about its vehicle, which comes from a vehicle file and from identification in flight.
+    """
 
     delay: tuple[NotNegative, Positive] = (0.0, 0.1)
-    """Shortest and longest delay of commands [s]."""
+    """Shortest and longest command delay [s]."""
     rate_lag: tuple[Positive, Positive] = (0.01, 0.25)
     """Smallest and largest time constant of the body rates, 2 zeta / omega_n [s]."""
     least_damping: Positive = 0.4
@@ -162,7 +166,7 @@ class Family:
     """Smallest natural frequency omega_n of a rate loop [rad/s]; slower rate loops have more damping."""
     excitation: bool = False
     """Whether a flight begins with small doublets of thrust and body rates, until the vehicle is identified. The
-    vehicle moves by a few centimetres. Not in live flights."""
+    vehicle moves by a few centimetres. Live flights do not use it."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -173,19 +177,19 @@ class Preset:
     task: TaskName = "hover"
     """Task: hover, track, vision, or module:name."""
     reward: Literal["paper", "l2", "stiff", "sharp", "view"] = "paper"
-    """Reward. paper: as printed; l2: ours, with a tip at the goal in hover; stiff: for hover, with cheap commands and a
-    steep tip; sharp: l2 with a tip at the reference, too; view: l2 that keeps keypoints in the image."""
+    """Reward. paper: as printed in the paper; l2: ours, with a tip at the goal in hover; stiff: for hover, with cheap
+    commands and a steep tip; sharp: l2 with a tip at the reference; view: l2 that also keeps keypoints in the image."""
     vehicle: Printable | VehicleSpec = "small"
     """Training vehicle: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
-    """Control period [s]: 50 Hz in the paper (Sec. III-E). A whole number of milliseconds."""
+    """Control period [s], a whole number of milliseconds; the paper uses 50 Hz (Sec. III-E)."""
     goal: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 1.0)
-    """Goal of hover, world frame [m]."""
+    """Goal of the hover task, world frame [m]."""
     termination_box: Positive = 5.0
-    """Largest distance from the goal or reference along an axis [m]; farther vehicles are terminated."""
+    """Largest distance from the goal or reference along any axis [m]; vehicles farther away are terminated."""
     axes: Literal["world", "heading"] = "world"
-    """Axes of the observed state. heading: they turn with the vehicle, so that a hover policy behaves the same at every
-    heading."""
+    """Axes of the observed state. heading: axes that turn with the vehicle, so that a hover policy behaves the same at
+    every heading."""
     command_history: int = Field(default=0, ge=0, le=50, strict=True)
     """Number of past commands in the observation."""
     delay_ticks: int = Field(default=0, ge=0, le=20, strict=True)
@@ -193,21 +197,21 @@ class Preset:
     plant_delay_ticks: int = Field(default=1, ge=0, le=20, strict=True)
     """Declared command delay of the plant [ticks], used to pair accelerations with commands."""
     actuator_tau: Positive | None = None
-    """Time constant of the actuators in the model [s]; by default without lag."""
+    """Time constant of the actuators in the model [s]; by default the model has no lag."""
     jump_cost: float = Field(default=0.0, ge=0.0, le=1e6, allow_inf_nan=False, strict=True)
-    """Weight of the cost of squared command changes between ticks, with c in m/s^2 and rates in rad/s."""
+    """Weight of the cost on squared command changes between ticks, with c in m/s^2 and rates in rad/s."""
     track: Track | None = None
     vision: Vision | None = None
     family: Family | None = None
-    """Family of training vehicles; None: only ``vehicle``."""
+    """Family of training vehicles; by default only ``vehicle``."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """Free table for a custom task."""
+    """Free-form table for a custom task."""
     pretrain: Pretrain = Field(default_factory=Pretrain)
     adapt: Adapt = Field(default_factory=Adapt)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Preset":
-        """Check that tables belong to the task, and that times fit the control period."""
+        """Check that the tables belong to the task, and that the times fit the control period."""
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")

@@ -38,9 +38,9 @@ def make_reference(names: str) -> Reference:
 
     Args:
         names: A registered name, ``module:name`` of a function that returns a reference, or a CSV file. A closed
-            trajectory of a file repeats as laps, any other ends after one pass; ``my.csv:laps`` requires laps,
-            ``my.csv:once`` requires one pass. A built-in shape may have a top speed [m/s], as ``circle=8``. Several
-            names, joined by ``+``, give a family.
+            trajectory in a file repeats as laps; any other trajectory ends after one pass. ``my.csv:laps`` requires
+            laps, and ``my.csv:once`` requires one pass. A built-in shape may have a top speed [m/s], e.g. ``circle=8``.
+            Several names joined by ``+`` form a family.
 
     Raises:
         ConfigError: There is no such reference, or its file cannot be used.
@@ -49,7 +49,7 @@ def make_reference(names: str) -> Reference:
 
 
 def make_training_reference(table: Track) -> Reference:
-    """Return the training reference: the named one, and copies in the effective gravity of constant pushes.
+    """Return the training reference: the named reference, and copies in the effective gravity of constant pushes.
 
     Raises:
         ConfigError: As for :func:`make_reference`.

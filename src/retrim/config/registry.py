@@ -1,7 +1,7 @@
-"""Registries: one for each kind of component of an experiment.
+"""Registries, one for each kind of component in an experiment.
 
 A name is looked up among the registered objects, then among the entry points of installed packages. ``module:name`` is
-imported from the Python path or the current folder. :mod:`.trust` checks names from files and messages before.
+imported from the Python path or the current folder. Names from files and messages are first checked by :mod:`.trust`.
 """
 
 import importlib
@@ -23,17 +23,17 @@ LIBRARIES = (
     *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
     "<",
 )
-"""Beginnings of the file names of code that is not the user's."""
+"""Beginnings of the paths of files without user code."""
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """Objects of one kind by name."""
+    """Objects of one kind, by name."""
 
     def __init__(self, kind: str, *, example: str) -> None:
         """Build an empty registry.
 
         Args:
-            kind: Kind of its objects, in the singular; its entry points have the group ``retrim.<kind>s``.
+            kind: Kind of its objects, in the singular; the group of its entry points is ``retrim.<kind>s``.
             example: Example name of a custom object, for error messages.
         """
         self._kind, self._example, self._known = kind, example, dict[str, T]()
@@ -52,7 +52,7 @@ class Registry(Mapping[str, T], Generic[T]):
         return thing
 
     def find(self, name: str) -> T:
-        """Return the object of that name.
+        """Return the object with this name.
 
         Raises:
             ConfigError: The name is unknown (the message suggests known names), or ``module:name`` cannot be imported.
@@ -76,7 +76,7 @@ class Registry(Mapping[str, T], Generic[T]):
             sys.path.append(here)
         try:
             result: T = getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # the module of a user can raise any exception
+        except Exception as error:  # a user's module can raise any exception
             raise ConfigError(f"{self._kind} {name!r} cannot be imported: {type(error).__name__}: {error}") from error
         return result
 
@@ -94,9 +94,9 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 def describe_user_error(error: Exception, words: Sequence[str]) -> str | None:
-    """Return a one-line message for an error that involves a module of the user, or None for other errors.
+    """Return a one-line message for an error that involves a user's module, or None for other errors.
 
-    The author of the module needs the mistake, not a stack trace of retrim.
+    The module's author needs to see the mistake, not retrim's stack trace.
 
     Args:
         error: Exception that was raised.

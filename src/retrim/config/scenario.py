@@ -22,19 +22,20 @@ class Scenario:
     """Plant, vehicle, sensors and disturbance of a flight, by name; validated on construction."""
 
     disturbance: str = "none"
-    """Name, name with a size, or sum, as ``wind=6+payload``."""
+    """Name, name with a size, or a sum such as ``wind=6+payload``."""
     plant: str = "bem"
     vehicle: str | VehicleSpec | None = None
-    """Vehicle of the flight; None: the training vehicle of the policy, or the built-in vehicle of the plant."""
+    """Vehicle of the flight; by default the policy's training vehicle, or the plant's built-in vehicle."""
     sensors: str = "ideal"
     thrust_error: float = THRUST_ERROR
-    """Relative thrust error; 0.1 means 10 % more thrust than commanded. Simulations of retrim only."""
+    """Relative thrust error; 0.1 means 10 % more thrust than commanded. Only retrim's simulations support it."""
     reference: str | None = None
-    """Reference of a tracking policy; None: the training reference."""
+    """Reference of a tracking policy; by default the training reference."""
     delay: float = DELAY
-    """Command delay of the plant [s]; simulations of retrim only. The policy does not receive it."""
+    """Command delay of the plant [s], unknown to the policy. Only retrim's simulations support it."""
     fault: str = NO_FAULT
-    """Fault of the measurements: name, or name with a size, as ``velocity-spikes=3``; simulations of retrim only."""
+    """Measurement fault: a name, or a name with a size such as ``velocity-spikes=3``. Only retrim's simulations support
+    it."""
 
     def __post_init__(self) -> None:
         """Raise :class:`ConfigError` for an unknown name, and for an option that the plant does not support."""
@@ -96,7 +97,7 @@ class Scenario:
         )
 
     def without_numbers(self) -> tuple["Scenario", tuple[str, ...]]:
-        """Return the scenario without the numbers of vehicle, delay and thrust error, which do not change the program.
+        """Return the scenario without the numbers that do not change the program: vehicle, delay and thrust error.
 
         Returns:
             The scenario without these numbers, and the names of the values that the vehicle file states.
@@ -115,8 +116,8 @@ class Scenario:
     def make_vehicle(self, trained_for: str | VehicleSpec) -> Vehicle:
         """Build the vehicle for the flight of a policy that was trained for ``trained_for``.
 
-        A plant with a built-in vehicle does not report its limits. For such a plant, this is the training vehicle,
-        whose limits the policy respects.
+        A plant with a built-in vehicle does not report its limits. For such a plant, the result is the training
+        vehicle, whose limits the policy respects.
         """
         return make_vehicle(self.vehicle or trained_for)
 
@@ -126,7 +127,7 @@ class Scenario:
         Args:
             trained_for: Training vehicle of the policy, used unless the scenario has a vehicle.
             dt: Control period [s].
-            seed: Seed of disturbance and sensors.
+            seed: Seed of the disturbance and the sensors.
 
         Raises:
             PlantError: A package that the plant needs is not installed.

@@ -52,7 +52,7 @@ from .tasks import TaskRequest, find_task, make_task
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
-"""Flight time that learning takes: fixed values of the preset, or the measured computing time."""
+"""Flight time that learning takes: fixed values from the preset, or the measured computing time."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class Setup:
 
     preset: Preset
     vehicle: Vehicle
-    """Vehicle of training."""
+    """Training vehicle."""
     env: Env
-    """Training environment: nominal model, task, delay."""
+    """Training environment: nominal model, task and delay."""
     flight_task: AbstractTask
     """Task of the flight: the training task, with the reference of the flight."""
     learner: OnlineLearner
@@ -83,7 +83,7 @@ class Setup:
 
         Args:
             preset: Preset of the experiment, or its name.
-            reference: Reference of a tracking flight, by name or as an object; by default that of training.
+            reference: Reference of a tracking flight, by name or as an object; by default the training reference.
             residual_model: Residual model of the learner; by default the model that the preset names.
 
         Raises:
@@ -130,10 +130,10 @@ class Setup:
         return cls(preset, vehicle, env, flight_task, learner, pretraining_optimiser(preset.pretrain))
 
     def on(self, reference: AbstractReference) -> "Setup":
-        """Return the same set-up with another reference for the flight and its learner.
+        """Return the same set-up with a different reference for the flight and its learner.
 
         Args:
-            reference: New reference. Programs are compiled again if its array sizes differ from the present ones.
+            reference: New reference. Programs are compiled again if its array sizes differ from the current ones.
         """
 
         def other(part: Any) -> Any:
@@ -163,7 +163,7 @@ class Setup:
 
         Yields:
             The policy after every few steps, and the losses of those steps. If the preset has encoder steps, the
-            encoder is trained before the first value.
+            encoder is trained before the first value is yielded.
         """
         k_init, k_train = random.split(random.key(seed))
         fresh, p = self.new_policy(k_init), self.preset.pretrain
@@ -185,7 +185,7 @@ class Setup:
         return ((state.policy.merged(), losses) for state, losses in chunks)
 
     def pretrained(self, seed: int = 0) -> AbstractPolicy:
-        """Return a policy trained from scratch, without progress reports; :meth:`pretraining` shows progress."""
+        """Return a policy trained from scratch, without progress reports; :meth:`pretraining` reports progress."""
         ((last, _),) = deque(self.pretraining(seed), maxlen=1)
         return last
 
@@ -202,9 +202,9 @@ class Setup:
 
         Args:
             policy: Policy of this preset, or the network of a method that has its own.
-            method: Method: ``base`` flies the policy unchanged, ``full`` and ``lora`` re-train it in flight; or another
-                registered name.
-            key: Seed of the learners; consumed. Methods that do not learn do not need it.
+            method: Registered name of a method. ``base`` flies the policy unchanged; ``full`` and ``lora`` re-train it
+                in flight.
+            key: Random key of the learners; consumed. Methods that do not learn do not need it.
             latency: Flight time that learning takes.
             state: Learner state of an earlier flight, from which to continue.
 
@@ -212,7 +212,7 @@ class Setup:
             ConfigError: There is no such method, or it does not suit the task.
             ValueError: The method needs a key.
         """
-        from .methods import MethodRequest, find_method  # here: methods import set-ups
+        from .methods import MethodRequest, find_method  # imported here, because this module is imported there
 
         pilot = find_method(method).make(MethodRequest(self, policy, key, latency, state))
         if pilot.dt is None:  # a controller does not store its control period
@@ -222,7 +222,7 @@ class Setup:
     def controller(self, state: LearnerState) -> AbstractController[Any]:
         """Return the controller of an adapting policy, with its observation and in the frame of the preset.
 
-        In the frame of effective gravity, a monitor steps back from learned parameters if they make the flight worse.
+        In the frame of effective gravity, a monitor reverts learned parameters that make the flight worse.
         """
         plain = policy_controller(self.preset, self.flight_task, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
@@ -235,14 +235,14 @@ class Setup:
         return monitor if self.preset.family is None else identify_vehicle(monitor, self.preset)
 
     def low_rank(self, policy: AbstractPolicy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
-        """Return ``policy`` with a fresh low-rank delta (ranks 4, 10, 1 and scale 4, as in the paper).
+        """Return ``policy`` with a fresh low-rank delta (ranks 4, 10 and 1, and scale 4, as in the paper).
 
         Raises:
             ConfigError: The policy is not a perceptron with three layers, or a layer is too narrow for its rank.
         """
         try:
             return low_rank(policy, key)
-        except ValueError as error:  # its traced message has several lines
+        except ValueError as error:  # the message of a traced function has several lines
             raise ConfigError(f"preset {self.preset.name!r}: {str(error).splitlines()[0]}") from error
 
     def adaptive_pilot(
@@ -263,16 +263,16 @@ class Setup:
         return AdaptivePilot(self.controller, state, learners, dt=dt, window=a.window)
 
     def flight_starts(self, n: int, seed: int = 0) -> list[State]:
-        """Return ``n`` starts: +- 1 m per axis from the task's home, 18 degrees about each axis, 0.1 m/s.
+        """Return ``n`` starts: +- 1 m per axis from the task's home, 18 degrees about each axis, and 0.1 m/s.
 
         They depend only on the seed and the home, so that all presets of a task use the same starts.
         """
         return flight_starts(self.flight_task.home(), n, seed)
 
     def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
-        """Return the limits of a vehicle that the reference of the flight exceeds, as text; None if there are none.
+        """Describe the limits of a vehicle that the flight's reference exceeds; return None if it exceeds none.
 
         Args:
-            vehicle: Vehicle of the flight; by default that of training.
+            vehicle: Vehicle of the flight; by default the training vehicle.
         """
         return None if self.followed is None else self.followed.infeasibility(vehicle or self.vehicle)

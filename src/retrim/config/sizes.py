@@ -1,4 +1,4 @@
-"""Parse names with a size, as ``wind=6``."""
+"""Parse names with a size, e.g. ``wind=6``."""
 
 from ..errors import ConfigError, excerpt
 
@@ -7,7 +7,7 @@ def name_and_size(text: str, kind: str) -> tuple[str, float | None]:
     """Split a name with an optional size.
 
     Args:
-        text: Name, as ``wind`` or ``wind=6``.
+        text: Name, e.g. ``wind`` or ``wind=6``.
         kind: Kind of the named object, for error messages.
 
     Returns:

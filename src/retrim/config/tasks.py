@@ -55,11 +55,11 @@ class TaskRequest:
 
     @property
     def options(self) -> Mapping[str, Any]:
-        """The free table of the preset, for custom tasks."""
+        """Free-form table of the preset, for custom tasks."""
         return self.preset.options
 
     def state_observation(self) -> StateObs:
-        """Return the observation of the paper, o = [p, R, v], with the past commands of the preset."""
+        """Return the paper's observation, o = [p, R, v], and as many past commands as the preset has."""
         return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
 
     def of_vehicle(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
@@ -72,8 +72,9 @@ class TaskRequest:
         """Return a hover task with the settings of the preset.
 
         Args:
-            reward: Reward from goal [m], state and command; by default that of the preset.
-            goal: Position of a goal that moves [m], world, by time [s]; by default the goal of the preset.
+            reward: Function of goal [m], state and command; by default the reward of the preset.
+            goal: Function of time [s] that returns the position of a moving goal, world [m]; by default the goal of the
+                preset.
 
         Example::
 
@@ -97,7 +98,7 @@ class TaskRequest:
         return hover if goal is None else MovingGoal(hover, goal)
 
     def observed_commands(self) -> tuple[Float[Array, "3"], int]:
-        """Return the scale of observed body rates [rad/s], and the number of observed past commands."""
+        """Return the scale of the observed body rates [rad/s], and the number of observed past commands."""
         return self.vehicle.omega_max, self.preset.command_history
 
 
@@ -107,9 +108,9 @@ class TaskEntry:
 
     make: Callable[[TaskRequest], AbstractTask]
     default_preset: str = "hover/fast"
-    """Default preset of training."""
+    """Default preset for training."""
     has_reference: bool = False
-    """Whether it tracks a reference."""
+    """Whether the task tracks a reference."""
 
 
 TASKS: Registry[TaskEntry] = Registry("task", example="module:name of a TaskEntry")

@@ -1,11 +1,11 @@
-"""The trust boundary: Python names of files and messages.
+"""The trust boundary: Python names in files and messages.
 
-Registered names are always allowed. ``module:name`` imports a module and calls an object of it. Such a name is accepted
-on the command line and in Python. In a file or a message it is refused, unless the user names it as well: ``--trust
-mine:task``, or ``trust=("mine:task",)``.
+Registered names are always allowed. ``module:name`` imports a module and calls one of its objects. Such a name is
+accepted on the command line and in Python. In a file or a message it is rejected, unless the user also passes it as
+``--trust mine:task`` or ``trust=("mine:task",)``.
 
 Readers of policies, learner states, presets, sweeps and network messages call :func:`check_trust` before they build
-anything. Starters of processes pass :func:`python_names` of the names that the user gave.
+anything. Code that starts processes passes on :func:`python_names` of the names that the user gave.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from ..errors import ConfigError, excerpt
 CSV_FILE = re.compile(r"[^:]*\.csv(:(laps|once))?", re.IGNORECASE)
 """Name of a trajectory file. A colon in it does not mark a Python name, but a choice between laps and one pass."""
 FREE = "options"
-"""Table of a custom task, in which this package does not look up names."""
+"""Table of a custom task; this package does not look up names in it."""
 
 
 def python_names(values: Any) -> tuple[str, ...]:
@@ -31,12 +31,12 @@ def python_names(values: Any) -> tuple[str, ...]:
 
 
 def check_trust(values: Any, trust: Collection[str], *, source: str) -> None:
-    """Refuse the Python names of a file or message, except those that the user trusts.
+    """Reject Python names in a file or message, except those that the user trusts.
 
     Args:
         values: Content of the file or message, before anything is built from it.
-        trust: Names as ``mine:task``.
-        source: Where it comes from; the message begins with it.
+        trust: Names that the user trusts, e.g. ``mine:task``.
+        source: Source of the values; the error message begins with it.
 
     Raises:
         ConfigError: The values contain a name that the user does not trust.

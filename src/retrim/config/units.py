@@ -1,4 +1,4 @@
-"""Checks of units: numbers in a wrong unit are rejected, and the message suggests the probable unit."""
+"""Unit checks: a number in a wrong unit is rejected, and the message suggests the probable unit."""
 
 from collections.abc import Callable, Iterable
 from typing import Annotated
@@ -10,12 +10,12 @@ Three = tuple[Positive, Positive, Positive]
 
 
 def at_most(largest: float, unit: str, *others: tuple[str, float]) -> Callable[[float], float]:
-    """Return a validator that rejects larger numbers, and suggests another unit if the number fits there.
+    """Return a validator that rejects larger numbers, and suggests a different unit if the number fits it.
 
     Args:
         largest: Largest accepted value.
         unit: Unit of the value.
-        others: Units that are easily confused with it, in order of preference: name, and size in ``unit``.
+        others: Units that are easily confused with it, in order of preference: the name and the size in ``unit``.
     """
 
     def validate(value: float) -> float:
@@ -30,5 +30,5 @@ def at_most(largest: float, unit: str, *others: tuple[str, float]) -> Callable[[
 
 
 def likely(questions: Iterable[tuple[str, float]], least: float, most: float) -> str:
-    """Return the first question whose number is within the bounds, after a semicolon, or an empty string."""
+    """Return a semicolon and the first question whose number is within the bounds, or an empty string."""
     return next((f"; {question}" for question, value in questions if least <= value <= most), "")

@@ -1,4 +1,4 @@
-"""Read TOML files, and validate tables against dataclasses. Error messages have one line."""
+"""Read TOML files, and validate tables against dataclasses; error messages have one line."""
 
 import dataclasses
 import difflib
@@ -15,7 +15,7 @@ from ..errors import ConfigError, excerpt
 T = TypeVar("T")
 
 CHECKED, TOLD = 100, 8
-"""Largest numbers of mistakes in one file that are examined, and that are listed."""
+"""Largest numbers of mistakes per file that are examined and that are listed."""
 UNKNOWN = "unknown key"
 NO_NAME = "Input should be a valid string"
 MAX_TOML_BYTES = 1_000_000
@@ -25,7 +25,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file.
 
     Raises:
-        ConfigError: The path is not a regular file, the file is too large or cannot be read, or is not TOML.
+        ConfigError: The path is not a regular file, or the file is too large, cannot be read, or is not TOML.
     """
     try:
         if not path.is_file():
@@ -33,7 +33,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         if path.stat().st_size > MAX_TOML_BYTES:
             raise ConfigError(f"{path}: larger than the {MAX_TOML_BYTES} bytes that are accepted")
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # a ValueError, too: an integer of 5,000 digits
+    except (ValueError, RecursionError) as error:  # an integer of 5,000 digits also raises ValueError
         raise ConfigError(f"{path}: not TOML ({error})") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
@@ -43,7 +43,7 @@ def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: st
     """Build a dataclass from tables or JSON.
 
     Args:
-        kind: Type of the dataclass.
+        kind: Dataclass to build.
         tables: Values, as dictionaries or as JSON.
         source: Source of the values; error messages begin with it.
 
@@ -83,7 +83,7 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
 
 
 def _keys(kind: type[Any], path: Sequence[str]) -> list[str]:
-    """Return the keys of the table at a path. Parts that are not keys, as members of a union, are skipped."""
+    """Return the keys of the table at a path. Parts that are not keys, such as members of a union, are skipped."""
     for part in path:
         annotation = typing.get_type_hints(kind).get(part)
         nested = [each for each in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(each)]

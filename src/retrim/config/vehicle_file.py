@@ -1,4 +1,4 @@
-"""Vehicles from TOML files, with values that can be measured or looked up; fixed rules give all other values."""
+"""Vehicles from TOML files with values that can be measured or looked up; fixed rules give all other values."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ Lag = Annotated[Positive, AfterValidator(at_most(2.0, "s", *MILLI))]
 
 
 OVERSHOOT, SLOWEST = 0.6, (0.25, 0.25, 1.5)
-"""Limits of a step response of the rates: largest overshoot, and longest time to 63 % for each axis [s]."""
+"""Limits of the step response of the rates: the largest overshoot, and the longest time to 63 % for each axis [s]."""
 LONGEST_ARM = 2.0  # [m]
 ENOUGH = (1.6, 20.0)
 """Smallest and largest ratio of the total rotor thrust to the weight."""
@@ -39,7 +39,7 @@ class VehicleSpec:
     mass: Annotated[float, Field(gt=0.005, strict=True), AfterValidator(at_most(50.0, "kg", ("g", 1e-3)))]
     """All-up mass [kg]."""
     inertia: Three
-    """Diagonal of the inertia, body frame [kg m^2]."""
+    """Diagonal of the inertia tensor, body frame [kg m^2]."""
     arm: tuple[Positive, Positive]
     """Distance of the rotors from the centre along body x and y [m]."""
     thrust_max: Positive
@@ -49,25 +49,25 @@ class VehicleSpec:
     motor_tau: Annotated[float, Field(gt=0, strict=True), AfterValidator(at_most(0.5, "s", *MILLI))]
     """Time constant of the motors [s]."""
     rate_lag: tuple[Lag, Lag, Lag] | None = None
-    """Time constants of the body rates after commands: roll, pitch, yaw [s]; by default those of the simulated rate
-    loop, which depend on the motors. Policies are trained for them, and for a thrust with the time constant of the
-    motors."""
+    """Time constants with which the body rates follow commands: roll, pitch, yaw [s]; by default those of the simulated
+    rate loop, which depend on the motors. Policies are trained for them, and for a thrust with the time constant of
+    the motors."""
     rate_damping: tuple[Damping, Damping, Damping] | None = None
     """Damping ratios of the rate loops: roll, pitch, yaw; by default the loops are of first order. With damping ratios,
     ``rate_lag`` is 2 zeta / omega_n."""
     command_delay: Annotated[float, Field(ge=0, strict=True), AfterValidator(at_most(0.2, "s", *MILLI))] | None = None
     """Time between a command and its effect [s]; by default that of the preset. Policies are trained for it, in whole
-    ticks, and learners use it to pair accelerations with the commands that caused them."""
+    ticks. Learners use it to pair accelerations with the commands that caused them."""
     propeller: Literal["3 inch", "5 inch"] | None = None
     """Blade geometry that is scaled to the vehicle; by default the one with the closer diameter."""
     propeller_diameter: Positive | None = None
     """Propeller diameter [inch]: 0.3 to 1.3 times the distance between adjacent rotors; by default 0.9 times."""
     drag_area: Three | None = None
-    """Drag area c A of the body along its axes [m^2]; by default that of the kingfisher, scaled by arm squared."""
+    """Drag area c A of the body along its axes [m^2]; by default that of the kingfisher, scaled by the squared arm."""
 
     @model_validator(mode="after")
     def _possible(self) -> "VehicleSpec":
-        """Raise if no such vehicle can exist."""
+        """Raise an error if no such vehicle can exist."""
         weight, thrust = self.mass * STANDARD_GRAVITY, self.thrust_max
         if thrust <= 1.2 * weight:
             raise ValueError(
@@ -133,9 +133,9 @@ class VehicleSpec:
     def build(self) -> Vehicle:
         """Return the vehicle.
 
-        The propeller is a scaled published one. Chord and radius scale with the diameter. Rotor speeds are such that a
-        rotor reaches a quarter of ``thrust_max`` at 90 % of its largest speed. The ratio of drag torque to thrust
-        scales with the diameter, and the rotor inertia with its fifth power.
+        The propeller is a scaled copy of a published one. Its chord and radius scale with the diameter. The rotor
+        speeds are chosen so that a rotor reaches a quarter of ``thrust_max`` at 90 % of its largest speed. The ratio of
+        drag torque to thrust scales with the diameter, and the rotor inertia with the fifth power of the diameter.
         """
         reach = math.hypot(*self.arm)
         inches = self.propeller_diameter or 0.9 * 2.0 * min(self.arm) / INCH
@@ -175,10 +175,10 @@ class VehicleSpec:
 
 
 def check_flyable(vehicle: Vehicle) -> None:
-    """Raise if a simulated rate loop cannot fly a vehicle.
+    """Raise an error if a simulated rate loop cannot fly the vehicle.
 
     Raises:
-        ValueError: A step response of the rates overshoots too much or rises too slowly; the message has its values.
+        ValueError: A step response of the rates overshoots too much or rises too slowly; the message states its values.
     """
     for axis, result, slowest in zip(("roll", "pitch", "yaw"), step_responses(vehicle), SLOWEST, strict=True):
         if result.overshoot > OVERSHOOT or result.rise > slowest:

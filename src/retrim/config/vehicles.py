@@ -19,7 +19,7 @@ register_vehicle = VEHICLES.register
 
 
 def is_published(vehicle: str | VehicleSpec) -> bool:
-    """Return whether a vehicle is a published one, with a rate loop that others have used in flight."""
+    """Return whether a vehicle is a published one, whose rate loop others have used in flight."""
     return isinstance(vehicle, str) and vehicle in PUBLISHED
 
 
@@ -60,5 +60,5 @@ def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
 
 
 def name_of(vehicle: str | VehicleSpec) -> str:
-    """Return the name of the vehicle, for results."""
+    """Return the vehicle's name for use in results."""
     return vehicle.name if isinstance(vehicle, VehicleSpec) else vehicle

@@ -16,14 +16,14 @@ from .controller import AbstractController
 
 
 class TrackingState(eqx.Module):
-    """Memory of the tracking and of the controller inside."""
+    """Memory of the tracking and of the inner controller."""
 
     rates: BodyRates
     inner: Any
 
 
 class ActuatorTracking(AbstractController[TrackingState]):
-    """Provides the controller inside with the present thrust and body rates.
+    """Provides the inner controller with the present thrust and body rates.
 
     The command path predicts them. A gyroscope, or the measured attitudes, corrects the body rates.
     """
@@ -39,19 +39,19 @@ class ActuatorTracking(AbstractController[TrackingState]):
     """Age of measurements [s]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "ActuatorTracking":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "ActuatorTracking":
-        """Return the same for a tick in which body rates and acceleration were measured."""
+        """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega)
 
     def with_vehicle(self, member: Member) -> "ActuatorTracking":
-        """Return the same for an identified vehicle."""
+        """Return the same controller for an identified vehicle."""
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member), path=member.path)
 
     def condition(self, memory: TrackingState) -> Condition | None:
-        """Return the condition of the controller inside."""
+        """Return the condition of the inner controller."""
         return self.inner.condition(memory.inner)
 
     def init(self, x: State) -> TrackingState:
@@ -59,7 +59,7 @@ class ActuatorTracking(AbstractController[TrackingState]):
         return TrackingState(BodyRates.start(x, self.dt), self.inner.init(x))
 
     def __call__(self, memory: TrackingState, t: Float[Array, ""], x: State) -> tuple[Command, TrackingState]:
-        """Return the command of the controller inside, which receives the present thrust and body rates."""
+        """Return the command of the inner controller, which receives the present thrust and body rates."""
         rates = memory.rates.measured(x, self.age, self.path, self.dt, self.omega)
         u, inner = self.inner.with_actuators(rates.path.actuators)(memory.inner, t, x)
         return u, TrackingState(rates.issued(u, self.path, self.dt), inner)

@@ -8,7 +8,7 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.abstract_reference import Point
 from ..tasks.flatness import flat_command
 
-LEAST_LIFT = 2.0  # [m/s^2], smallest upward part of a desired thrust, which the attitude needs to be defined
+LEAST_LIFT = 2.0  # [m/s^2], smallest upward part of a desired thrust; without it, the attitude is not defined
 STEEPEST = 4.0  # tangent of the largest desired tilt, 76 degrees
 
 
@@ -37,12 +37,12 @@ def thrust_of(acceleration: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def command_for(x: State, thrust: Float[Array, "3"], wanted: Point, gain: Float[Array, "3"]) -> Command:
-    """Return the command that turns a vehicle to a thrust; its collective thrust is the part along the present axis.
+    """Return the command that turns a vehicle to a thrust; its collective thrust is the part along the present z axis.
 
     Args:
         x: State in which the command begins to act.
         thrust: Desired mass-normalised thrust, world [m/s^2].
-        wanted: Reference, for its heading and the rate of its attitude.
+        wanted: Reference, which provides the heading and the attitude rate.
         gain: Body rate per radian of attitude error, about each body axis [1/s].
 
     Source:

@@ -1,8 +1,8 @@
 """Detect a vehicle that oscillates by itself, and assume that it is slower until it is calm.
 
-A policy that assumes a faster vehicle than it flies turns back too late and drives the vehicle back and forth. The
-estimate of the vehicle cannot show this, since it may be the cause. The attitude shows it: the tilt swings by many
-times the amount that a push, a gust or a kick causes, and does not stop.
+A policy that assumes a faster vehicle than the actual one turns back too late and drives the vehicle back and forth.
+The estimate of the vehicle cannot show this, since it may be the cause. The attitude can: the tilt swings by many times
+the amount that a push, a gust or a kick causes, and does not stop.
 """
 
 import equinox as eqx
@@ -13,13 +13,13 @@ from ..physics.path_family import PathBelief
 from ..physics.state import STANDARD_GRAVITY, State
 from .swings import Swings
 
-# Size of the swings of the thrust axis, times gravity: the largest kick of the gauntlet reaches 36 for a second, and
-# flights on 60 vehicles with a true belief 15 otherwise; self-induced oscillations stay between 45 and 145.
+# Size of the swings of the thrust axis, times gravity. The largest kick of the gauntlet reaches 36 for a second;
+# otherwise, flights on 60 vehicles with a true belief reach 15. Self-induced oscillations stay between 45 and 145.
 LARGE, FULL = 30.0, 60.0
-RISE = 3.0  # [1/s], largest rate of the level
-MEMORY = 6.0  # [s], time constant of its decay; a caution that stays makes the flight inaccurate
+RISE = 3.0  # [1/s], largest rate at which the level rises
+MEMORY = 6.0  # [s], time constant of its decay; lasting caution makes the flight inaccurate
 REPORTED = 0.1  # level from which the log reports the oscillation
-MORE = 0.5  # share by which the gain of the thrust may be larger than estimated
+MORE = 0.5  # share by which the thrust gain may be larger than estimated
 SLOWER = (1.0, 1.0, 0.0, 0.0)  # coordinates that the level changes: delay and rate lag
 
 
@@ -28,7 +28,7 @@ class Caution(eqx.Module):
 
     swings: Swings
     level: Float[Array, ""]
-    """0 for the identified vehicle, 1 for the slowest vehicle of the family."""
+    """Level from 0 (the identified vehicle) to 1 (the slowest vehicle of the family)."""
 
     @classmethod
     def none(cls, x: State) -> "Caution":
@@ -54,16 +54,16 @@ class Caution(eqx.Module):
         return PathBelief.between(low, high)
 
     def gain(self, gain: Float[Array, ""]) -> Float[Array, ""]:
-        """Return a gain of the thrust that is larger by the level of caution, so that the commands are smaller.
+        """Return a thrust gain that is larger by the level of caution, so that the commands are smaller.
 
-        Too small a gain makes all loops stiffer; too large a gain costs some centimetres, which the observer removes.
+        Too small a gain makes all loops stiffer; too large a gain costs a few centimetres, which the observer removes.
 
         Args:
-            gain: Estimated gain of the thrust.
+            gain: Estimated thrust gain.
         """
         return gain * (1.0 + MORE * self.level.astype(gain.dtype))
 
 
 def _tilt(x: State) -> Float[Array, "3"]:
-    """Return the acceleration by the thrust of a hover at this attitude, world [m/s^2]."""
+    """Return the acceleration from hover thrust at this attitude, world [m/s^2]."""
     return STANDARD_GRAVITY * x.R[:, 2]

@@ -1,4 +1,4 @@
-"""Condition of a controller that can step back from a part of its function, and its description in words."""
+"""Condition of a controller that can step back from some of its functions, and its description in words."""
 
 from enum import IntEnum
 
@@ -17,7 +17,7 @@ class Stage(IntEnum):
 
 
 class Cause(IntEnum):
-    """Reason of the last change of the stage."""
+    """Reason for the last change of stage."""
 
     NONE = 0
     ERROR = 1

@@ -26,19 +26,19 @@ class AbstractController(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def init(self, x: State) -> M:
-        """Return the memory at the start of a flight in the state ``x``; JAX traces it, as it traces calls."""
+        """Return the memory at the start of a flight in the state ``x``; JAX traces this method and calls."""
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State) -> tuple[Command, M]:
         """Return the next command.
 
         Args:
-            memory: Result of :meth:`init` or of the last call.
+            memory: Result of :meth:`init` or of the previous call.
             t: Time since the start of the flight [s].
             x: Measured state.
 
         Returns:
-            The command, and the new memory of the same shapes.
+            The command, and the new memory with the same shapes.
         """
 
     def accepted(self, memory: M, u: Command) -> M:
@@ -47,7 +47,7 @@ class AbstractController(eqx.Module, Generic[M]):
         return memory
 
     def with_age(self, age: float | Float[Array, ""]) -> "AbstractController[M]":
-        """Return the same controller for measurements ``age`` old [s]; by default the age is ignored."""
+        """Return the same controller for measurements that are ``age`` old [s]; by default the age is ignored."""
         del age
         return self
 
@@ -104,7 +104,7 @@ class AbstractController(eqx.Module, Generic[M]):
         return None
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractController[M]":
-        """Return the same controller for states and commands of ``frame``.
+        """Return the same controller for states and commands in ``frame``.
 
         Raises:
             FrameError: The controller does not support other frames.
@@ -113,7 +113,7 @@ class AbstractController(eqx.Module, Generic[M]):
 
 
 class PolicyController(AbstractController[tuple[Any, Command]]):
-    """A policy with its observation. The memory consists of that of the observation and the last command."""
+    """A policy with its observation; the memory holds the observation's memory and the last command."""
 
     observation: AbstractObservation[Any]
     policy: AbstractPolicy
@@ -125,7 +125,7 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
     def __call__(
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
     ) -> tuple[Command, tuple[Any, Command]]:
-        """Evaluate observation and policy once."""
+        """Evaluate the observation and the policy once."""
         remembered, last = memory
         o, remembered = self.observation(remembered, t, x, last)
         u = self.policy(o)
@@ -136,11 +136,11 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
         return memory[0], u
 
     def with_vehicle(self, member: Member) -> "PolicyController":
-        """Return the same policy with the observation of an identified vehicle."""
+        """Return the same policy with the observation for an identified vehicle."""
         return dataclasses.replace(self, observation=self.observation.with_belief(member.belief))
 
     def with_actuators(self, actuators: ActuatorState) -> "PolicyController":
-        """Return the same policy with the observation of a vehicle whose thrust and rates are known."""
+        """Return the same policy with the observation for a vehicle whose thrust and rates are known."""
         return dataclasses.replace(self, observation=self.observation.with_actuators(actuators))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "PolicyController":

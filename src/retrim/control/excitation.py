@@ -1,7 +1,7 @@
 """Active exploration: small doublets of thrust and body rates while the command path is not known well enough.
 
 Each pulse train is (+, -, -, +), so that it leaves neither a velocity nor a displacement. The vehicle moves by a few
-centimetres. A policy does not excite by default; the caller adds the result to the command.
+centimetres. By default, a policy does not excite the vehicle; the caller adds the result to the command.
 """
 
 import equinox as eqx
@@ -22,13 +22,13 @@ class Excitation(eqx.Module):
     rates: Float[Array, "3"]
     """Amplitudes of the body rates [rad/s]."""
     pulse: Float[Array, "4"]
-    """Length of a pulse of thrust, roll, pitch and yaw [s]."""
+    """Pulse lengths of thrust, roll, pitch and yaw [s]."""
     delay_margin: Float[Array, ""]
     """Sufficient half width of the 90 % interval of the delay [s]."""
     lag_margin: Float[Array, ""]
-    """The same for the lag of the rates, as a share of the lag."""
+    """The same for the rate lag, as a share of the lag."""
     gain_margin: Float[Array, ""]
-    """The same for the gain of the thrust, as a share of the gain."""
+    """The same for the thrust gain, as a share of the gain."""
     longest: Float[Array, ""]
     """Time after which the excitation ends in any case [s]."""
 
@@ -49,8 +49,8 @@ class Excitation(eqx.Module):
             thrust: Amplitude of the thrust [m/s^2].
             rates: Amplitudes of the body rates [rad/s].
             delay_margin: Sufficient half width of the 90 % interval of the delay [s].
-            lag_margin: The same for the lag of the rates, as a share of the lag.
-            gain_margin: The same for the gain of the thrust, as a share of the gain.
+            lag_margin: The same for the rate lag, as a share of the lag.
+            gain_margin: The same for the thrust gain, as a share of the gain.
             longest: Time after which the excitation ends in any case [s].
 
         Raises:

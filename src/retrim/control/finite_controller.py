@@ -24,7 +24,7 @@ class FiniteMemory(eqx.Module, Generic[M]):
     """Memory of a :class:`FiniteController`."""
 
     inner: M
-    """Memory of the controller inside, after the last tick with a finite measurement."""
+    """Memory of the inner controller, after the last tick with a finite measurement."""
     last: Command
     """Command of that tick."""
     is_finite: Bool[Array, ""]
@@ -32,7 +32,7 @@ class FiniteMemory(eqx.Module, Generic[M]):
 
 
 class FiniteController(AbstractController[FiniteMemory[Any]]):
-    """Repeats the last command and keeps its memory while measurement or command are not finite.
+    """Repeats the last command and keeps its memory while the measurement or the command is not finite.
 
     Exported policies behave in the same way, tick by tick.
     """
@@ -46,7 +46,7 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
     def __call__(
         self, memory: FiniteMemory[Any], t: Float[Array, ""], x: State
     ) -> tuple[Command, FiniteMemory[Any]]:  # fmt: skip
-        """Evaluate the controller inside, or repeat the last command."""
+        """Evaluate the inner controller, or repeat the last command."""
         u, inner = self.base(memory.inner, t, x)
         is_finite = _all_below(x) & _all_below(u)
         last, inner = jax.tree.map(
@@ -59,27 +59,27 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
         return FiniteMemory(self.base.accepted(memory.inner, u), u, memory.is_finite)
 
     def with_age(self, age: float | Float[Array, ""]) -> "FiniteController":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return FiniteController(self.base.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "FiniteController":
-        """Return the same for a tick in which body rates and acceleration were measured."""
+        """Return the same controller for a tick in which body rates and acceleration were measured."""
         return FiniteController(self.base.with_inertial(omega, a))
 
     def vehicle(self, memory: FiniteMemory[Any]) -> VehicleReport | None:
-        """Return the vehicle that the controller inside has identified."""
+        """Return the vehicle that the inner controller has identified."""
         return self.base.vehicle(memory.inner)
 
     def with_vehicle(self, member: Member) -> "FiniteController":
-        """Return the same for an identified vehicle."""
+        """Return the same controller for an identified vehicle."""
         return FiniteController(self.base.with_vehicle(member))
 
     def with_actuators(self, actuators: ActuatorState) -> "FiniteController":
-        """Return the same for a tick in which thrust and body rates are known."""
+        """Return the same controller for a tick in which thrust and body rates are known."""
         return FiniteController(self.base.with_actuators(actuators))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "FiniteController":
-        """Return the same for states and commands of ``frame``."""
+        """Return the same controller for states and commands in ``frame``."""
         return FiniteController(self.base.in_frame(frame))
 
 

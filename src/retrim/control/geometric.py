@@ -65,7 +65,7 @@ class GeometricController(AbstractController[GeometricState]):
     """Largest command that the vehicle accepts."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "GeometricController":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> GeometricState:

@@ -25,11 +25,11 @@ from ..tasks.occluded import OccludedMemory
 from .controller import AbstractController, PolicyController
 
 SHARE_OF_LATENESS = 0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
-FASTEST, SLOWEST = 0.015, 0.05  # [s], its limits
+FASTEST, SLOWEST = 0.015, 0.05  # [s], limits of this time constant
 
 
 class GravityFrameState(eqx.Module):
-    """Memory of the observer and of the controller inside."""
+    """Memory of the observer and of the inner controller."""
 
     observer: ObserverState
     inner: Any
@@ -38,36 +38,36 @@ class GravityFrameState(eqx.Module):
 
 
 class GravityFrame(AbstractController[GravityFrameState]):
-    """Flies a controller in the frame of the effective gravity, from a known and an estimated disturbance."""
+    """Flies a controller in the frame of the effective gravity, given a known and an estimated disturbance."""
 
     inner: AbstractController[Any]
     observer: DisturbanceObserver
     """Observer that estimates the unknown part of the disturbance."""
     known: Residual | None = None
-    """Learned residual, world frame [m/s^2]. Its deviation from its value at rest is used directly, since an estimate
+    """Learned residual, world frame [m/s^2]. The deviation from its value at rest is used directly, since an estimate
     of it would be late."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
-    """Age of measurements [s]; the controller inside receives the state extrapolated to the current time."""
+    """Age of measurements [s]; the inner controller receives the state extrapolated to the current time."""
     rate_bias: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Actual minus commanded body rates [rad/s]; it is subtracted from the command."""
     trust_estimate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
-    """Share of the disturbance that turns the frame; with 0 the controller inside flies without compensation."""
+    """Share of the disturbance that turns the frame; with 0 the inner controller flies without compensation."""
     trust_known: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
-    """Share of the learned residual and of the learned bias of the rates that is used."""
+    """Share of the learned residual and of the learned rate bias that is used."""
     actuators: ActuatorState | None = None
     """Present thrust and body rates; None if the last command acts."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Disturbance that turns the frame in addition to the estimated one, world [m/s^2]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "GravityFrame":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age))
 
     def with_vehicle(self, member: Member) -> "GravityFrame":
-        """Return the same for an identified vehicle.
+        """Return the same controller for an identified vehicle.
 
-        The observer uses the delay of the vehicle and the lag of its thrust. It is as fast as the
-        vehicle permits, since the frame must not turn much faster than the vehicle can follow.
+        The observer uses the vehicle's delay and thrust lag. It is as fast as the vehicle permits, since the frame must
+        not turn much faster than the vehicle can follow.
         """
         observer = dataclasses.replace(self.observer, path=member.path)
         if member.lateness is not None:
@@ -76,7 +76,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer)
 
     def with_actuators(self, actuators: ActuatorState) -> "GravityFrame":
-        """Return the same for a tick in which thrust and body rates are known."""
+        """Return the same controller for a tick in which thrust and body rates are known."""
         return dataclasses.replace(self, actuators=actuators)
 
     def init(self, x: State) -> GravityFrameState:
@@ -89,7 +89,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return GravityFrameState(observed, self.inner.init(x), EffectiveGravityFrame.of(observed.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
-        """Return the command of the controller inside, in the frame of the present effective gravity."""
+        """Return the command of the inner controller, in the frame of the present effective gravity."""
         observer, felt = self.observer, jnp.zeros_like(x.p)
         if self.known is not None:
             unsteady = StateDependentResidual(self.known, self.trust_known)
@@ -109,7 +109,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return u, GravityFrameState(observer.issued(observed, u), inner, frame)
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
-        """Remember the accepted command in the observer and, transformed to the frame, in the controller inside."""
+        """Remember the accepted command in the observer and, transformed to the frame, in the inner controller."""
         observer = self.observer.accepted(memory.observer, u)
         meant = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
         return GravityFrameState(observer, self.inner.accepted(memory.inner, meant), memory.frame)
@@ -135,7 +135,7 @@ class PoseFrame(AbstractController[tuple[OccludedMemory, Command]]):
     def __call__(
         self, memory: tuple[OccludedMemory, Command], t: Float[Array, ""], x: State
     ) -> tuple[Command, tuple[OccludedMemory, Command]]:
-        """Return the command of the controller inside, in the frame of the effective gravity one tick ago."""
+        """Return the command of the inner controller, in the frame of the effective gravity one tick ago."""
         seen, last = memory
         frame = EffectiveGravityFrame.of(capped(seen.pose.d, self.limit))
         u, (seen, _) = self.inner.in_frame(frame)((seen, frame.command(last)), t, frame.state(x))

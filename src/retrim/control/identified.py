@@ -1,8 +1,8 @@
 """Identify the vehicle in flight, and use the result in the controller.
 
 The estimator of the command path (:mod:`retrim.estimation.command_path`) receives every measurement and command. Its
-90 % intervals become the belief of a policy that is trained for a family of vehicles, and the gain of the thrust scales
-the commands. This does not need training or compilation, since beliefs are inputs. They change slowly, so that an
+90 % intervals become the belief of a policy that is trained for a family of vehicles, and the thrust gain scales the
+commands. This does not need training or compilation, since beliefs are inputs. Beliefs change slowly, so that an
 estimate, right or wrong, does not make the commands jump.
 """
 
@@ -24,23 +24,23 @@ from .excitation import Excitation
 from .vehicle_report import VehicleEstimate, VehicleReport
 
 PACE = 2.0  # [1/s]: an unknown coordinate is known after half a second at the earliest
-GAIN_PACE = 1.0  # [1/s], largest rate of change of the gain of the thrust
+GAIN_PACE = 1.0  # [1/s], largest rate of change of the thrust gain
 GAINS = (0.4, 2.5)
 
 
 class BeliefState(eqx.Module):
-    """Memory of a flight with a belief, and of the controller inside."""
+    """Memory of a flight with a belief, and of the inner controller."""
 
     belief: PathBelief
     """Belief of the last command."""
     gain: Float[Array, ""]
-    """Gain of the thrust that is used for the last command."""
+    """Thrust gain that was used for the last command."""
     inner: Any
     caution: Caution
 
 
 class BeliefFlight(AbstractController[BeliefState]):
-    """Flies a controller for a family of vehicles with a belief, which follows the identified vehicle slowly."""
+    """Flies a controller for a family of vehicles with a belief that slowly follows the identified vehicle."""
 
     inner: AbstractController[Any]
     family: PathFamily
@@ -51,19 +51,19 @@ class BeliefFlight(AbstractController[BeliefState]):
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
     watches: bool = eqx.field(static=True, default=True)
-    """Whether a self-induced oscillation makes it assume a slower vehicle. The tilt of a task with a reference swings
-    without such an oscillation."""
+    """Whether a self-induced oscillation makes the controller assume a slower vehicle. In a task with a reference, the
+    tilt swings even without such an oscillation."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "BeliefFlight":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, inner=self.inner.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "BeliefFlight":
-        """Return the same for a tick in which body rates and acceleration were measured."""
+        """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a))
 
     def condition(self, memory: BeliefState) -> Condition | None:
-        """Return the condition of the controller inside; if it has none, that of the caution."""
+        """Return the condition of the inner controller, or by default that of the caution."""
         inside = self.inner.condition(memory.inner)
         if inside is not None or not self.watches:
             return inside
@@ -77,7 +77,7 @@ class BeliefFlight(AbstractController[BeliefState]):
         return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior).init(x), Caution.none(x))
 
     def __call__(self, memory: BeliefState, t: Float[Array, ""], x: State) -> tuple[Command, BeliefState]:
-        """Return the command of the controller inside for the present belief about the vehicle."""
+        """Return the command of the inner controller for the present belief about the vehicle."""
         dt = self.dt
         belief = memory.belief.towards(self.estimate.belief, PACE * dt)
         caution = memory.caution.after(x, dt) if self.watches else memory.caution
@@ -115,7 +115,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     prior: PathBelief
     """Belief at take-off."""
     declared: Float[Array, "2"] | None = None
-    """Command delay and rate lag of the vehicle file [s]; None if the file does not state them."""
+    """Command delay and rate lag from the vehicle file [s]; None if the file does not state them."""
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
@@ -123,16 +123,16 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
     watches: bool = eqx.field(static=True, default=True)
-    """Whether a self-induced oscillation makes it assume a slower vehicle; see :class:`BeliefFlight`."""
+    """Whether a self-induced oscillation makes the controller assume a slower vehicle; see :class:`BeliefFlight`."""
     excitation: Excitation | None = None
-    """Small doublets of the commands until the estimate is narrow; None does not excite the vehicle."""
+    """Small command doublets until the estimate is narrow; None for no excitation."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "IdentifiedFlight":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IdentifiedFlight":
-        """Return the same for a tick in which body rates and acceleration were measured."""
+        """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega, a=a)
 
     def condition(self, memory: IdentifiedState) -> Condition | None:
@@ -149,7 +149,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         return IdentifiedState(path, self.follow(vehicle_estimate(self.family, path.estimate)).init(x))
 
     def __call__(self, memory: IdentifiedState, t: Float[Array, ""], x: State) -> tuple[Command, IdentifiedState]:
-        """Update the identification, and return the command of the controller inside for the present estimate."""
+        """Update the identification, and return the command of the inner controller for the present estimate."""
         path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age)
         follower = self.follow(vehicle_estimate(self.family, path.estimate))
         u, flight = follower(memory.flight, t, x)
@@ -172,7 +172,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         return True
 
     def follow(self, estimate: VehicleEstimate) -> BeliefFlight:
-        """Return the controller for the result of an identification, here or in another process.
+        """Return the controller for an identification result, from this or another process.
 
         Args:
             estimate: Present estimate of the vehicle.
@@ -210,5 +210,5 @@ def belief_from(family: PathFamily, estimate: PathEstimate) -> PathBelief:
 
 
 def bounded_gain(estimate: PathEstimate) -> Float[Array, ""]:
-    """Return the gain of the thrust of an estimate, within the range of possible vehicles."""
+    """Return the thrust gain of an estimate, clipped to the range of possible vehicles."""
     return jnp.clip(estimate.thrust_gain.mean, *GAINS)

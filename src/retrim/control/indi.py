@@ -1,8 +1,8 @@
 """Incremental nonlinear dynamic inversion: corrects the acting thrust by the error of the measured acceleration.
 
-The measured acceleration contains every disturbance, so that a model of the disturbance is not needed: the desired
-thrust is f + (a_wanted - a). The acting thrust f and the acceleration a pass the same filter, so that they belong to
-the same time (Smeur, de Croon and Chu 2018; Tal and Karaman 2021, here above the loop of the body rates).
+The measured acceleration contains every disturbance, so a disturbance model is not needed: the desired thrust is f +
+(a_wanted - a). The acting thrust f and the acceleration a pass through the same filter, so that they belong to the same
+time (Smeur, de Croon and Chu 2018; Tal and Karaman 2021, here above the body-rate loop).
 """
 
 import dataclasses
@@ -42,22 +42,22 @@ class IndiController(AbstractController[IncrementalState]):
     gains: Gains
     prediction: Prediction
     tau: Float[Array, ""]
-    """Time constant of the filter of acceleration and thrust [s]."""
+    """Time constant of the filter for acceleration and thrust [s]."""
     low: Command
     """Smallest command that the vehicle accepts."""
     high: Command
     """Largest command that the vehicle accepts."""
     omega: Float[Array, "3"] | None = None
-    """Measured body rates [rad/s]; None for those that follow from the commands."""
+    """Measured body rates [rad/s]; None to derive them from the commands."""
     a: Float[Array, "3"] | None = None
-    """Measured acceleration, the mean over the last tick, world [m/s^2]; None for that of the measured velocities."""
+    """Measured acceleration, the mean over the last tick, world [m/s^2]; None to derive it from the velocities."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "IndiController":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IndiController":
-        """Return the same for a tick in which body rates and acceleration were measured."""
+        """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 
     def init(self, x: State) -> IncrementalState:
@@ -69,7 +69,7 @@ class IndiController(AbstractController[IncrementalState]):
         dt, last = self.prediction.dt, memory.last
         acted, _ = self.prediction.acted(memory.underway)
         a = (x.v - last.v) / dt if self.a is None else self.a
-        # The accelerometer has no latency, even if the attitude has.
+        # The accelerometer does not have latency, even if the attitude does.
         late = self.prediction.age if self.a is not None else jnp.zeros_like(self.prediction.age)
         turned = so3.exp(late.astype(a.dtype) * (acted.omega if self.omega is None else self.omega))
         thrust = self.prediction.thrust(memory.underway, so3.mul(last.R, turned), so3.mul(x.R, turned))

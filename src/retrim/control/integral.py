@@ -15,7 +15,7 @@ from .controller import AbstractController
 
 
 class IntegralState(eqx.Module):
-    """Integral of the position error, and the memory of the controller inside."""
+    """Integral of the position error, and the memory of the inner controller."""
 
     integral: Float[Array, "3"]
     """Integral of the position error [m s]."""
@@ -23,7 +23,7 @@ class IntegralState(eqx.Module):
 
 
 class IntegralAction(AbstractController[IntegralState]):
-    """Gives a controller the position p + gain * integral of (p - target)."""
+    """Passes the position p + gain * integral of (p - target) to a controller."""
 
     inner: AbstractController[Any]
     task: AbstractTask
@@ -49,9 +49,9 @@ class IntegralAction(AbstractController[IntegralState]):
         return IntegralState(memory.integral, self.inner.accepted(memory.inner, u))
 
     def with_vehicle(self, member: Member) -> "IntegralAction":
-        """Return the same for an identified vehicle."""
+        """Return the same controller for an identified vehicle."""
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member))
 
     def with_actuators(self, actuators: ActuatorState) -> "IntegralAction":
-        """Return the same for a tick in which thrust and body rates are known."""
+        """Return the same controller for a tick in which thrust and body rates are known."""
         return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))

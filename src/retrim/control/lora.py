@@ -1,4 +1,4 @@
-"""Low-rank adaptation (Hu et al. 2022; paper, Sec. III-F): the base is frozen, two thin factors per layer are trained.
+"""Low-rank adaptation (Hu et al. 2022; paper, Sec. III-F): a frozen base, and two trained thin factors per layer.
 
 y = (W + scale * B A) x + b. B starts at zero, so that a fresh delta does not change the policy. A network of the
 paper's size has 12,864 numbers to train instead of 272,900.
@@ -46,7 +46,7 @@ class LoraPolicy(eqx.Module):
     def of(
         cls, base: Policy, *, key: Key[Array, ""], ranks: tuple[int, ...] = RANKS, scale: float = SCALE
     ) -> "LoraPolicy":
-        """Return a fresh delta: A uniform within 1 / sqrt(fan-in) (Kaiming), B zero, so that the output is unchanged.
+        """Return a fresh delta with A uniform within 1 / sqrt(fan-in) (Kaiming) and B zero, so the output is unchanged.
 
         Args:
             base: Policy to adapt.
@@ -71,15 +71,15 @@ class LoraPolicy(eqx.Module):
 
     @property
     def params(self) -> tuple[LowRankFactors, ...]:
-        """Return the parameters that an optimiser updates."""
+        """Parameters that an optimiser updates."""
         return self.delta
 
     def with_params(self, delta: tuple[LowRankFactors, ...]) -> "LoraPolicy":
-        """Return the same base with another delta."""
+        """Return the same base with a different delta."""
         return LoraPolicy(self.base, delta, self.scale, self.shift)
 
     def shifted(self, by: Float[Array, "4"]) -> "LoraPolicy":
-        """Return the policy whose output is ``by`` larger, for every observation; base and delta are unchanged."""
+        """Return the policy with ``by`` added to its output for every observation; base and delta are unchanged."""
         return LoraPolicy(self.base, self.delta, self.scale, self.shift + by)
 
     def merged(self) -> Policy:

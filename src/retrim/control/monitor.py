@@ -9,12 +9,12 @@ disturbance observer. The monitor uses them in stages:
     BASE      the base policy alone, in the world frame.
 
 The monitor steps back after one of two tests. (1) A *twin*, a simulated vehicle, predicts the flight of the base
-policy, in the nominal model with the mean of the estimated disturbance. If the error of the vehicle exceeds that of the
-twin in three consecutive intervals, or by a large amount in one, the flight steps back by one stage. It returns after a
+policy, in the nominal model with the mean of the estimated disturbance. If the vehicle's error exceeds that of the twin
+in three consecutive intervals, or by a large amount in one, the flight steps back by one stage. It returns after a
 waiting time, which doubles each time. (2) An estimate that swings back and forth by itself
 (:mod:`retrim.control.swings`) shows that the observer drives the vehicle, because measurements are later than declared
-or wrongly scaled. Such an error persists in flight: the base policy takes over at once, later with the slow mean, and
-after a second oscillation alone to the end.
+or wrongly scaled. Such an error persists in flight, so the base policy takes over at once. Later it flies with the slow
+mean, and after a second oscillation it flies alone until the end.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ from .near_target import NearTarget
 from .policy import AbstractPolicy
 from .swings import Swings
 
-INTERVAL = 1.0  # [s] over which errors are averaged
+INTERVAL = 1.0  # [s], interval over which errors are averaged
 MARGIN, FAR = 0.03, 0.7  # [m], limits of the error beyond that of the twin: in consecutive intervals, and in one
 STRIKES = 3  # consecutive intervals; a vehicle recovers from the largest kick of the gauntlet within two
 LOST = 3.0  # [m]; a twin with a larger error restarts at the vehicle
@@ -55,11 +55,11 @@ class Twin(eqx.Module):
     memory: Any
     """Memory of the base policy."""
     excess: Float[Array, ""]
-    """Sum over the interval of the error of the vehicle minus that of the twin [m]."""
+    """Sum over the interval of the vehicle's error minus that of the twin [m]."""
     ticks: Int[Array, ""]
     """Number of ticks since the start of the interval."""
     path: PathState | None = None
-    """Command path of the simulated vehicle; None if it follows commands at once."""
+    """Command path of the simulated vehicle; None if it follows commands immediately."""
 
 
 class MonitorState(eqx.Module):
@@ -70,7 +70,7 @@ class MonitorState(eqx.Module):
     """Policy at take-off."""
     stage: Int[Array, ""]
     cause: Int[Array, ""]
-    """Reason of the last change of the stage."""
+    """Reason for the last change of stage."""
     best: Int[Array, ""]
     """Best stage to which the flight may return."""
     swings: Swings
@@ -89,22 +89,22 @@ class Monitor(AbstractController[MonitorState]):
     """Flies an adapted policy in the frame of the effective gravity, and steps back from it if necessary."""
 
     frame: GravityFrame
-    """The adapted flight; the controller inside is a :class:`~retrim.control.controller.PolicyController`."""
+    """The adapted flight; the inner controller is a :class:`~retrim.control.controller.PolicyController`."""
     task: AbstractTask
     """Task, which defines the error."""
     path: CommandPath | None = None
-    """Command path of the twin; None if it follows commands at once."""
+    """Command path of the twin; None if it follows commands immediately."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "Monitor":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, frame=self.frame.with_age(age))
 
     def with_vehicle(self, member: Member) -> "Monitor":
-        """Return the same for an identified vehicle."""
+        """Return the same controller for an identified vehicle."""
         return Monitor(self.frame.with_vehicle(member), self.task, member.path)
 
     def with_actuators(self, actuators: ActuatorState) -> "Monitor":
-        """Return the same for a tick in which thrust and body rates are known."""
+        """Return the same controller for a tick in which thrust and body rates are known."""
         return dataclasses.replace(self, frame=self.frame.with_actuators(actuators))
 
     def init(self, x: State) -> MonitorState:
@@ -116,7 +116,7 @@ class Monitor(AbstractController[MonitorState]):
         return MonitorState(flight, policy, never, never, never, Swings.none(still), still, twin, never, zero, hold)
 
     def __call__(self, memory: MonitorState, t: Float[Array, ""], x: State) -> tuple[Command, MonitorState]:
-        """Return the command of this stage, and test the stage."""
+        """Return the command for the present stage, and test the stage."""
         adapted, observed = memory.stage == Stage.ADAPTED, memory.stage <= Stage.OBSERVED
         slow = memory.stage == Stage.SLOW
         flying = dataclasses.replace(
@@ -144,7 +144,7 @@ class Monitor(AbstractController[MonitorState]):
         return Condition(memory.stage, memory.cause)
 
     def _trust(self, memory: MonitorState, t: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the weight of the estimate: small at the launch, and smaller the more the estimate swings."""
+        """Return the weight of the estimate: small at launch, and smaller the more the estimate swings."""
         calm = jnp.clip((SWINGS - memory.swings.size) / (SWINGS - CALM), 0.0, 1.0)
         return calm * jnp.minimum(1.0, t / RAMP).astype(calm.dtype)
 
@@ -152,7 +152,7 @@ class Monitor(AbstractController[MonitorState]):
         """Return the largest error in the observation of the policy [m].
 
         With late measurements, a policy that flies well near its target oscillates under a large error. The limit
-        grows, since an uncompensated push needs an error to hold against it.
+        grows, since the policy needs an error to hold against an uncompensated push.
         """
         swung = (memory.cause == Cause.OSCILLATION) & (memory.stage == Stage.BASE)
         own = jnp.where(swung, REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), jnp.inf)

@@ -1,9 +1,10 @@
 """Model-predictive path integral control: many random command sequences, weighted by their predicted costs.
 
-In each tick the shifted mean of the last tick is perturbed by noise. Every sequence is rolled out in the nominal model,
-with the estimated disturbance if there is an estimator. The new mean is that of all sequences, each with the weight
-exp(-cost / temperature) (Williams et al. 2017; costs as in the comparison with DATT, Huang et al. 2023). The noise is
-correlated in time (Vlahov et al. 2024), since independent noise in each tick cancels out before it moves the vehicle.
+In each tick, the shifted mean of the previous tick is perturbed by noise. Every sequence is rolled out in the nominal
+model, with the estimated disturbance if there is an estimator. The new mean is the average of all sequences, each with
+the weight exp(-cost / temperature) (Williams et al. 2017; costs as in the comparison with DATT, Huang et al. 2023). The
+noise is correlated in time (Vlahov et al. 2024), since independent noise in each tick cancels out before it moves the
+vehicle.
 """
 
 import dataclasses
@@ -45,9 +46,9 @@ class MppiController(AbstractController[MppiState]):
     """Task, which provides the reference."""
     prediction: Prediction
     low: Command
-    """Smallest command of the vehicle."""
+    """Smallest command that the vehicle accepts."""
     high: Command
-    """Largest command of the vehicle."""
+    """Largest command that the vehicle accepts."""
     key: Key[Array, ""]
     estimator: L1Estimator | None
     """Estimator of the disturbance in the model; None for the nominal model."""
@@ -69,7 +70,7 @@ class MppiController(AbstractController[MppiState]):
     """Length of a sequence [ticks]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "MppiController":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> MppiState:

@@ -14,24 +14,24 @@ from .controller import AbstractController
 
 
 class NearTarget(AbstractController[Any]):
-    """Gives a controller a position within ``reach`` of the target if the vehicle is farther away.
+    """Limits the position that a controller receives to within ``reach`` of the target.
 
-    The commands of a policy grow with the distance. If measurements are late, a policy that is stable near its target
-    may oscillate and crash from far away.
+    A policy's commands grow with the distance. If measurements are late, a policy that is stable near its target may
+    oscillate and crash from far away.
     """
 
     inner: AbstractController[Any]
     task: AbstractTask
     """Task, which provides the target."""
     reach: Float[Array, ""]
-    """Largest distance in the input, in the coordinates of the controller [m]."""
+    """Largest distance in the input, in the controller's coordinates [m]."""
 
     def init(self, x: State) -> Any:
-        """Return the memory of the controller inside."""
+        """Return the memory of the inner controller."""
         return self.inner.init(x)
 
     def __call__(self, memory: Any, t: Float[Array, ""], x: State) -> tuple[Command, Any]:
-        """Return the command of the controller inside for the limited distance."""
+        """Return the command of the inner controller for the limited distance."""
         target = self.task.target(t)
         away = x.p - target
         distance = jnp.sqrt(jnp.sum(away * away) + 1e-12)
@@ -44,13 +44,13 @@ class NearTarget(AbstractController[Any]):
         return self.inner.accepted(memory, u)
 
     def with_vehicle(self, member: Member) -> "NearTarget":
-        """Return the same for an identified vehicle."""
+        """Return the same controller for an identified vehicle."""
         return NearTarget(self.inner.with_vehicle(member), self.task, self.reach)
 
     def with_actuators(self, actuators: ActuatorState) -> "NearTarget":
-        """Return the same for a tick in which thrust and body rates are known."""
+        """Return the same controller for a tick in which thrust and body rates are known."""
         return NearTarget(self.inner.with_actuators(actuators), self.task, self.reach)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "NearTarget":
-        """Return the same for states and commands of ``frame``."""
+        """Return the same controller for states and commands in ``frame``."""
         return NearTarget(self.inner.in_frame(frame), self.task.in_frame(frame), self.reach)

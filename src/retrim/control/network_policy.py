@@ -15,7 +15,7 @@ from .policy import AbstractPolicy, command_bounds
 
 
 class NetworkPolicy(AbstractPolicy):
-    """A policy whose network is an Equinox module. Its floating-point arrays are trained, by plain differentiation."""
+    """A policy whose network is an Equinox module. Its floating-point arrays are trained by plain differentiation."""
 
     leaves: tuple[Array, ...]
     """Arrays of the network, in the order of its pytree."""
@@ -33,8 +33,8 @@ class NetworkPolicy(AbstractPolicy):
 
         Args:
             network: Module that is called with one observation and returns four numbers, for thrust and body rates.
-                Zeros are the hover command; a network whose first outputs are small begins near hover.
-            vehicle: Vehicle with the limits of the commands.
+                Zeros map to the hover command, so a network whose initial outputs are small begins near hover.
+            vehicle: Vehicle that defines the command limits.
         """
         arrays, rest = eqx.partition(network, eqx.is_array)
         leaves, tree = jax.tree.flatten(arrays)
@@ -43,7 +43,7 @@ class NetworkPolicy(AbstractPolicy):
 
     @property
     def params(self) -> tuple[Array, ...]:
-        """Return the floating-point arrays of the network."""
+        """Floating-point arrays of the network."""
         return tuple(leaf for leaf in self.leaves if eqx.is_inexact_array(leaf))
 
     def with_params(self, params: tuple[Array, ...]) -> "NetworkPolicy":
@@ -59,5 +59,5 @@ class NetworkPolicy(AbstractPolicy):
         return y + lax.stop_gradient(self.shift)
 
     def shifted(self, by: Float[Array, "4"]) -> "NetworkPolicy":
-        """Return the policy whose output is ``by`` larger, for every observation."""
+        """Return the policy with ``by`` added to its output for every observation."""
         return dataclasses.replace(self, shift=self.shift + by)

@@ -13,7 +13,7 @@ from ..physics.state import Command
 from ..physics.vehicle import Vehicle
 
 Perturbations = tuple[Float[Array, "... _"], ...]
-"""One vector per layer (in :mod:`retrim.learn` with rows in front), added to the pre-activation."""
+"""One vector per layer (with leading rows in :mod:`retrim.learn`), added to the pre-activation."""
 Layers = tuple[eqx.nn.Linear, ...]
 """The layers of a policy, or a gradient with respect to them."""
 Inputs = tuple[Float[Array, "... _"], ...]
@@ -21,17 +21,17 @@ Inputs = tuple[Float[Array, "... _"], ...]
 
 
 class AbstractPolicy(eqx.Module):
-    """A network whose output is mapped to a command; the parameters are trained, the limits are constant.
+    """A network whose output is mapped to a command; the parameters are trained, and the limits are constant.
 
     u = u_min + (u_max - u_min) sigmoid(y + y_0), where y is the network's output and y_0 makes y = 0 the hover
     command. A hard limit would not have a gradient once it is reached; the sigmoid always has one.
     """
 
-    if TYPE_CHECKING:  # to a type checker an abstract variable would be a dataclass field
+    if TYPE_CHECKING:  # a type checker would treat an abstract variable as a dataclass field
 
         @property
         def u_hover(self) -> Command:
-            """Command of a zero output."""
+            """Command for a zero output."""
 
         @property
         def u_min(self) -> Command:
@@ -48,7 +48,7 @@ class AbstractPolicy(eqx.Module):
     @property
     @abc.abstractmethod
     def params(self) -> Any:
-        """Return the parameters that an optimiser updates: a pytree of arrays."""
+        """Parameters that an optimiser updates: a pytree of arrays."""
 
     @abc.abstractmethod
     def with_params(self, params: Any) -> "AbstractPolicy":
@@ -60,14 +60,14 @@ class AbstractPolicy(eqx.Module):
 
     @abc.abstractmethod
     def shifted(self, by: Float[Array, "4"]) -> "AbstractPolicy":
-        """Return the policy whose output is ``by`` larger, for every observation."""
+        """Return the policy with ``by`` added to its output for every observation."""
 
     def merged(self) -> "AbstractPolicy":
         """Return itself; a low-rank policy merges its delta here."""
         return self
 
     def linear_layers(self) -> Layers:
-        """Return the layers of a perceptron, which low-rank adaptation and export need; empty for other networks."""
+        """Return a perceptron's layers, for low-rank adaptation and export; other networks return an empty tuple."""
         return ()
 
     def __call__(self, observation: Float[Array, " o"]) -> Command:
@@ -82,7 +82,7 @@ class AbstractPolicy(eqx.Module):
 
 
 class Policy(AbstractPolicy):
-    """A perceptron with ReLU. ``layers`` are trained."""
+    """A ReLU perceptron, whose ``layers`` are trained."""
 
     layers: tuple[eqx.nn.Linear, ...]
     u_hover: Command
@@ -93,11 +93,11 @@ class Policy(AbstractPolicy):
     def of(
         cls, observation_size: int, vehicle: Vehicle, *, key: Key[Array, ""], hidden: tuple[int, ...] = (512, 512)
     ) -> "Policy":
-        """Return a fresh network: kernels N(0, 0.01 / mean of fan-in and fan-out), biases zero; it commands hover.
+        """Return a fresh network that commands hover: kernels N(0, 0.01 / mean of fan-in and fan-out), zero biases.
 
         Args:
             observation_size: Length of the observation.
-            vehicle: Vehicle with the limits of the commands.
+            vehicle: Vehicle that defines the command limits.
             key: Random key, consumed.
             hidden: Widths of the hidden layers.
         """
@@ -117,7 +117,7 @@ class Policy(AbstractPolicy):
 
     @property
     def params(self) -> Layers:
-        """Return the parameters that an optimiser updates."""
+        """Parameters that an optimiser updates."""
         return self.layers
 
     def with_params(self, layers: Layers) -> "Policy":
@@ -129,7 +129,7 @@ class Policy(AbstractPolicy):
         return self.layers
 
     def shifted(self, by: Float[Array, "4"]) -> "Policy":
-        """Return the policy whose output is ``by`` larger, for every observation."""
+        """Return the policy with ``by`` added to its output for every observation."""
         *layers, last = self.layers
         return self.with_params((*layers, eqx.tree_at(lambda l: l.bias, last, replace_fn=lambda bias: bias + by)))
 
@@ -141,9 +141,9 @@ class Policy(AbstractPolicy):
         return self.layers[-1](h)
 
     def perturbed(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
-        """Return the command with ``perturbations[l]`` added to the output of layer l, without gradients to weights.
+        """Return the command with ``perturbations[l]`` added to the output of layer l, without weight gradients.
 
-        Also return the input of each layer; with the cotangents of the perturbations they give every weight gradient.
+        Also return the input of each layer; with the cotangents of the perturbations, these give every weight gradient.
         """
         h, inputs = observation, []
         for i, (layer, perturbation) in enumerate(zip(self.layers, perturbations, strict=True)):
@@ -154,7 +154,7 @@ class Policy(AbstractPolicy):
 
 
 def command_bounds(vehicle: Vehicle) -> tuple[Command, Command, Command]:
-    """Return hover and the lower and upper limits of the commands of a vehicle."""
+    """Return the hover command and the lower and upper limits of a vehicle's commands."""
     bounds = (Command.hover(), vehicle.command_min, vehicle.command_max)
     # Strong types, as in a loaded policy, so that programs for one are not compiled again for the other.
     strong: tuple[Command, Command, Command] = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=leaf.dtype), bounds)

@@ -1,4 +1,4 @@
-"""State-based controllers with the pose from camera images.
+"""State-based controllers with a pose from camera images.
 
 The pose filter of :class:`OccludedKeypoints`, which estimates the pose for a policy, also estimates it for these
 controllers, from the same points and the same commands. A controller that uses an inertial unit keeps it: the estimated
@@ -19,7 +19,7 @@ from .controller import AbstractController
 
 
 class SeenPoseState(eqx.Module):
-    """Memory of the filter and of the controller inside."""
+    """Memory of the filter and of the inner controller."""
 
     seen: OccludedMemory
     inner: Any
@@ -37,11 +37,11 @@ class PoseFilteredController(AbstractController[SeenPoseState]):
     """Acceleration, the mean over the last tick, world [m/s^2]; None if it is not measured."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "PoseFilteredController":
-        """Return the same for frames that are ``age`` old [s]."""
+        """Return the same controller for frames that are ``age`` old [s]."""
         return dataclasses.replace(self, inner=self.inner.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "PoseFilteredController":
-        """Return the same for a tick in which body rates and acceleration were measured."""
+        """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 
     def init(self, x: State) -> SeenPoseState:
@@ -50,7 +50,7 @@ class PoseFilteredController(AbstractController[SeenPoseState]):
         return SeenPoseState(seen, self.inner.init(seen.pose.x), Command.hover(x.p.dtype))
 
     def __call__(self, memory: SeenPoseState, t: Float[Array, ""], x: State) -> tuple[Command, SeenPoseState]:
-        """Return the command for the estimated pose; the state only defines the pose of camera and inertial unit."""
+        """Return the command for the estimated pose; the state only defines the poses of camera and inertial unit."""
         _, seen = self.observation(memory.seen, t, x, memory.last)
         here, controller = seen.pose.x, self.inner
         if self.omega is not None and self.a is not None:
@@ -61,5 +61,5 @@ class PoseFilteredController(AbstractController[SeenPoseState]):
         return u, SeenPoseState(seen, inner, u)
 
     def accepted(self, memory: SeenPoseState, u: Command) -> SeenPoseState:
-        """Remember the accepted command, here and in the controller inside."""
+        """Remember the accepted command, here and in the inner controller."""
         return SeenPoseState(memory.seen, self.inner.accepted(memory.inner, u), u)

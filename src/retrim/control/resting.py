@@ -1,4 +1,4 @@
-"""A policy that commands hover at its rest point, for all observations other than the state."""
+"""A policy that commands hover at its rest point, whatever it observes in addition to the state."""
 
 import dataclasses
 from typing import Any
@@ -15,8 +15,8 @@ from .controller import PolicyController
 class RestingController(PolicyController):
     """A policy whose output is shifted by its output at rest at home, with the present heading.
 
-    A policy for many vehicles has another rest point for each belief. The shift removes that error, so that the policy
-    rests at home, as :class:`~retrim.adapt.trim.RestTrim` does after an update.
+    A policy for many vehicles has a different rest point for each belief. The shift removes that error, so that the
+    policy rests at home, as :class:`~retrim.adapt.trim.RestTrim` does after an update.
     """
 
     home: Float[Array, "3"]
@@ -25,7 +25,7 @@ class RestingController(PolicyController):
     def __call__(
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
     ) -> tuple[Command, tuple[Any, Command]]:
-        """Evaluate observation and policy once, and the policy at rest."""
+        """Evaluate the observation and the policy once, and the policy also at rest."""
         heading = jnp.arctan2(x.R[1, 0], x.R[0, 0])
         home = self.home.astype(x.p.dtype)
         o = self.observation.at_rest(State(home, so3.rotz(heading), jnp.zeros_like(home)))

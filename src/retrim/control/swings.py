@@ -6,13 +6,13 @@ from jaxtyping import Array, Float
 
 SWING = 2.0  # [m/s^2], smallest distance between two turning points of an axis
 UNIT = 4.0  # [m/s^2], size of a swing that counts as one; others count by the square of their size
-MEMORY = 1.5  # [s], time constant of the forgetting of swings
+MEMORY = 1.5  # [s], time constant with which swings are forgotten
 
 
 class Swings(eqx.Module):
     """Turning points of an estimate per axis, and the size of its recent swings.
 
-    A step of the disturbance, a load or a gust moves an estimate once. An observer that drives its own vehicle, because
+    A disturbance step, a load or a gust moves an estimate once. An observer that drives its own vehicle, because
     measurements are late or wrongly scaled, moves it back and forth by several m/s^2 more than once a second.
     """
 

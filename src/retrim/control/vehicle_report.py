@@ -1,4 +1,4 @@
-"""The identified vehicle: for the controller, and as a line for the log."""
+"""The identified vehicle, for the controller and as a line for the log."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -7,7 +7,7 @@ from ..estimation.command_path import PathEstimate, describe_path
 from ..physics.path_family import PathBelief
 
 REPORTS = (1.0, 5.0)
-"""Times of a flight at which the identified vehicle is reported [s]."""
+"""Flight times at which the identified vehicle is reported [s]."""
 
 
 class VehicleEstimate(eqx.Module):
@@ -15,7 +15,7 @@ class VehicleEstimate(eqx.Module):
 
     belief: PathBelief
     gain: Float[Array, ""]
-    """Thrust over commanded thrust."""
+    """Ratio of actual to commanded thrust."""
 
 
 class VehicleReport(eqx.Module):
@@ -23,10 +23,10 @@ class VehicleReport(eqx.Module):
 
     estimate: PathEstimate
     declared: Float[Array, "2"] | None = None
-    """Command delay and rate lag of the vehicle file [s]; None if the file does not state them."""
+    """Command delay and rate lag from the vehicle file [s]; None if the file does not state them."""
 
     def note(self) -> str:
-        """Return the vehicle in one line."""
+        """Return a one-line description of the vehicle."""
         if self.declared is None:
             return describe_path(self.estimate)
         delay, lag = (float(each) for each in self.declared)

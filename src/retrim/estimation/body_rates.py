@@ -20,18 +20,18 @@ SHARE = 0.3  # share of the difference between measurement and prediction that c
 
 
 class BodyRates(eqx.Module):
-    """Prediction of the body rates, and its memory."""
+    """Prediction of the body rates and its memory."""
 
     R: Float[Array, "3 3"]
     """Attitude measured one tick ago."""
     before: PathState
-    """Command path one tick ago."""
+    """State of the command path one tick ago."""
     path: PathState
-    """Command path now."""
+    """State of the command path now."""
     mean: Float[Array, "3"]
     """Predicted mean rates over the tick that has just ended [rad/s]."""
     earlier: Float[Array, "3"]
-    """Predicted mean rates over the tick before [rad/s]."""
+    """Predicted mean rates over the previous tick [rad/s]."""
 
     @classmethod
     def start(cls, x: State, dt: float, *, longest: float = LONGEST_DELAY) -> "BodyRates":
@@ -66,7 +66,7 @@ class BodyRates(eqx.Module):
             age: Age of ``x`` [s].
             path: Command path of the vehicle.
             dt: Control tick [s].
-            omega: Rates of a gyroscope [rad/s]; None without a gyroscope.
+            omega: Rates from a gyroscope [rad/s]; None without a gyroscope.
         """
         if omega is None:
             late = jnp.clip(age / dt, 0.0, 1.0).astype(x.p.dtype)
@@ -76,7 +76,7 @@ class BodyRates(eqx.Module):
             error = omega.astype(x.p.dtype) - self.omega
         error = jnp.where(jnp.all(jnp.isfinite(error)), error, 0.0)
         acting = self.path.actuators
-        # A rate that differs at the end of a tick has changed faster during the tick.
+        # A rate that exceeds the prediction at the end of a tick has also changed faster during the tick.
         slope = acting.slope + SHARE * (path.response.rate_lag / dt) * error
         corrected = ActuatorState(Command(acting.command.c, acting.command.omega + error), slope)
         return dataclasses.replace(self, R=x.R, path=dataclasses.replace(self.path, actuators=corrected))

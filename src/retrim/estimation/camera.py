@@ -10,7 +10,7 @@ from ..physics.state import State
 
 DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 """Body to camera: the camera's z looks along body -z; camera x is body -y, camera y is body -x."""
-D_MIN = 0.05  # smallest denominator of the projection, for points far off axis and behind
+D_MIN = 0.05  # smallest denominator of the projection, for points far off the axis or behind the camera
 
 
 class Projection(NamedTuple):
@@ -32,7 +32,7 @@ class Camera(eqx.Module):
     centre: Float[Array, "2"]
     """Principal point [px]."""
     size: Float[Array, "2"]
-    """Size of the image [px]."""
+    """Image size [px]."""
 
     @classmethod
     def published(cls) -> "Camera":
@@ -46,7 +46,7 @@ class Camera(eqx.Module):
         )
 
     def project(self, P: Float[Array, "3"]) -> Projection:
-        """Project a point in camera coordinates [m]; result and gradient are finite for every point."""
+        """Project a point in camera coordinates [m]; the result and its gradient are finite for every point."""
         d1 = jnp.sqrt(jnp.sum(P**2) + 1e-12)
         z1 = self.xi * d1 + P[2]
         d2 = jnp.sqrt(P[0] ** 2 + P[1] ** 2 + z1**2 + 1e-12)

@@ -1,8 +1,8 @@
 """Consistency of two successive measurements: whether a rigid body can have moved from one to the other.
 
 A single wrong velocity enters two accelerations with opposite signs and 50 times its size (at 50 Hz), so that one
-sample in a window can outweigh all others. These tests do not need a model of the vehicle or a history. They have one
-definition for the disturbance observer, which receives a pair per tick, and for the learners, which receive a window.
+sample in a window can outweigh all others. These tests need neither a vehicle model nor a history. The disturbance
+observer, which receives one pair per tick, and the learners, which receive a window, share one definition.
 """
 
 import equinox as eqx
@@ -13,28 +13,28 @@ from jaxtyping import Array, Bool, Float
 from ..physics import so3
 from ..physics.state import State, where
 
-SPEED = 0.25  # [m/s], tolerated difference of a velocity from the derivative of the position, such as a small bias
-SPREADS = 4.0  # tolerated deviations of the noise beyond it; a normal distribution exceeds them in < 1 of 10^4
+SPEED = 0.25  # [m/s], tolerated difference of a velocity from the derivative of the position, e.g. a small bias
+SPREADS = 4.0  # tolerated standard deviations beyond it; a normal distribution exceeds them in < 1 of 10^4
 NOISE_PRIOR = 1e-3  # [m], before the first measurement
 NOISE_LIMIT = 3e-3  # [m]; larger noise is a fault, since otherwise every fault would look like noise
 NOISE_TAU = 1.0  # [s], memory of the noise
-JUMP = 3.0**0.5  # ratio of the mean size of the change of a gap to that of a gap, for white noise of positions
+JUMP = 3.0**0.5  # ratio of the mean change of a gap to the mean gap, for white noise in the positions
 ACCELERATION = 150.0  # [m/s^2], beyond any vehicle of this kind, including a push and a collision with air
 RATE = 40.0  # [rad/s], beyond any commanded rate of a vehicle of this kind
 REST = 1e-3  # [m/s]; a slower vehicle may be measured twice in the same state
-SCALE = 0.25  # largest difference of the motion from that of the velocities, as a share
+SCALE = 0.25  # largest difference of the motion from that implied by the velocities, as a share
 CORRELATED = 0.5  # smallest squared correlation of gaps and steps for a wrong scale
 MOTION, OVER_NOISE = 0.15, 3.0  # [m/s], and multiple of the noise of gaps: smallest mean motion that shows a scale
 SCALE_TAU = 1.0  # [s], memory of the moments that show a scale
 DOUBT_TAU = 0.3  # [s], memory of the share of unusable steps
-SKEW = 0.1  # largest entry of R^T R - I of a rotation
+SKEW = 0.1  # largest entry of R^T R - I for a rotation
 
 
 class Findings(eqx.Module):
     """Contradictions between two successive measurements; all false for a possible motion."""
 
     repeated: Bool[Array, ""]
-    """The second measurement equals the first one bit for bit, although the vehicle moves."""
+    """The second measurement equals the first one bit for bit, although the vehicle is moving."""
     velocity: Bool[Array, ""]
     """The velocity is not the derivative of the position."""
     acceleration: Bool[Array, ""]
@@ -51,7 +51,7 @@ class Findings(eqx.Module):
 
 
 def gap(before: State, after: State, dt: float) -> Float[Array, "3"]:
-    """Return the step of the position minus that from the mean of the velocities at its ends, world [m].
+    """Return the position step minus the step from the mean of the velocities at its ends, world [m].
 
     The trapezoidal rule is exact to dt^3 / 12 times the jerk, which is 0.1 mm at 50 Hz in the most agile flight.
     """
@@ -61,7 +61,7 @@ def gap(before: State, after: State, dt: float) -> Float[Array, "3"]:
 def gap_noise(before: Float[Array, "3"], after: Float[Array, "3"]) -> Float[Array, ""]:
     """Return the size of the noise from two successive gaps [m].
 
-    Velocities with a bias or a wrong scale have gaps that hardly change, which do not count as noise.
+    Velocities with a bias or a wrong scale have gaps that hardly change, and such gaps do not count as noise.
     """
     return jnp.sqrt(jnp.sum((after - before) ** 2) + 1e-20) / JUMP
 
@@ -108,7 +108,7 @@ def contradictions(before: State, after: State, dt: float, noise: Float[Array, "
         before: First measurement.
         after: Measurement one tick later.
         dt: Control tick [s].
-        noise: Typical size of a :func:`gap` due to noise in this flight, see :func:`gap_noise` [m].
+        noise: Typical size of a :func:`gap` due to noise in this flight [m]; see :func:`gap_noise`.
     """
     same = [jnp.all(a == b) for a, b in ((before.p, after.p), (before.R, after.R), (before.v, after.v))]
     slack = SPEED * dt + SPREADS * jnp.minimum(noise, NOISE_LIMIT)
@@ -133,17 +133,17 @@ class Consistency(eqx.Module):
     noise: Float[Array, ""]
     """Typical size of a gap due to noise [m]."""
     scale: Scale
-    """Moments of the last second."""
+    """Moments over the last second."""
     scaled: Bool[Array, ""]
-    """Whether velocities had a wrong scale when the vehicle last moved."""
+    """Whether the velocities had a wrong scale when the vehicle last moved."""
     repeated: Bool[Array, ""]
-    """Whether the last measurement equals the one before it, as after a dropped frame."""
+    """Whether the last measurement equals the one before it, e.g. after a dropped frame."""
     possible: Bool[Array, ""]
     """Whether the last measurement did not contradict the one before it."""
     certain: Bool[Array, ""]
-    """Whether the step to the last measurement is usable: neither of its ends contradicts the measurement before."""
+    """Whether the step to the last measurement is usable: neither end contradicts the measurement before it."""
     doubt: Float[Array, ""]
-    """Share of unusable steps among the last ones; one at the start, before any step was tested."""
+    """Share of unusable steps among the last few; one at the start, until a step has been tested."""
 
     @classmethod
     def start(cls, x: State) -> "Consistency":

@@ -6,19 +6,20 @@ tick, the prediction of d is constant, and the measured velocity corrects both,
     v <- v_predicted + (1 - z w) (v_measured - v_predicted),
     d <- d + (1 - z) (1 - w) (v_measured - v_predicted) / dt,
 
-with the poles z and w. One of them belongs to the time constant that a vehicle's unmodelled motors and delays allow.
-The other has the bandwidth of the steady Kalman filter for a disturbance that wanders by q sqrt(t) and velocities with
-the noise r per tick, (q / (r sqrt(dt)))^(1/2) [rad/s]; r is that of the last second. Without noise z is zero, and the
-observer is a first-order low-pass filter of the acceleration that the model misses in each tick.
+with the poles z and w. One of them has the time constant that a vehicle's unmodelled motors and delays allow. The
+other has the bandwidth of the steady-state Kalman filter, (q / (r sqrt(dt)))^(1/2) [rad/s], for a disturbance that
+wanders by q sqrt(t) and velocities with the noise r per tick. The noise r is estimated over the last second. Without
+noise, z is zero, and the observer is a first-order low-pass filter of the acceleration that the model misses in each
+tick.
 
 While a command at a limit acts, the motion of the vehicle does not show the disturbance: d and r are held, and v is set
-to the measured velocity. The same applies at the first measurement and after a missed tick, since the change is then
-not that of one tick.
+to the measured velocity. The same applies at the first measurement and after a missed tick, since the velocity change
+is then not that of one tick.
 
 Measurements that contradict each other (:mod:`retrim.estimation.consistency`) do not contain information about the
-disturbance: d is held during such a tick and the next one; v is predicted if a frame was dropped. The more of the last
-ticks have contradictions, the faster d decays, since an estimate without measurements acts as a push. The correction of
-one tick is limited, so that a wrong velocity that passes all tests has little effect.
+disturbance. During such a tick and the next one, d is held, and v is predicted if a frame was dropped. The more of the
+last few ticks have contradictions, the faster d decays, since an estimate without measurements acts like a push. The
+correction in one tick is limited, so that a wrong velocity that passes all tests has little effect.
 """
 
 import dataclasses
@@ -37,9 +38,9 @@ from .consistency import Consistency
 from .latency import follows
 
 NOISE_TAU = 1.0  # [s], memory of the estimated noise
-DECAY_TAU = 0.1  # [s], decay of the estimate if all of the last ticks have contradictions
+DECAY_TAU = 0.1  # [s], decay of the estimate if all of the last few ticks have contradictions
 CORRECTION, SPREADS = 0.08, 6.0  # [m/s] and standard deviations of the noise: largest innovation of a tick
-COAST = 0.5  # share of the last ticks with contradictions up to which the model predicts v after a dropped frame
+COAST = 0.5  # share of contradictory ticks up to which the model predicts v after a dropped frame
 SECOND_DIFFERENCE = 1.954  # mean magnitude of the second difference of white noise, in standard deviations
 
 
@@ -51,7 +52,7 @@ class ObserverState(eqx.Module):
     t: Float[Array, ""]
     """Time of the last measurement [s]; minus infinity before the first measurement."""
     commands: CommandQueue
-    """Commands of the last ticks; the newest was issued for the tick that has just ended."""
+    """Commands of the last few ticks; the newest was issued for the tick that has just ended."""
     v: Float[Array, "3"]
     """Estimated velocity, world [m/s]."""
     d_hat: Float[Array, "3"]
@@ -66,7 +67,7 @@ class ObserverState(eqx.Module):
 
 
 class DisturbanceObserver(eqx.Module):
-    """Estimates the disturbance that acts now, as fast as noise and unmodelled dynamics allow."""
+    """Estimates the present disturbance as fast as noise and unmodelled dynamics allow."""
 
     nominal: AbstractDynamics[Any]
     tau: Float[Array, ""]
@@ -76,7 +77,7 @@ class DisturbanceObserver(eqx.Module):
     wander: Float[Array, ""]
     """Standard deviation per axis of the change of the disturbance in a second [m/s^2]; infinity ignores the noise."""
     path: CommandPath = eqx.field(default_factory=CommandPath.of)
-    """Command path of the vehicle. Rates are measured, so that only its delay and its thrust are used."""
+    """Command path of the vehicle. Only its delay and thrust are used, since rates are measured."""
     limits: tuple[Command, Command] | None = None
     """Smallest and largest command; None if commands are not limited."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
@@ -129,8 +130,8 @@ class DisturbanceObserver(eqx.Module):
         doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
         decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
         # The model bridges a few dropped frames, since the measured velocity has the full noise. After other
-        # contradictions it does not: measurements may be later than declared, so that the prediction is for another
-        # time.
+        # contradictions it does not: measurements may be later than declared, so that the prediction is for a
+        # different time.
         dropped = consistency.repeated | s.consistency.repeated
         coasts = comparable & dropped & (consistency.doubt < COAST)
         v = jnp.where(coasts, predicted, x.v)
@@ -141,7 +142,7 @@ class DisturbanceObserver(eqx.Module):
         return where(comparable, after, held)
 
     def issued(self, s: ObserverState, u: Command) -> ObserverState:
-        """Return the memory after the command ``u`` was issued for the tick that begins."""
+        """Return the memory after the command ``u`` was issued for the tick that begins now."""
         return dataclasses.replace(s, commands=s.commands.push(u))
 
     def accepted(self, s: ObserverState, u: Command) -> ObserverState:
@@ -149,6 +150,6 @@ class DisturbanceObserver(eqx.Module):
         return dataclasses.replace(s, commands=s.commands.amend(u))
 
     def _noise(self, s: ObserverState, missed: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the noise of velocities, estimated from the jumps of the missed acceleration between ticks."""
+        """Return the noise of the velocities, estimated from the jumps of the missed acceleration between ticks."""
         seen = jnp.mean(jnp.abs(missed - s.missed)) * self.nominal.dt / SECOND_DIFFERENCE
         return s.noise + (1.0 - jnp.exp(-self.nominal.dt / NOISE_TAU)) * (seen - s.noise)

@@ -1,4 +1,4 @@
-"""L1 adaptive estimation of a disturbance: a velocity predictor, an adaptation law constant over a tick, a filter.
+"""L1 adaptive estimation of a disturbance: a velocity predictor, an adaptation law held over a tick, and a filter.
 
 The predicted velocity v_hat follows the measured velocity v at the speed of the pole A_s < 0. The law selects the sigma
 that would remove the whole prediction error within a tick, and the filter computes the estimate from it,
@@ -10,7 +10,7 @@ that would remove the whole prediction error within a tick, and the filter compu
 where f is the commanded thrust (Hovakimyan and Cao 2010; as in DATT, Huang et al. 2023). A constant disturbance d
 appears in -sigma from the second tick on, so that d_hat approaches it with the time constant -dt / ln(alpha). At the
 first measurement, and after a missed tick, the predictor starts from the measured velocity and d_hat is held, since the
-change is then not that of one tick.
+velocity change is then not that of one tick.
 """
 
 import equinox as eqx
@@ -40,7 +40,7 @@ class L1State(eqx.Module):
 
 
 class L1Estimator(eqx.Module):
-    """Estimates the disturbance that acts, from velocities and commanded thrust."""
+    """Estimates the acting disturbance from velocities and commanded thrust."""
 
     pole: Float[Array, ""]
     """Pole A_s of the predictor [1/s]; negative."""

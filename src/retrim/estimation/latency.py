@@ -9,11 +9,11 @@ from ..physics.state import Command, State
 
 
 def follows(t: Float[Array, ""], last: Float[Array, ""], dt: float) -> Bool[Array, ""]:
-    """Return whether a measurement follows another by one tick; otherwise their difference is not that of one tick.
+    """Return whether a measurement follows the previous one by one tick, so that their difference is that of one tick.
 
     Args:
         t: Time of the measurement [s].
-        last: Time of the measurement before [s]; minus infinity for the first measurement.
+        last: Time of the previous measurement [s]; minus infinity for the first measurement.
         dt: Control tick [s].
     """
     return jnp.abs(t - last - dt) < 0.5 * dt

@@ -1,7 +1,7 @@
-"""Error-state extended Kalman filter of the camera's pose and of the disturbance.
+"""Error-state extended Kalman filter for the camera's pose and the disturbance.
 
-The filter uses the ground pattern, the commands and Eq. (1) of the paper, but not the state. It only predicts while all
-points are invisible; one visible point is enough for a correction. Errors of Eq. (1) are modelled as a slow
+The filter uses the ground pattern, the commands and Eq. (1) of the paper, but not the state. It only predicts while no
+point is visible; one visible point is enough for a correction. Errors of Eq. (1) are modelled as a slow
 acceleration.
 """
 
@@ -20,7 +20,7 @@ from .camera import Camera, in_camera
 START = (0.1, 0.05, 0.2)  # uncertainty of the pose at hand-over: m, rad, m/s
 PUSH = 1.0  # [m/s^2], uncertainty of the disturbance at hand-over
 DRIFT = (0.0, 0.5, 1.0)  # further errors of Eq. (1): rates [rad/s] and acceleration [m/s^2], held over a tick
-WANDER = 1.0  # [m/s^2] in a second, random walk of the disturbance
+WANDER = 1.0  # [m/s^2] after one second, random walk of the disturbance
 ITERATIONS = 3  # a first estimate may be far off, so the projection is linearised again at the last result
 GATE = 4.0  # standard deviations; a point farther off corrects no more than one at this distance
 
@@ -37,7 +37,7 @@ class PoseFilter(eqx.Module):
 
     @classmethod
     def near(cls, x: State, key: Key[Array, ""]) -> "PoseFilter":
-        """Return a filter initialised near ``x``, to 10 cm, 3 degrees and 0.2 m/s; the key is consumed."""
+        """Return a filter initialised near ``x``, within about 10 cm, 3 degrees and 0.2 m/s; the key is consumed."""
         std = jnp.repeat(jnp.array(START, dtype=x.p.dtype), 3)
         off = std * jax.random.normal(key, (9,), x.p.dtype)
         push = jnp.full(3, PUSH, dtype=x.p.dtype)
@@ -84,7 +84,7 @@ class PoseFilter(eqx.Module):
             camera: The camera model.
             ground: Keypoints, world [m].
             pixels: Measured projections (normalised image coordinates).
-            visible: Whether each of them was measured.
+            visible: Whether each pixel was measured.
             noise: Standard deviation of the pixels per axis (normalised).
         """
 

@@ -21,17 +21,17 @@ class Underway(eqx.Module):
     before: ActuatorState
     """State of the actuators at the beginning of the tick that has just ended."""
     queue: CommandQueue
-    """Commands of the last ticks; the newest was issued for the tick that has just ended."""
+    """Commands of the last few ticks; the newest was issued for the tick that has just ended."""
 
 
 class Prediction(eqx.Module):
-    """Eq. (1) of the paper behind the declared command path of a vehicle."""
+    """Eq. (1) of the paper behind a vehicle's declared command path."""
 
     path: CommandPath
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
     ticks: int = eqx.field(static=True)
-    """Delay of the path in ticks, rounded up; a static number, since most vehicles need one step of prediction."""
+    """Delay of the path in ticks, rounded up; a static number, since most vehicles need only one prediction step."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
 
@@ -46,7 +46,7 @@ class Prediction(eqx.Module):
         return cls(path, dt, math.ceil(float(path.delay) / dt - ROUNDING))
 
     def with_age(self, age: float | Float[Array, ""]) -> "Prediction":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same prediction for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, age=jnp.array(age))
 
     def init(self, x: State) -> Underway:
@@ -55,7 +55,7 @@ class Prediction(eqx.Module):
         return Underway(ActuatorState.at(hover), CommandQueue.of(hover, self.dt, longest=self.ticks * self.dt))
 
     def acted(self, s: Underway) -> tuple[Command, ActuatorState]:
-        """Return mean thrust and rates over the tick that has just ended, and the state of the actuators at its end."""
+        """Return the mean thrust and rates over the tick that has just ended, and the actuator state at its end."""
         return self.path.advance(s.queue, s.before, self.dt)
 
     def thrust(self, s: Underway, before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -77,7 +77,7 @@ class Prediction(eqx.Module):
             s: Memory.
             x: Measured state.
             d: Disturbance, world [m/s^2].
-            omega: Measured body rates [rad/s]; None for those that follow from the commands.
+            omega: Measured body rates [rad/s]; None to use those that follow from the commands.
         """
         _, actuators = self.acted(s)
         if omega is not None:
@@ -94,7 +94,7 @@ class Prediction(eqx.Module):
         return x, actuators.command
 
     def issued(self, s: Underway, u: Command) -> Underway:
-        """Return the memory after the command ``u`` was issued for the tick that begins."""
+        """Return the memory after the command ``u`` was issued for the tick that begins now."""
         return Underway(self.acted(s)[1], s.queue.push(u))
 
     def accepted(self, s: Underway, u: Command) -> Underway:

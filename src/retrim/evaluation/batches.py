@@ -1,4 +1,4 @@
-"""Batches of flights, each of which runs as one program."""
+"""Batches of flights; each batch runs as one program."""
 
 import threading
 from collections.abc import Callable, Hashable, Iterable
@@ -10,8 +10,8 @@ import jax
 from ..runkit.flights import FlightSpec
 from ..runkit.provenance import cores
 
-LOT, LARGE = 64, 2048  # largest number of flights of one program: on a CPU, on an accelerator
-SMALL = 2  # Python steps a single flight, and uses only one core for it
+LOT, LARGE = 64, 2048  # largest number of flights in one program: on a CPU, on an accelerator
+SMALL = 2  # smallest batch; Python steps a single flight, which uses only one core
 
 
 class FlightBatch(NamedTuple):
@@ -21,7 +21,7 @@ class FlightBatch(NamedTuple):
     compiled: threading.Event | None
     """Set when the first batch of the same program has compiled it; None for a single flight."""
     compiles: bool = False
-    """Whether it is the first batch of its program."""
+    """Whether this is the first batch of its program."""
 
 
 def in_batches(
@@ -29,11 +29,11 @@ def in_batches(
 ) -> list[FlightBatch]:
     """Divide flights into batches; flights that cannot share a program run individually.
 
-    The first batch of each program comes first, so that different programs compile at the same time.
+    The first batches of all programs come before the others, so that different programs compile at the same time.
 
     Args:
-        groups: Flights that differ in numbers of the vehicle, start and seed only.
-        program: Returns a key that identifies the program of a group; None if its flights run one by one.
+        groups: Groups of flights that differ only in the vehicle's numbers, the start and the seed.
+        program: Returns a key that identifies a group's program; None if its flights run one by one.
     """
     first, others = dict[Hashable, FlightBatch](), list[FlightBatch]()
     for group in groups:
@@ -49,7 +49,7 @@ def in_batches(
 
 
 def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
-    """Divide a group into parts of ``size`` flights; a single remaining flight joins the part before it."""
+    """Divide a group into parts of ``size`` flights; a single remaining flight joins the previous part."""
     bounds = [*range(0, len(group), size), len(group)]
     if size > 1 and len(bounds) > 2 and bounds[-1] - bounds[-2] == 1:
         del bounds[-2]
@@ -57,10 +57,10 @@ def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
 
 
 def largest() -> int:
-    """Return the largest number of flights of one program, on all devices together."""
+    """Return the largest number of flights in one program, on all devices together."""
     return (LOT if jax.default_backend() == "cpu" else LARGE) * jax.device_count()
 
 
 def lanes() -> int:
-    """Return the number of batches that run at once: one per core, or one for several devices or an accelerator."""
+    """Return the number of concurrent batches: one per core, or one for several devices or an accelerator."""
     return cores() if jax.default_backend() == "cpu" and jax.device_count() == 1 else 1

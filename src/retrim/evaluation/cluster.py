@@ -12,10 +12,10 @@ from ..plants.extras import import_extra
 from ..runkit.provenance import EXTRAS, code, versions
 from ..runkit.reporter import Reporter
 
-ANSWERS_S = 10.0  # limit for the first connection to the scheduler
-BACK_S = 60.0  # limit for an answer of the scheduler, also after a lost connection
-WORKERS_S = 30.0  # limit for the first worker to connect
-ATTEMPTS = 5  # for a job that the scheduler lost, or whose result did not arrive
+ANSWERS_S = 10.0  # time limit for the first connection to the scheduler
+BACK_S = 60.0  # time limit for an answer from the scheduler, also after a lost connection
+WORKERS_S = 30.0  # time limit for the first worker to connect
+ATTEMPTS = 5  # for a job that the scheduler has lost, or whose result has not arrived
 ADDRESS = re.compile(r"(tcp|tls)://\[?(?P<host>[^\]]+)\]?:(?P<port>\d{1,5})")
 ALIKE = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
 """Packages whose versions must be equal on all machines, so that a flight does not depend on its machine."""
@@ -24,19 +24,20 @@ ALIKE = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
 class Cluster(Executor):
     """An executor whose jobs run on the workers of a Dask scheduler.
 
-    If a worker dies, its job runs again on another one, until Dask considers the job itself the cause (its
-    ``allowed-failures``, three by default). A job that the scheduler lost while the connection was down runs again,
-    too. Each result is delivered once. This process opens no listening port; it connects to the scheduler.
+    If a worker dies, its job runs again on another one. This ends when Dask considers the job itself to be the cause
+    (see its ``allowed-failures``, three by default). A job that the scheduler loses while the connection is down also
+    runs again. Each result is delivered once. This process does not open a listening port; it connects to the
+    scheduler.
     """
 
     def __init__(self, address: str) -> None:
-        """Connect, and compare versions.
+        """Connect to the scheduler, and compare versions.
 
         Args:
-            address: ``tcp://HOST:PORT``, or ``tls://HOST:PORT`` with the certificates of Dask's own configuration.
+            address: ``tcp://HOST:PORT``, or ``tls://HOST:PORT`` with the certificates in Dask's own configuration.
 
         Raises:
-            ConfigError: The address is invalid, no scheduler answers, it has no worker, or a worker has other versions.
+            ConfigError: The address is invalid, no scheduler answers, it has no workers, or the versions differ.
             PlantError: Dask is not installed.
         """
         place = ADDRESS.fullmatch(address)
@@ -57,7 +58,7 @@ class Cluster(Executor):
 
     @property
     def page(self) -> str:
-        """Address of the scheduler's own page."""
+        """Address of the scheduler's dashboard."""
         return str(self._client.dashboard_link)
 
     @property
@@ -84,7 +85,7 @@ class Cluster(Executor):
             return
 
         def over(done: Any) -> None:
-            with suppress(InvalidStateError):  # it was cancelled meanwhile
+            with suppress(InvalidStateError):  # the job was cancelled in the meantime
                 if done.status == "error":
                     outer.set_exception(done.exception())
                     return
@@ -95,7 +96,7 @@ class Cluster(Executor):
                         return
                     except InvalidStateError:
                         raise
-                    except Exception as error:  # lost on the way from the worker, or unreadable here
+                    except Exception as error:  # the result was lost on its way from the worker, or is unreadable here
                         lost = _line(error)
                     finally:
                         done.release()  # otherwise the worker would keep the result as well
@@ -108,7 +109,7 @@ class Cluster(Executor):
         inner.add_done_callback(over)
 
     def _check(self) -> None:
-        """Compare the versions of all workers with ours."""
+        """Compare the versions on all workers with those of this process."""
         try:
             self._client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError as error:
@@ -121,7 +122,7 @@ class Cluster(Executor):
 
 @contextmanager
 def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
-    """Yield the cluster at an address, and report its workers and dashboard; yield None without an address."""
+    """Yield the cluster at an address, and report its workers and dashboard; without an address, yield None."""
     if address is None:
         yield None
         return
@@ -131,7 +132,7 @@ def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
 
 
 def ours() -> dict[str, str]:
-    """Return the values that must be equal on all machines: versions, and the digest of retrim's code."""
+    """Return the values that must be equal on all machines: the versions, and the digest of retrim's code."""
     result = versions()
     return {name: result.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"code": code()}
 
@@ -144,7 +145,7 @@ def check_alike(theirs: dict[str, str], who: str) -> None:
         who: Name of that process, for the message.
 
     Raises:
-        ConfigError: They differ, with each difference.
+        ConfigError: The versions differ; the message lists each difference.
     """
     here = ours()
     if other := [f"{name} {theirs.get(name)}, here {here[name]}" for name in here if theirs.get(name) != here[name]]:
@@ -152,7 +153,7 @@ def check_alike(theirs: dict[str, str], who: str) -> None:
 
 
 def call(theirs: dict[str, str], fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Call a function on a worker; check versions again, since the worker may have joined after the first check."""
+    """Call a function on a worker; check versions first, since the worker may have joined after the earlier check."""
     from ..runkit.compile_cache import enable_compile_cache
 
     check_alike(theirs, "who sent this job to a worker")

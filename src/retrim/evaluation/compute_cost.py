@@ -1,4 +1,4 @@
-"""Cost of each method: steps and time of training, of an update in flight, and of one decision."""
+"""Cost of each method: steps and time for training, for an update in flight, and for one decision."""
 
 import time
 from collections.abc import Callable
@@ -24,7 +24,7 @@ DECISIONS = 200
 
 
 def timed(work: Callable[[], Any], runs: int) -> tuple[float, float]:
-    """Return the compile time, and the median time of a run [s]."""
+    """Return the compile time and the median run time [s]."""
     watch = Stopwatch()
     jax.block_until_ready(work())
     times, compiled = list[float](), watch.compile_s
@@ -36,10 +36,10 @@ def timed(work: Callable[[], Any], runs: int) -> tuple[float, float]:
 
 
 def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
-    """Measure the time of a fit of the residual and of an update of the policy, both as in flight.
+    """Measure the time that a residual fit and a policy update take, both as in flight.
 
     Args:
-        setup: Setup with the preset of adaptation.
+        setup: Set-up with the adaptation preset.
         lora: Whether to update a low-rank delta.
     """
     policy: Any = setup.new_policy(random.key(0))
@@ -62,7 +62,7 @@ def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
 
 
 def decision_s(setup: Setup, controller: AbstractController[Any]) -> float:
-    """Return the median time of one decision [s]."""
+    """Return the median time for one decision [s]."""
     x = setup.flight_starts(1)[0]
     decide = eqx.filter_jit(lambda controller, memory, t, x: controller(memory, t, x))
     memory, t = controller.init(x), jnp.zeros_like(x.p[0])
@@ -71,7 +71,7 @@ def decision_s(setup: Setup, controller: AbstractController[Any]) -> float:
 
 
 def full_window(setup: Setup) -> Window:
-    """Return a full window of flight under the large disturbance, at hover commands."""
+    """Return a full window of flight under the large disturbance, with hover commands."""
     plant = Scenario("large").make(setup.preset.vehicle, dt=setup.preset.dt)
     buffer = RollingBuffer(setup.preset.adapt.window)
     measurement = plant.reset(setup.flight_starts(1)[0])

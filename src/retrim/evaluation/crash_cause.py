@@ -1,4 +1,4 @@
-"""Likely cause of a crash, with numbers, from the measurements and commands in its log."""
+"""The likely cause of a crash, with numbers, from the measurements and commands in its log."""
 
 from collections.abc import Iterator
 
@@ -8,16 +8,16 @@ from ..physics.state import STANDARD_GRAVITY
 from ..runtime.flight import Log
 
 DELAYS, LAGS = range(11), (0.0, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)  # [ticks], [s]
-TICKS = 12  # shorter flights have too little data on thrust and rates
-LATER = 0.06  # [s], tolerated lateness of rates beyond training; the fit of a fast loop has about this uncertainty
+TICKS = 12  # shorter flights contain too little data on thrust and rates
+LATER = 0.06  # tolerated delay of rates beyond that in training [s]; the fit of a fast loop is about this uncertain
 
 
 def likely_cause(log: Log, lateness: float) -> str | None:
-    """Return the first cause that a log shows; None if it shows no known one.
+    """Return the first known cause that a log shows, or None.
 
     Args:
         log: A flight that was terminated.
-        lateness: Delay and lag of the body rates in the model of training [s].
+        lateness: Delay plus lag of the body rates in the training model [s].
     """
     return next(
         (result for cause in (_clock, _numbers, _motion, _rates, _limit) for result in cause(log, lateness)), None
@@ -73,7 +73,7 @@ def _motion(log: Log, lateness: float) -> Iterator[str]:
 
 
 def _rates(log: Log, lateness: float) -> Iterator[str]:
-    """Compare body rates about roll and pitch with their commands, behind delays and lags."""
+    """Compare roll and pitch rates with their commands, behind delays and lags."""
     if len(log.t) < TICKS:
         return
     measured, commanded = body_rates(log.measured.R, log.dt)[:, :2], log.u[1:, 1:3]
@@ -115,7 +115,7 @@ def body_rates(R: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _fit(measured: np.ndarray, commanded: np.ndarray, delay: int, lag: float, dt: float) -> tuple[float, float]:
-    """Return gain and correlation between measured rates and delayed, lagged commands."""
+    """Return the gain and the correlation between measured rates and delayed, lagged commands."""
     late = np.concatenate([np.zeros((delay, 2)), commanded[: len(commanded) - delay]])
     share, acting, result = np.exp(-dt / lag) if lag else 0.0, np.zeros(2), np.empty_like(late)
     for k, each in enumerate(late):

@@ -1,4 +1,4 @@
-"""Collects the flights of a fleet: waits for them, reports progress, and keeps all completed ones after a stop."""
+"""Collects a fleet's flights: waits for them, reports progress, and keeps all completed ones after a stop."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -14,11 +14,11 @@ from .batches import FlightBatch
 from .metrics import Rows, rows
 
 GONE: "Future[list[Flight]]" = Future()
-"""Placeholder for a future whose flights are forgotten; it is cancelled and never waited for."""
+"""Placeholder for a future whose flights were discarded; it is cancelled, and never waited for."""
 GONE.cancel()
-OFTEN = 1.0  # [s]: interval of progress reports while flights are running
+OFTEN = 1.0  # interval between progress reports while flights are running [s]
 Progress = Callable[[float, int], None]
-"""Receives the number of completed flights and of all flights; a running flight counts by its completed share."""
+"""Receives the numbers of completed flights and of all flights; a running flight counts by its completed share."""
 Submit = Callable[[FlightBatch, Callable[[float], None]], "Future[list[Flight]]"]
 """Starts a batch; its second argument is a callback that receives the completed share."""
 
@@ -34,12 +34,12 @@ class Flights:
 
     flown: list[Flight]
     interrupted: bool
-    """Some flights are missing: the fleet was stopped, or a job failed."""
+    """Whether flights are missing because the fleet was stopped or a job failed."""
     failed: dict[FlightSpec, str] = field(default_factory=dict)
-    """Flights whose job failed in another process, and why, in one line."""
+    """Flights whose jobs failed in another process, each with its error in one line."""
 
     def rows(self) -> Rows:
-        """Return one row of results per scenario, method and seed."""
+        """Return one row of results per scenario and method."""
         return rows(self.flown)
 
 
@@ -57,18 +57,18 @@ def gathered(
     """Start every batch, and wait until all flights are completed or aborted.
 
     Args:
-        specs: Flights, in the order in which they are returned.
+        specs: The flights, in the order in which they are returned.
         lots: The same flights, in batches.
         submit: Starts one batch.
-        progress: Called in this thread when flights are completed, and periodically before.
+        progress: Called in this thread when flights are completed, and periodically while they run.
         on_result: Receives completed flights, in this thread.
-        stop: Aborts the running flights. Ctrl-C does the same, and sets it.
+        stop: Aborts the running flights when it is set. Ctrl-C sets it, too.
         forget: Discard each flight after ``on_result`` has received it; thousands of logs would fill the memory.
         outlive: Continue if a batch fails, and return the failures; a configuration error still ends everything.
 
     Raises:
-        PlantError: A plant refused.
-        JobError: The executor cannot be reached any more.
+        PlantError: A plant refused to fly.
+        JobError: The executor can no longer be reached.
     """
     futures: list[Future[list[Flight]]] = []
     aloft, flown = dict[int, float](), dict[FlightSpec, Flight | None]()
@@ -123,5 +123,5 @@ def gathered(
 
 
 def _told(error: BaseException) -> str:
-    """Return an error in one line."""
+    """Return an error as one line of text."""
     return " ".join(f"{type(error).__name__}: {error}".split())

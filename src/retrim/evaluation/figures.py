@@ -24,7 +24,7 @@ from ..tasks.transition import Spliced
 from ..viz import plots
 
 BY_HAND = ("asked", "knobs", "reference")
-"""Kinds of events that a person causes in a live flight."""
+"""Kinds of events that a user causes in a live flight."""
 
 
 def picture(
@@ -41,15 +41,15 @@ def picture(
 
     Args:
         flights: Flights; those of other scenarios are left out.
-        setup: Preset of the policy, on the scenario's reference.
+        setup: Set-up of the policy's preset, with the scenario's reference.
         scenario: Scenario whose flights are drawn.
         folder: Output folder.
-        stem: Name of the files; by default task and disturbance.
+        stem: Name of the files, without a suffix; by default the task and the disturbance.
         title: Title of the picture; by default the conditions of the flights.
-        labels: Labels of methods by name; by default those of tables.
+        labels: Method labels by name; by default those in tables.
 
     Returns:
-        Paths of the PNG and the SVG; an empty list if no flight has this scenario.
+        Paths of the PNG and the SVG; an empty list if no flight belongs to this scenario.
     """
     shown = [f for f in flights if f.spec.scenario == scenario]
     if not shown:
@@ -87,7 +87,7 @@ def picture(
 
 
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
-    """Return times and labels of the disturbance in a flight; a disturbance that always changes has one span."""
+    """Return the time spans of a disturbance, with labels; a disturbance that changes all the time has one span."""
     times, result, changes = timeline(name, home, seconds)
     if len(changes) > FEW:
         return [plots.Span(0.0, seconds, name, strong=False)]
@@ -101,7 +101,7 @@ def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
 
 
 def _label(here: ExternalEffects) -> str:
-    """Return the effects in words; an empty text without effects."""
+    """Return the effects in words; an empty string without effects."""
     words = list[str]()
     if np.any(here.push):
         same = len(set(here.push.tolist())) == 1
@@ -117,10 +117,10 @@ def _label(here: ExternalEffects) -> str:
 
 
 def _colours(methods: Sequence[str]) -> dict[str, int]:
-    """Return a colour per method.
+    """Return the colour index of each method.
 
-    The base policy and full adaptation have fixed colours. Other methods get the remaining ones in order; the colour
-    of full adaptation is also free if that method is absent.
+    The base policy and full adaptation have fixed colours. Other methods receive the remaining ones in order. If full
+    adaptation is absent, its colour is also available.
     """
     own = {"base": 0, "full": 1}
     left = itertools.count(2 if "full" in methods else 1)

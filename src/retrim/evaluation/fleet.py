@@ -1,4 +1,4 @@
-"""Many flights of one preset: scenarios x methods x seeds x starts, on any executor."""
+"""Many flights with one preset: scenarios x methods x seeds x starts, on any executor."""
 
 import secrets
 import threading
@@ -24,7 +24,7 @@ from .executor import Flights, Progress, Submit, gathered
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 
-COMPILED_AFTER = 1.0  # [s] of flight: all programs of a batch have run by then
+COMPILED_AFTER = 1.0  # flight time by which all programs of a batch have run [s]
 
 
 class Fleet:
@@ -46,14 +46,14 @@ class Fleet:
 
         Args:
             preset: Preset of the policies.
-            policies: Policies by seed; a single one has the seed 0. A baseline may have its own network instead.
+            policies: Policies by seed; a single policy has seed 0. A baseline may have its own network instead.
             scenarios: Scenarios of the flights.
             methods: Methods of the flights.
-            starts: Flights per scenario, method and seed, each from another start.
-            seconds: Length of a flight; the task's own by default.
+            starts: Number of flights per scenario, method and seed, each from a different start.
+            seconds: Length of a flight [s]; the task's own by default.
             latency: How learning is charged to flight time. ``measured`` flies one flight at a time, so that a flight
-                is not charged for the work of another.
-            state: Learner state of an earlier flight; adapting flights resume from it.
+                is not charged for another flight's work.
+            state: Learner state from an earlier flight; adapting flights resume from it.
 
         Raises:
             ConfigError: A name does not exist, or two settings are incompatible.
@@ -90,7 +90,7 @@ class Fleet:
         ]
 
     def lots(self, specs: Sequence[FlightSpec]) -> list[FlightBatch]:
-        """Return specifications in batches; flights that cannot share a program run individually."""
+        """Return the specifications in batches; flights that cannot share a program run individually."""
         groups: dict[Hashable, list[FlightSpec]] = {}
         for spec in specs:
             groups.setdefault(spec.group, []).append(spec)
@@ -102,10 +102,10 @@ class Fleet:
         return in_batches(groups.values(), program)
 
     def warm_up(self, specs: Sequence[FlightSpec] | None = None) -> None:
-        """Compile the programs of single flights before their take-off, in this process.
+        """Compile the programs of single flights before take-off, in this process.
 
         Args:
-            specs: Flights; all of the fleet by default.
+            specs: The flights; by default all flights of the fleet.
         """
         plants, pilots = set[Scenario](), set[Any]()
         for spec in self.specs if specs is None else specs:
@@ -133,23 +133,24 @@ class Fleet:
         """Fly all or some of the flights.
 
         Args:
-            executor: Any executor, which then flies one flight at a time; one with other processes builds its own
-                programs. By default flights of a simulated plant run in batches, each as one program, and the others
-                one by one, on one thread per core.
-            progress: Called in this thread when flights are completed, and periodically before.
+            executor: Any executor; each of its jobs is a single flight. An executor with other processes builds its own
+                programs. Without an executor, flights of a simulated plant run in batches, each as one program, and
+                other flights run one by one, on one thread per core.
+            progress: Called in this thread when flights are completed, and periodically while they run.
             on_result: Receives completed flights, in this thread.
-            stop: Aborts the running flights. Ctrl-C does the same, and sets it.
-            only: Fly these specifications, a part of ``specs``.
-            by_lot: Submit the batches of the default to an executor with other processes, instead of single flights.
-                The flights are then the same bit for bit.
-            forget: Do not return flights: thousands of logs would fill the memory, and ``on_result`` has received them.
+            stop: Aborts the running flights when it is set. Ctrl-C sets it, too.
+            only: Fly only these specifications, a part of ``specs``.
+            by_lot: Submit batches instead of single flights to an executor with other processes. The flights then equal
+                those of the default, bit for bit.
+            forget: Do not return the flights, since thousands of logs would fill the memory; ``on_result`` receives
+                them.
 
         Returns:
-            The completed flights, in the order of the specifications, and the flights whose job failed in another
+            The completed flights, in the order of the specifications, and the flights whose jobs failed in another
             process.
 
         Raises:
-            PlantError: A plant refused, or its package is not installed.
+            PlantError: A plant refused to fly, or its package is not installed.
         """
         stop = stop or threading.Event()
         specs = self.specs if only is None else list(only)

@@ -1,4 +1,4 @@
-"""Stores the flights of an unfinished table in its folder, so that the same command resumes after a kill."""
+"""Stores the flights of an unfinished table in its folder, so that the same command resumes after being killed."""
 
 import hashlib
 import shutil
@@ -22,21 +22,21 @@ from .section_store import file_digests, named_by, named_in
 
 FLIGHTS = f"{PARTS}/flights"
 Group = tuple[Hashable, str]
-"""Group key of a specification; see :attr:`FlightSpec.group`."""
+"""A specification's group key; see :attr:`FlightSpec.group`."""
 
 
 class FlightStore:
-    """The flights of a fleet in the folder of a run.
+    """The flights of a fleet in a run's folder.
 
-    A group has the flights that one program can fly. It is written when it is complete, so that the batches of the
-    other groups do not change and their results stay the same, bit for bit.
+    A group contains the flights that one program can fly. It is written only when it is complete. The batches of other
+    groups therefore do not change, and their results stay the same, bit for bit.
     """
 
     def __init__(self, run: Run, fleet: Fleet) -> None:
-        """Read the flights of the same fleet that an earlier run has written to the folder with the same code."""
+        """Read the same fleet's flights that an earlier run with the same code has written to the folder."""
         self._run, self._over = run, dict[FlightSpec, Flight]()
         self._groups = dict[Group, list[FlightSpec]]()
-        for spec in dict.fromkeys(fleet.specs):  # a method that is named twice flies once
+        for spec in dict.fromkeys(fleet.specs):  # a method that is listed twice flies once
             self._groups.setdefault(spec.group, []).append(spec)
         policies = {str(seed): _digest_of(policy) for seed, policy in fleet.policies.items()}
         about = {"preset": dump(fleet.preset), "policies": policies, "seconds": fleet.seconds}
@@ -49,11 +49,11 @@ class FlightStore:
             self._keys[group] = section_key(**about, **what)
         result = [self._read(group) for group in self._groups]
         self.earlier = {flight.spec: flight for flights in result for flight in flights}
-        """Flights of an earlier run, which this run does not repeat."""
+        """Flights from an earlier run, which this run does not repeat."""
         run.reused += sum(map(bool, result))
 
     def save(self, flights: Sequence[Flight]) -> None:
-        """Write each group that these flights complete."""
+        """Write each group that is complete with these flights."""
         self._over |= {flight.spec: flight for flight in flights}
         for group in dict.fromkeys(flight.spec.group for flight in flights):
             specs = self._groups[group]
@@ -72,12 +72,12 @@ class FlightStore:
 
 
 def clear_flights(run: Run) -> None:
-    """Remove the flights in the folder of a run, after their table is written."""
+    """Remove the flights from a run's folder, after their table is written."""
     shutil.rmtree(run.folder / FLIGHTS, ignore_errors=True)
 
 
 def _digest_of(policy: Any) -> str:
-    """Return a digest of the arrays of a policy."""
+    """Return a digest of a policy's arrays."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(eqx.filter(policy, eqx.is_array)):
         digest.update(np.asarray(leaf).tobytes())

@@ -1,4 +1,4 @@
-"""A fault of one version of JAX, and a test for it."""
+"""A fault in one version of JAX, and a test for it."""
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +10,11 @@ EXCLUDED = "0.10.2"
 
 
 def wrong_rows(n: int, dtype: jnp.dtype) -> int:
-    """Return the number of rows that ``jit`` computes wrongly: rotate n vectors by the identity, square, sum.
+    """Return the number of rows that ``jit`` computes incorrectly.
 
-    The vectors are (0 ... n-1, 0, 0). jax 0.10.2 returns another row's result once the batch is large enough
-    (jax-ml/jax#39103). Row i must be i^2, exactly in float64 and to rounding in float32.
+    The program rotates n vectors by the identity, and sums the squares of each. Row i has the vector (i, 0, 0), and its
+    result must be i^2, exactly in float64 and to rounding in float32. jax 0.10.2 returns a different row's result once
+    the batch is large enough (jax-ml/jax#39103).
     """
     rows = np.zeros((n, 3))
     rows[:, 0] = np.arange(n)

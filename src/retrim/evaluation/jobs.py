@@ -1,4 +1,4 @@
-"""A batch of flights as a job for another process. The job is a plain value; each process builds the set-up once."""
+"""A batch of flights as a job for another process: a job is a plain value, and each process builds the set-up once."""
 
 import functools
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ class Job:
     """Everything that a batch of flights needs, in a form that can be sent to another process."""
 
     fleet: str
-    """Identifier of its fleet."""
+    """Identifier of the job's fleet."""
     preset: str
     policies: tuple[Any, ...]
     """Policies or baseline networks, one for each flight."""
@@ -28,7 +28,7 @@ class Job:
     latency: Latency
     state: LearnerState | None
     learnt: bool = True
-    """Whether to return the learner state of each flight, too, which is as large as its log."""
+    """Whether to return each flight's learner state, too; it is as large as the log."""
 
 
 def fly_job(job: Job) -> list[Flight]:
@@ -45,12 +45,12 @@ def fly_job(job: Job) -> list[Flight]:
 
 @functools.lru_cache(maxsize=16)
 def setup_for(preset: str, reference: str | None = None, fleet: str = "") -> Setup:
-    """Return a set-up, built once per process and fleet, for executors with other processes.
+    """Return a set-up for executors with other processes; it is built once per process and fleet.
 
     Args:
-        preset: As JSON.
+        preset: The preset, as JSON.
         reference: Name of the reference.
-        fleet: Identifier of the fleet; the file of a reference may have changed since another fleet.
+        fleet: Identifier of the fleet; a reference file may have changed since an earlier fleet.
     """
     del fleet
     return Setup.from_preset(parse(preset, source="preset"), reference)

@@ -1,4 +1,4 @@
-"""Limits of seeds, numbers of starts and lengths of flights, checked before any training."""
+"""Limits for seeds, the number of starts and flight lengths, checked before any training."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ def check_seeds(seeds: Sequence[int]) -> None:
     """Check the seeds of a run.
 
     Raises:
-        ConfigError: The list is empty or has duplicates, or a seed is negative or does not fit 32 bits.
+        ConfigError: The list is empty or contains duplicates, or a seed is negative or exceeds 32 bits.
     """
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
@@ -21,14 +21,14 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 
 def check_flights(starts: int, seconds: float | None) -> None:
-    """Check number and length of flights.
+    """Check the number and the length of flights.
 
     Args:
-        starts: Flights per scenario, method and seed.
-        seconds: Length of a flight; None for the task's own.
+        starts: Number of flights per scenario, method and seed.
+        seconds: Length of a flight [s]; None for the task's own.
 
     Raises:
-        ConfigError: One of them is out of range.
+        ConfigError: One of the values is out of range.
     """
     if not 1 <= starts <= MAX_STARTS:
         raise ConfigError(f"{starts} starts: must be 1 to {MAX_STARTS}")

@@ -28,13 +28,13 @@ CONDITIONS = ("disturbance", "method", "plant", "vehicle", "sensors", "thrust_er
 FIGURES = (
     "error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", "rates_rms", "rates_change_rms",
 )  # fmt: skip
-"""Figures of a flight, in addition to whether it crashed."""
+"""A flight's figures, in addition to whether it crashed."""
 EFFORT = ("rates_rms", "rates_change_rms")
-"""Commanded body rates, and their change in a tick [rad/s]."""
+"""Commanded body rates, and their change per tick [rad/s]."""
 
 
 def record(flight: Flight) -> dict[str, Any]:
-    """Return the figures of one flight; errors of a flight that was terminated are None."""
+    """Return one flight's figures; the errors of a terminated flight are None."""
     spec, crashed = flight.spec, flight.log.terminated
     effort = flight.effort if find_method(spec.method).on_board is None else (np.nan, np.nan)  # no rates are commanded
     behind, unshifted = flight.behind or (None, None)
@@ -66,13 +66,13 @@ def record(flight: Flight) -> dict[str, Any]:
 
 
 def failed_record(spec: FlightSpec, vehicle: str, metric: str, why: str) -> dict[str, Any]:
-    """Return the record of a flight whose job failed: its conditions and the reason; all figures are None.
+    """Return the record of a flight whose job failed, with its conditions and the reason; all figures are None.
 
     Args:
         spec: Specification of the flight.
         vehicle: Name of the vehicle.
         metric: Name of the task's error.
-        why: The error, in one line.
+        why: The job's error, in one line.
     """
     conditions = {name: getattr(spec.scenario, name) for name in CONDITIONS if hasattr(spec.scenario, name)}
     about = {**conditions, "method": spec.method, "vehicle": vehicle, "seed": spec.seed, "start": spec.start}
@@ -80,11 +80,11 @@ def failed_record(spec: FlightSpec, vehicle: str, metric: str, why: str) -> dict
 
 
 def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
-    """Return one row per scenario and method: :func:`summary` of each.
+    """Return one row per scenario and method; see :func:`summary`.
 
     Args:
         flights: The flights.
-        by_seed: Separate rows for each seed.
+        by_seed: Whether to separate the rows by seed.
     """
     groups: dict[Any, list[Flight]] = {}
     for flight in flights:
@@ -97,12 +97,12 @@ def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:
 def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIONS) -> dict[str, Any]:
     """Return one row for flights under the same conditions.
 
-    The mean is over the flights that were not terminated; the median and the maximum count a terminated flight as
+    The mean is over the flights that were not terminated. In the median and the maximum, a terminated flight's error is
     infinite (written as None), so that they do not hide a crash. A flight whose job failed gives no information about
-    the method: it counts in ``n`` and is listed in ``failures``.
+    the method. It counts in ``n``, and is listed in ``failures``.
 
     Args:
-        records: Results of :func:`record`.
+        records: Results from :func:`record`.
         keys: Conditions to copy into the row.
     """
     why = [each["failed"] for each in records if each.get("failed")]
@@ -141,11 +141,11 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
 def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[float] | None:
     """Return the 95 % bootstrap interval of the mean error [m]; None if every flight was terminated.
 
-    Training seeds are drawn first, with replacement, and then the flights of each. Flights of one seed are correlated;
-    this order keeps their correlation from making the interval narrower.
+    Training seeds are drawn first, with replacement, and then flights from each seed. Flights with the same seed are
+    correlated; this order keeps their correlation from narrowing the interval.
 
     Args:
-        records: Results of :func:`record`.
+        records: Results from :func:`record`.
         draws: Number of resampled means.
     """
     by_seed: dict[Any, list[float]] = {}
@@ -177,14 +177,14 @@ def metres(value: float, digits: int | None = None) -> str:
     """Return an error [m] as text; a value that rounds to zero is written as an upper bound.
 
     Args:
-        value: The error.
+        value: The error [m].
         digits: Decimal places; three by default, four below a millimetre.
     """
     return _shown(value, digits or _digits(value))
 
 
 def mean_and_deviation(values: np.ndarray) -> str:
-    """Return errors [m] as mean ± standard deviation, with the digits of :func:`metres` for the mean."""
+    """Return errors [m] as mean ± standard deviation, with the decimal places that :func:`metres` gives the mean."""
     mean, deviation = float(values.mean()), float(values.std(ddof=len(values) > 1))
     return _with_deviation(mean, deviation, _digits(mean))
 
@@ -204,11 +204,11 @@ def _shown(value: float, digits: int) -> str:
 
 
 def cell(row: dict[str, Any], digits: int | None = None) -> str:
-    """Return mean ± standard deviation [m], with the numbers of terminated flights and of failed jobs.
+    """Return the mean ± standard deviation [m], with the numbers of terminated flights and of failed jobs.
 
     Args:
-        row: Result of :func:`summary`.
-        digits: Decimal places; as in :func:`metres` by default.
+        row: Result from :func:`summary`.
+        digits: Decimal places; by default those of :func:`metres`.
     """
     failed = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
     if row["mean"] is None:
@@ -218,12 +218,12 @@ def cell(row: dict[str, Any], digits: int | None = None) -> str:
 
 
 def _finite(value: float) -> float | None:
-    """Return a finite value unchanged, and otherwise None, since JSON has no infinity."""
+    """Return a finite value unchanged, otherwise None; JSON cannot represent infinity."""
     return value if np.isfinite(value) else None
 
 
 def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
-    """Return a line with the crashes of each method and their cause, and a line if no update took effect."""
+    """Return a line about each method's crashes and their cause, and a line if no update took effect."""
     lines = []
     for method in dict.fromkeys(flight.spec.method for flight in flights):
         same = [flight for flight in flights if flight.spec.method == method]
@@ -237,7 +237,7 @@ def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
 
 
 def _crashes(method: str, crashed: Sequence[Flight], n: int, preset: Preset) -> str:
-    """Return a line on the first crash of a method, with its likely cause."""
+    """Return a line about a method's first crash, with its likely cause."""
     first = min(crashed, key=lambda flight: float(flight.log.t[-1]))
     path = declared_path(preset, make_vehicle(preset.vehicle))
     lateness = float(path.delay + path.response.rate_lag[0])

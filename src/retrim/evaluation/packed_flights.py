@@ -1,4 +1,4 @@
-"""Flights as one NPZ file, exact to the last bit, without their learner states."""
+"""Flights as one NPZ file, bit for bit, without their learner states."""
 
 import io
 import json
@@ -18,7 +18,7 @@ def packed(flights: Sequence[Flight]) -> bytes:
     """Return flights as an NPZ file.
 
     Args:
-        flights: Flights; the file does not contain their specifications.
+        flights: The flights; the file does not contain their specifications.
     """
     arrays, about = dict[str, Any](), list[dict[str, Any]]()
     for i, flight in enumerate(flights):
@@ -36,14 +36,14 @@ def packed(flights: Sequence[Flight]) -> bytes:
 
 
 def unpacked(data: bytes, specs: Sequence[FlightSpec]) -> list[Flight]:
-    """Return the flights of :func:`packed`.
+    """Return the flights from a file that :func:`packed` made.
 
     Args:
         data: Content of the file.
         specs: Specifications of the flights.
 
     Raises:
-        ValueError: The file has another number of flights. An invalid file raises an error of NumPy's reader.
+        ValueError: The file has a different number of flights. For an invalid file, NumPy's reader raises an error.
     """
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         arrays: dict[str, np.ndarray] = dict(file)

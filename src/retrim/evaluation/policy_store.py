@@ -1,4 +1,4 @@
-"""Stores trained policies in the folder of a run, so that they are trained once and `retrim fly` can use them."""
+"""Stores trained policies in a run's folder, so that they are trained only once and `retrim fly` can use them."""
 
 import re
 from collections.abc import Sequence
@@ -18,23 +18,24 @@ from .section_store import file_digests, named_in
 
 POLICIES = "policies"
 UNSAFE = re.compile(r"[^\w.+=-]+")
-"""Characters of a preset's name (which may be a path) that are unsafe in a file name."""
+"""Characters in a preset's name (which may be a path) that are unsafe in a file name."""
 
 
 def trained_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> dict[int, AbstractPolicy]:
-    """Return a policy for each seed; those that ``run.trained`` has are not trained again.
+    """Return a policy for each seed; policies that are already in ``run.trained`` are not trained again.
 
     Args:
         preset: Preset to train with.
-        seeds: Seeds of weights and starts.
-        run: Its ``trained`` stores the policies, for this code and the files that the preset refers to.
-        reporter: Receives progress.
+        seeds: Seeds for the weights and starts.
+        run: Run whose ``trained`` folder stores the policies. They are reused only with the same code and the same
+            files that the preset refers to.
+        reporter: Receives the progress.
 
     Returns:
-        Policies by seed, in order; after an interruption incomplete ones are missing.
+        Policies by seed, in order; after an interruption, incomplete ones are missing.
 
     Raises:
-        JobError: A training failed in another process; raised after the others are completed.
+        JobError: Training failed in another process; raised after the other jobs are completed.
     """
     made_of = section_key(preset=dump(preset), files=file_digests(*named_in(preset)))
     stem = f"{UNSAFE.sub('-', preset.name)}-{made_of[:8]}"

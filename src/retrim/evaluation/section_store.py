@@ -1,4 +1,4 @@
-"""Stores the finished sections of a run in its folder, so that the same command resumes after a kill."""
+"""Stores a run's finished sections in its folder, so that the same command resumes after being killed."""
 
 import dataclasses
 import hashlib
@@ -14,7 +14,7 @@ from ..runkit.run import PARTS, Run
 
 
 def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) -> None:
-    """Write a section and the rows behind it to the folder of the run."""
+    """Write a section and its rows to the run's folder."""
     drawn = None if section.picture is None else {section.picture.name: digest_of(section.picture)}
     whole = dataclasses.asdict(section) | {"picture": drawn}
     run.write_text(f"{PARTS}/{key}.json", json.dumps({"section": whole, "rows": rows}) + "\n")
@@ -23,7 +23,7 @@ def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) 
 def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None:
     """Return a section that an earlier run has finished in this folder, with its rows; None if it is not there.
 
-    It is also None if another run has overwritten the picture of the section, which is then made again.
+    The result is also None if another run has overwritten the section's picture. The section is then made again.
     """
     path = run.folder / PARTS / f"{key}.json"
     if not path.is_file():
@@ -37,16 +37,16 @@ def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None
         lines = tuple(tuple(row) for row in whole["rows"])
         section = TableSection(tuple(whole["columns"]), lines, whole["title"], whole["about"], next(iter(drawn), None))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None  # it is made again
+        return None  # the section is made again
     run.reused += 1
     return section, rows
 
 
 def file_digests(*names: str | None) -> dict[str, str]:
-    """Return digests of the files that names refer to: CSV files, and the modules of ``module:name``.
+    """Return digests of the files that names refer to: CSV files, and the modules in ``module:name``.
 
     Args:
-        *names: Names of any kind, and sums of names. Their modules must have been imported.
+        *names: Names of any kind, or several joined by ``+``. Their modules must have been imported.
     """
     result = dict[str, str]()
     for part in (part for name in names if name for part in name.split("+")):

@@ -1,4 +1,4 @@
-"""Common steps of all tables: check the options, train the policies, fly them."""
+"""Common steps for all tables: check the options, train the policies, and fly them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ class Study:
     """Error of each policy in its own model [m]."""
 
     def about(self) -> str:
-        """Return one sentence on the policies."""
+        """Return one line of text about the policies."""
         own = ", ".join(f"{1000 * error:.1f}" for error in self.errors)
         return f"Preset `{self.preset.name}`; error in its own model, by seed: {own} mm."
 
@@ -40,10 +40,10 @@ class Study:
 def table_presets(
     names: Sequence[str], task: str, *, seeds: Sequence[int], starts: int, seconds: float | None
 ) -> list[Preset]:
-    """Load the presets of a table, and check its sizes before anything is trained.
+    """Load a table's presets, and check its seeds, starts and flight length before any training.
 
     Raises:
-        ConfigError: A preset does not exist or is for another task, or a size is out of range.
+        ConfigError: A preset does not exist or is for a different task, or a value is out of range.
     """
     check_seeds(seeds)
     check_flights(starts, seconds)
@@ -51,7 +51,7 @@ def table_presets(
 
 
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
-    """Train a policy for each seed, or read it from the run; after an interruption return the completed ones."""
+    """Train a policy for each seed, or read it from the run; after an interruption, return the completed ones."""
     setup, policies, errors = Setup.from_preset(preset), dict[int, AbstractPolicy](), list[float]()
     for seed, policy in trained_policies(preset, seeds, run, reporter).items():
         if run.interrupted:
@@ -65,7 +65,7 @@ def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter
 def refuse_misfits(
     preset: Preset, scenarios: Sequence[Scenario], *, methods: Sequence[str], starts: int, seconds: float | None
 ) -> None:
-    """Plan the flights of a table with a policy that has not been trained.
+    """Plan a table's flights with an untrained policy.
 
     Raises:
         ConfigError: A name does not exist, or two settings are incompatible.
@@ -88,17 +88,17 @@ def fly_all(
     seconds: float | None,
     keep: bool = True,
 ) -> Flights:
-    """Fly every combination, with progress.
+    """Fly every combination, and report the progress.
 
     Args:
         study: Policies to fly.
         scenarios: Scenarios of the flights.
-        run: Its folder stores the flights; flights that an earlier run has stored there are not repeated.
-        reporter: Receives progress.
+        run: Run whose folder stores the flights; flights that an earlier run has stored there are not repeated.
+        reporter: Receives the progress.
         methods: Methods of the flights.
-        starts: Flights per scenario, method and seed.
+        starts: Number of flights per scenario, method and seed.
         seconds: Length of a flight [s]; the task's own by default.
-        keep: Store the flights until the table removes them; their learner states are not stored.
+        keep: Store the flights until the table removes them; learner states are not stored.
 
     Raises:
         PlantError: The package of a plant is not installed.

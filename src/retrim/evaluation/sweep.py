@@ -1,4 +1,4 @@
-"""Sweeps: policies x scenarios x seeds from one TOML file, resumable after a kill."""
+"""Sweeps: policies x scenarios x seeds from one TOML file, resumable after being killed."""
 
 import dataclasses
 import json
@@ -40,12 +40,12 @@ FIGURES = ("error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "u
 
 @dataclass(frozen=True, config=STRICT)
 class Sweep:
-    """The content of a sweep file."""
+    """The contents of a sweep file."""
 
     presets: tuple[str, ...] = Field(default=("hover/retrim",), min_length=1)
-    """Presets to train a policy with, for each seed."""
+    """Presets; a policy is trained with each preset and seed."""
     seeds: tuple[Annotated[int, Strict()], ...] = Field(default=(0,), min_length=1)
-    """Training seeds; each also seeds starts, disturbances and learners of its flights."""
+    """Training seeds; each one also seeds the starts, disturbances and learners of its flights."""
     methods: tuple[str, ...] = Field(default=("base", "full"), min_length=1)
     disturbances: tuple[str, ...] = Field(default=("none",), min_length=1)
     plants: tuple[str, ...] = Field(default=("bem",), min_length=1)
@@ -53,12 +53,12 @@ class Sweep:
     """Vehicles of the flights; by default that of training. Paths are relative to the sweep file; contents are kept."""
     sensors: tuple[str, ...] = Field(default=("ideal",), min_length=1)
     references: tuple[str, ...] = ()
-    """References of tracking policies."""
+    """References for tracking policies."""
     starts: int = Field(default=1, ge=1, le=100_000, strict=True)
     seconds: float | None = Field(default=None, ge=1.0, le=36_000.0, strict=True)
-    """Length of a flight; the task's own by default."""
+    """Length of a flight [s]; the task's own by default."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Values on top of every preset, as in its TOML file; a vehicle file is relative to the sweep file."""
+    """Values that override those of every preset, as in its TOML file. A vehicle file is relative to the sweep file."""
 
     def scenarios(self) -> list[Scenario]:
         """Return every combination of disturbance, plant, vehicle, sensors and reference."""
@@ -77,10 +77,10 @@ def read_sweep(path: Path, trust: Collection[str] = ()) -> Sweep:
 
     Args:
         path: The file.
-        trust: Python names that it may hold, as ``mine:task``.
+        trust: Python names that it may refer to, for example ``mine:task``.
 
     Raises:
-        ConfigError: It cannot be read, a key or value is invalid, or it names Python code that is not trusted.
+        ConfigError: The file cannot be read, a key or value is invalid, or it names Python code that is not trusted.
     """
     tables = read_toml(path)
     if isinstance(overlay := tables.get("overlay"), dict):
@@ -95,9 +95,9 @@ def read_sweep(path: Path, trust: Collection[str] = ()) -> Sweep:
 def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     """Train all policies and fly all flights that are not yet in the run's folder.
 
-    Policies are stored in ``policies/``, and a row for each flight in ``flights.jsonl``. After a kill the run resumes
-    from those that the same code made from the same files. ``sweep.md``, ``sweep.json`` and ``sweep.png`` are written
-    at the end, and after an interruption.
+    Policies are stored in ``policies/``, and a row for each flight in ``flights.jsonl``. After being killed, the run
+    resumes from the policies and rows that the same code made from the same files. ``sweep.md``, ``sweep.json`` and
+    ``sweep.png`` are written at the end, and after an interruption.
 
     Returns:
         One row per preset, scenario and method.
@@ -112,7 +112,7 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
         for scenario in sweep.scenarios():
             scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # fails if a package is missing
     kept = _Kept(run.folder / "flights.jsonl")
-    # The keys are made once, before the first flight; a file that changes meanwhile affects the next run only.
+    # The keys are made once, before the first flight; a file that changes in the meantime affects only the next run.
     keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
     for preset, of_fleet in zip(presets, keys, strict=True):
         with run.interruptible():
@@ -131,12 +131,12 @@ def _fleet(preset: Preset, policies: Mapping[int, AbstractPolicy], sweep: Sweep)
 
 
 def _untrained(preset: Preset, sweep: Sweep) -> dict[int, AbstractPolicy]:
-    """Return untrained policies, to plan the flights before training."""
+    """Return untrained policies for planning the flights before training."""
     return dict.fromkeys(sweep.seeds, Setup.from_preset(preset).new_policy(random.key(0)))
 
 
 def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, reporter: Reporter) -> None:
-    """Fly the missing flights, and store the rows of completed ones."""
+    """Fly the missing flights, and store the rows of the completed ones."""
     missing = [spec for spec, key in keys.items() if key not in kept.rows]
     if not missing or run.interrupted:
         return
@@ -166,7 +166,7 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, 
 
 
 class _Kept:
-    """Rows of completed flights, one line of JSON each. Failed flights and those of unreadable lines fly again."""
+    """Rows of completed flights, one line of JSON each; failed flights and those on unreadable lines fly again."""
 
     def __init__(self, path: Path) -> None:
         self._path, self.rows = path, dict[str, dict[str, Any]]()
@@ -186,7 +186,7 @@ class _Kept:
 
 
 def _is_record(row: Any) -> bool:
-    """Return whether a line is the record of a flight, with valid types."""
+    """Return whether a line is a flight's record with valid types."""
     if not (isinstance(row, dict) and isinstance(row.get("key"), str) and row.keys() >= {*GROUP, *FIGURES, "metric"}):
         return False
     texts = all(row[name] is None or isinstance(row[name], str) for name in (*GROUP, "metric"))
@@ -199,7 +199,7 @@ def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
 
 
 def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
-    """Write the documents of the completed flights, in the order of the sweep."""
+    """Write the documents about the completed flights, in the order of the sweep."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in kept:
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
@@ -223,7 +223,7 @@ def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Re
 
 
 def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[str, dict[str, list[float]]]:
-    """Return the errors of flights by scenario and method; they are infinite for crashed flights."""
+    """Return the flights' errors by scenario and method; a crashed flight's error is infinite."""
     shown: dict[str, dict[str, list[float]]] = {}
     varied = [i for i, name in enumerate(GROUP[:-1]) if len({group[i] for group in groups}) > 1] or [5]
     for group, flights in groups.items():

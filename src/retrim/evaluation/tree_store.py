@@ -1,4 +1,4 @@
-"""Networks and training states in the folder of a run: a training runs only once, and resumes after an interruption."""
+"""Networks and training states in a run's folder: training runs only once, and resumes after an interruption."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,24 +20,24 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 def save_tree(path: Path, tree: Any, *, kind: str, about: Mapping[str, str] = NOTHING) -> None:
-    """Write the arrays of a tree, whole or not at all.
+    """Write a tree's arrays completely or not at all.
 
     Args:
         path: The file.
         tree: The tree; random keys are written as their key data.
-        kind: Kind of the content.
+        kind: Kind of content.
         about: Further metadata for readers of the file.
     """
     write_whole(path, wire.pack(_numbers(tree), kind=kind, about=about))
 
 
 def load_tree(path: Path, like: T, *, kind: str, reporter: Reporter) -> T | None:
-    """Return the tree that was written, bit for bit; None if there is no file or it is damaged.
+    """Return the tree that was written, bit for bit; None if the file is missing or damaged.
 
     Args:
         path: The file.
-        like: A tree of the same structure; it supplies the leaves that are not arrays.
-        kind: Expected kind of the content.
+        like: A tree with the same structure; it supplies the leaves that are not arrays.
+        kind: Expected kind of content.
         reporter: Receives a line if the file is damaged.
     """
     if not path.is_file():
@@ -54,7 +54,7 @@ def load_tree(path: Path, like: T, *, kind: str, reporter: Reporter) -> T | None
 
 
 def _numbers(tree: Any) -> Any:
-    """Return the arrays of a tree, with random keys as key data."""
+    """Return a tree's arrays, with random keys as key data."""
     arrays = eqx.filter(tree, eqx.is_array)
     return jax.tree.map(lambda leaf: random.key_data(leaf) if _is_key(leaf) else leaf, arrays)
 

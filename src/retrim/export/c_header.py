@@ -1,6 +1,7 @@
 """Exports a policy as a C99 header in single precision, without allocation, with built-in test vectors.
 
-The code tests numbers by their bits. With -ffast-math, a compiler would remove comparisons that fail only for NaN.
+The generated code tests the bits of numbers: with -ffast-math, a compiler would remove comparisons that fail only for
+NaN.
 """
 
 import math
@@ -176,7 +177,7 @@ def _check_steps(name: str) -> list[str]:
 
 
 def _step(name: str, policy: Portable) -> list[str]:
-    """Return the code of the observation and of a step from state to command, for policies that observe the state."""
+    """Return the code for the observation and a step from state to command, for policies that observe the state."""
     if policy.observation is None:
         return []
     seen, past = policy.observation, 4 * policy.observation["history"]
@@ -229,11 +230,11 @@ def _array(name: str, values: np.ndarray) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """Return the text of a number that single precision reads back exactly."""
+    """Return the C literal of a number, which is exact in single precision."""
     text = f"{np.float32(value):.9g}"
     return f"{text}f" if any(sign in text for sign in ".e") else f"{text}.0f"
 
 
 def _bits(value: float) -> str:
-    """Return the bits of a number in single precision."""
+    """Return the bits of a number in single precision, as a C literal."""
     return f"0x{np.float32(value).view(np.uint32):08x}u"

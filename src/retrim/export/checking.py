@@ -1,6 +1,6 @@
 """Compares an exported policy with JAX on 10,000 observations, and measures the time of a step.
 
-The test vectors of each format contain NaN, infinite and too large numbers.
+The test vectors of each format contain NaN, infinite numbers and numbers that are too large.
 """
 
 import math
@@ -46,24 +46,24 @@ int main(void)
 
 @dataclass(frozen=True)
 class Parity:
-    """Result of a run of an exported policy."""
+    """Result of running an exported policy."""
 
     by: str
     """Program that ran the policy."""
     worst: float
-    """Largest difference to JAX, as a share of the range of commands."""
+    """Largest difference from JAX, as a share of the command range."""
     step_s: float
-    """Time of one step [s]: the median, or for C the mean of all."""
+    """Time of one step [s]: the median, or the mean for C."""
 
 
 def check_npz(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Check the runner."""
+    """Check the NPZ file with the NumPy runner."""
     runner = Runner(path)
     return Parity("NumPy", _worst(policy, runner.command(rows), wanted), _timed(lambda o: runner.command(o), rows))
 
 
 def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Check the model with ONNX Runtime, if it is installed."""
+    """Check the model with ONNX Runtime; return None if it is not installed."""
     if find_spec("onnxruntime") is None:
         return None
     import onnxruntime
@@ -78,10 +78,10 @@ def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarra
 
 
 def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Compile the header and check it, if there is a compiler.
+    """Compile and check the header; return None if there is no compiler.
 
     Raises:
-        ConfigError: It does not compile.
+        ConfigError: The header does not compile.
     """
     compiler = next((result for name in ("gcc", "cc", "clang") if (result := shutil.which(name))), None)
     if compiler is None:

@@ -17,7 +17,7 @@ from .npz_file import write_delta, write_npz
 from .onnx_file import write_onnx
 from .portable import Portable, commands, observations, portable_of
 
-PARITY = 1e-5  # largest error of an exported policy, as a share of the range of commands
+PARITY = 1e-5  # largest error of an exported policy, as a share of the command range
 SPREAD = 1.5  # scale of the observations for the comparison, in units of their usual size
 
 
@@ -43,15 +43,15 @@ def export(
     """Write a policy in another format, and report its accuracy there.
 
     Args:
-        policy: A policy, or the folder that holds one.
+        policy: A policy, or the folder that contains one.
         to: A format; or ``delta``, to write only a low-rank delta.
-        out: The file; by default ``policy`` or ``delta`` and the suffix of the format, in the current folder.
+        out: File to write; by default ``policy`` or ``delta`` and the suffix of the format, in the current folder.
         delta: A low-rank delta that is added to the policy.
         reporter: Receives the results.
         trust: Python names that the policy may refer to, for example ``mine:task``.
 
     Returns:
-        The files.
+        The paths of the written files.
 
     Raises:
         ConfigError: There is no such format, another file has the name of an output, or the result differs from JAX.

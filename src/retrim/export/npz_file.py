@@ -1,4 +1,4 @@
-"""Exports NPZ: arrays of a policy with a runner in the same folder, or a low-rank delta alone."""
+"""Exports NPZ files: the arrays of a policy, with a runner in the same folder, or only a low-rank delta."""
 
 import json
 from importlib.resources import files
@@ -19,7 +19,7 @@ def write_npz(path: Path, policy: Portable) -> list[Path]:
     """Write a policy, and the runner in the same folder; return both paths.
 
     Raises:
-        ConfigError: Another file has the name of the runner.
+        ConfigError: A different file already has the name of the runner.
     """
     runner, code = path.with_name(RUNNER), files(__package__).joinpath(RUNNER).read_bytes()
     if runner.exists() and (not runner.is_file() or runner.read_bytes() != code):

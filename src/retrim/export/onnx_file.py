@@ -1,4 +1,7 @@
-"""Exports ONNX: the network with its bounded output, for any number of rows. Needs the extra ``export``."""
+"""Exports ONNX models: the network with its bounded output, for any number of rows.
+
+This module needs the extra ``export``.
+"""
 
 import json
 from importlib.util import find_spec

@@ -22,7 +22,10 @@ TESTS = 4
 
 @dataclass(frozen=True)
 class Portable:
-    """A policy as NumPy arrays in single precision. u = low + (high - low) / (1 + exp(-(y + y0)))."""
+    """A policy as NumPy arrays in single precision.
+
+    The command is u = low + (high - low) / (1 + exp(-(y + y0))), with the network output y.
+    """
 
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Weights (inputs, outputs) and biases; a ReLU follows each layer except the last."""
@@ -30,9 +33,9 @@ class Portable:
     """Smallest command: c [m/s^2], omega [rad/s]."""
     high: np.ndarray
     y0: np.ndarray
-    """Offset of the network output, with which an output of zero commands hover."""
+    """Offset of the network output, so that an output of zero commands hover."""
     observation: dict[str, Any] | None
-    """Parameters of the observation of a state; None if the observation depends on more than the state."""
+    """Parameters of the state observation; None if the observation depends on more than the state."""
     about: dict[str, Any]
     """Preset, task, control tick [s], and a hash of the weights."""
     test_observations: np.ndarray
@@ -80,7 +83,7 @@ def observations(size: int, n: int, seed: int) -> np.ndarray:
 
 
 def commands(policy: AbstractPolicy, rows: np.ndarray) -> np.ndarray:
-    """Return the commands of JAX for rows of observations, in single precision."""
+    """Return the commands that JAX computes for rows of observations, in single precision."""
     single: AbstractPolicy = jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_array(leaf) else leaf, policy)
     return np.asarray(_commands(single, jnp.asarray(rows)))
 

@@ -1,11 +1,14 @@
-"""Runs an exported policy with NumPy only. This file does not need the rest of its package: copy it with the NPZ.
+"""Runs an exported policy with NumPy only.
+
+This file does not need the rest of its package: copy it together with the NPZ file.
 
     policy = Runner("policy.npz")
     policy.reset()
     c, *omega = policy.step(p, R, v)      # at every control tick
     if policy.repeats > 50: ...           # no finite measurement for 50 ticks: the last command was repeated
 
-World ENU, body forward-left-up; the command is the collective thrust, mass-normalised [m/s^2], and body rates [rad/s].
+The world frame is ENU, and the body frame is forward-left-up. The command consists of the mass-normalised collective
+thrust [m/s^2] and the body rates [rad/s].
 """
 
 import json
@@ -15,21 +18,21 @@ from typing import Any
 import numpy as np
 
 TOLERANCE = 1e-5  # largest error at the test vectors in the file, as a share of the command range
-LARGEST = 2.0**20  # a measurement is smaller than this number
+LARGEST = 2.0**20  # valid measurements are smaller than this number
 
 
 class Runner:
-    """A policy from an NPZ file. The constructor checks it against the test vectors in the file."""
+    """A policy from an NPZ file; the constructor checks it against the file's test vectors."""
 
     def __init__(self, path: str | Path, delta: str | Path | None = None) -> None:
         """Read a policy.
 
         Args:
-            path: The NPZ file.
-            delta: An NPZ file with the learned delta of a low-rank policy, which is added to the policy.
+            path: NPZ file of the policy.
+            delta: NPZ file with the learned delta of a low-rank policy, which is added to the policy.
 
         Raises:
-            ValueError: The policy fails the test vectors of the file, or the delta belongs to another policy.
+            ValueError: The policy fails the test vectors of the file, or the delta belongs to a different policy.
         """
         with np.load(path, allow_pickle=False) as file:
             self._arrays = {name: file[name] for name in file.files}
@@ -56,7 +59,7 @@ class Runner:
         return self._repeats
 
     def command(self, observation: np.ndarray) -> np.ndarray:
-        """Return the command [c, omega] for an observation, or for rows of them; NaN if one is not finite."""
+        """Return the command [c, omega] for an observation or for rows of them; NaN if one is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             o = np.asarray(observation, dtype=np.float32)
             is_finite = _is_finite(o)
@@ -79,8 +82,8 @@ class Runner:
     def step(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the command for a state, once per control tick.
 
-        While state or command are not finite, the last command is repeated, :attr:`repeats` increases, and the memory
-        does not change.
+        If the state or the command is not finite, the last command is repeated, :attr:`repeats` increases, and the
+        memory does not change.
 
         Args:
             p: Position, world [m].
@@ -142,5 +145,5 @@ class Runner:
 
 
 def _is_finite(x: np.ndarray) -> np.ndarray:
-    """Return whether all numbers of each row are smaller than LARGEST; NaN is not."""
+    """Return whether all numbers of each row are smaller than LARGEST in magnitude; NaN is not."""
     return np.asarray((np.abs(x) < LARGEST).all(axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""Policies as files: weights, limits, a description and a checksum. They can be read without a configuration."""
+"""Policies as files with weights, limits, a description and a checksum; they can be read without a configuration."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -20,16 +20,16 @@ from .sanity import check_policy
 
 MAX_WIDTH, MAX_LAYERS = 16_384, 16
 NETWORK = "network"
-"""Architecture of a policy that is not a perceptron; the function that its preset names builds it."""
+"""Architecture of a policy that is not a perceptron; the function that its preset names builds the network."""
 
 
 def write_policy(path: str | Path, policy: AbstractPolicy, about: Mapping[str, str]) -> None:
-    """Write a policy; its folder is created if necessary.
+    """Write a policy; the file's folder is created if necessary.
 
     Args:
         path: The file.
         policy: Policy to write.
-        about: Header fields, for example a preset; the architecture and the version of this package are added.
+        about: Header fields, for example a preset; the architecture and this package's version are added.
     """
     header = {**about, "architecture": architecture(policy), "version": this_release()}
     write_whole(Path(path), wire.pack(policy, kind="policy", about=header))
@@ -38,19 +38,19 @@ def write_policy(path: str | Path, policy: AbstractPolicy, about: Mapping[str, s
 def read_policy(
     path: str | Path, network: Callable[[dict[str, str]], AbstractPolicy] | None = None
 ) -> tuple[AbstractPolicy, dict[str, str]]:
-    """Read a policy from a file, or from a folder that holds ``policy.safetensors``.
+    """Read a policy from a file, or from a folder that contains ``policy.safetensors``.
 
     Args:
-        path: The file.
-        network: Returns the shapes of a policy that is not a perceptron, from the header of its file. By default only
-            perceptrons are read.
+        path: The file or folder.
+        network: Maps the file's header to the shapes of a policy that is not a perceptron. By default, only perceptrons
+            are read.
 
     Returns:
-        The policy, and the header of its file.
+        The policy, and the file's header.
 
     Raises:
-        CheckpointError: The file is missing, truncated, damaged or of another kind, its weights or
-            commands are not finite or too large, or its limits do not enclose hover.
+        CheckpointError: The file is missing, truncated, damaged or of a different kind, the policy's weights or
+            commands are not finite or are too large, or its limits do not enclose hover.
     """
     path = Path(path)
     file = path / "policy.safetensors" if path.is_dir() else path
@@ -70,10 +70,10 @@ def read_policy(
 
 
 def policy_like(sizes: str, *, source: str) -> Policy:
-    """Return the shapes of a policy from its architecture, for example ``15-512-512-4``.
+    """Return a policy's shapes from its architecture, for example ``15-512-512-4``.
 
     Raises:
-        CheckpointError: It is not an architecture of a policy.
+        CheckpointError: The text is not a policy's architecture.
     """
     try:
         widths = [int(word) for word in sizes.split("-")]
@@ -88,7 +88,7 @@ def policy_like(sizes: str, *, source: str) -> Policy:
 
 
 def architecture(policy: AbstractPolicy) -> str:
-    """Return the sizes of a perceptron's layers, for example ``15-512-512-4``; ``network`` for another network."""
+    """Return a perceptron's layer sizes, for example ``15-512-512-4``; ``network`` for any other network."""
     layers = policy.linear_layers()
     if not layers:
         return NETWORK
@@ -96,7 +96,7 @@ def architecture(policy: AbstractPolicy) -> str:
 
 
 def fingerprint(policy: AbstractPolicy) -> str:
-    """Return a hash of a policy's weights in single precision, because a low-rank delta belongs to one base."""
+    """Return a hash of a policy's weights in single precision; it identifies the base of a low-rank delta."""
     digest = hashlib.sha256()
     for layer in policy.linear_layers():
         for leaf in (layer.weight, layer.bias):
@@ -105,7 +105,7 @@ def fingerprint(policy: AbstractPolicy) -> str:
 
 
 def save_delta(path: str | Path, policy: LoraPolicy) -> None:
-    """Write the learned delta of a low-rank policy, without its base: about 50 kB for the paper's network.
+    """Write a low-rank policy's learned delta without its base: about 50 kB for the paper's network.
 
     Args:
         path: The file; its folder is created if necessary.
@@ -119,14 +119,14 @@ def save_delta(path: str | Path, policy: LoraPolicy) -> None:
 
 
 def load_delta(path: str | Path, base: AbstractPolicy) -> LoraPolicy:
-    """Read a delta and add it to its base; use ``.merged()`` of the result to fly.
+    """Read a delta and combine it with its base; to fly, call ``.merged()`` on the result.
 
     Args:
         path: The file.
         base: The policy for which the delta was trained.
 
     Raises:
-        CheckpointError: The file is missing, damaged, of another kind, or for another base, or the merged policy
+        CheckpointError: The file is missing, damaged, of a different kind or for a different base, or the merged policy
             cannot be flown.
     """
     path = Path(path)
@@ -159,7 +159,7 @@ def lora_like(base: Policy, header: Mapping[str, str], *, source: str) -> LoraPo
     """Return the shapes of a low-rank policy on ``base`` from header fields.
 
     Raises:
-        CheckpointError: Ranks or scale are missing or invalid.
+        CheckpointError: The ranks or the scale are missing or invalid.
     """
     try:
         ranks, scale = tuple(map(int, header["ranks"].split("-"))), float(header["scale"])

@@ -15,7 +15,7 @@ from ..transport.wire import MAX_BYTES
 
 
 def write_whole(path: Path, data: bytes | str) -> None:
-    """Write a file through a partial one in the same folder; an interruption leaves the old file or the new one.
+    """Write a file via a partial one in the same folder; an interruption leaves either the old file or the new one.
 
     Raises:
         OSError: The folder cannot be written, or the disk is full.
@@ -30,7 +30,7 @@ def write_whole(path: Path, data: bytes | str) -> None:
         partial.replace(path)
     except OSError as error:
         if error.errno is not None:
-            error.filename = error.filename or str(path)  # the error of a full disk contains no file name
+            error.filename = error.filename or str(path)  # the error for a full disk does not contain a file name
         raise
     finally:
         with contextlib.suppress(OSError):
@@ -38,11 +38,13 @@ def write_whole(path: Path, data: bytes | str) -> None:
 
 
 def npz_bytes(arrays: Mapping[str, Any], *, compressed: bool = False) -> bytes:
-    """Return an NPZ file. Equal arrays give equal bytes; NumPy's own writer adds the time of day.
+    """Return the bytes of an NPZ file.
+
+    Equal arrays give equal bytes; NumPy's own writer would add the time of day.
 
     Args:
         arrays: Arrays by name.
-        compressed: Whether to compress them.
+        compressed: Whether to compress the arrays.
     """
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED) as archive:
@@ -58,7 +60,8 @@ def read_bounded(path: Path, advice: str) -> bytes:
     """Read a file of at most :data:`retrim.transport.wire.MAX_BYTES`.
 
     Raises:
-        CheckpointError: It is not a regular file (with ``advice`` on how to make one), too large, or cannot be read.
+        CheckpointError: There is no regular file (the message then contains ``advice`` on how to make one), or it is
+            too large or cannot be read.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; {advice}")
@@ -71,7 +74,7 @@ def read_bounded(path: Path, advice: str) -> bytes:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that files can be written to a folder, before a long computation begins; remove new folders again.
+    """Check that files can be written to a folder, before a long computation begins; new folders are removed again.
 
     Raises:
         ConfigError: Files cannot be written.

@@ -1,4 +1,4 @@
-"""Determines the release that wrote a file, to explain a preset that does not fit."""
+"""Determines which release wrote a file, to explain a preset that does not fit."""
 
 import functools
 import re
@@ -19,7 +19,7 @@ def this_release() -> str:
 
 
 def newer_release(header: Mapping[str, str]) -> str | None:
-    """Return the version that wrote a file if it is newer than this one; otherwise, or if it is unknown, None.
+    """Return the version that wrote a file if it is known and newer than this one, otherwise None.
 
     Args:
         header: Header of the file.

@@ -1,4 +1,4 @@
-"""Checks whether a policy can be flown. A checksum proves that a file is intact; its numbers may still be unusable."""
+"""Checks whether a policy can be flown. A checksum proves that a file is intact, but its numbers may be unusable."""
 
 from typing import Any
 
@@ -11,23 +11,23 @@ from ..control.policy import AbstractPolicy
 from ..errors import CheckpointError, excerpt
 
 LARGEST = 1e5
-"""Largest weight; trained ones are below 100. Larger ones overflow within a few layers of single precision."""
+"""Largest weight. Trained weights are below 100; larger ones overflow within a few layers in single precision."""
 THRUST, RATES = 1000.0, 1000.0
-"""Largest limits of commands: [m/s^2], [rad/s]; a racing quadrotor has 150 and 40."""
+"""Largest command limits: [m/s^2], [rad/s]; those of a racing quadrotor are 150 and 40."""
 TRIALS = 8
 
 
 def check_policy(policy: AbstractPolicy, *, source: str, observation: np.ndarray | None = None) -> None:
-    """Check weights, limits, and the commands at hover and near it.
+    """Check the weights, the limits, and the commands at and near hover.
 
     Args:
-        policy: Policy to check; a low-rank one must be merged.
+        policy: Policy to check; a low-rank policy must be merged.
         source: Origin of the policy; error messages begin with it.
         observation: Observation at hover; zeros by default.
 
     Raises:
-        CheckpointError: A weight or limit is not finite or too large, limits do not enclose hover, or a command is not
-            finite.
+        CheckpointError: A weight or limit is not finite or is too large, the limits do not enclose hover, or a command
+            is not finite.
     """
     low, hover, high = (_double(u.vector()) for u in (policy.u_min, policy.u_hover, policy.u_max))
     most = np.array([THRUST, RATES, RATES, RATES])
@@ -56,7 +56,7 @@ def check_policy(policy: AbstractPolicy, *, source: str, observation: np.ndarray
 
 
 def _outputs(policy: AbstractPolicy, rows: np.ndarray) -> np.ndarray:
-    """Return the outputs of the network for rows of observations; in NumPy for a perceptron, to compile nothing."""
+    """Return the network's outputs for rows of observations; NumPy computes a perceptron, to avoid compilation."""
     layers, h = policy.linear_layers(), rows
     if not layers:
         return np.stack([np.asarray(eqx.filter_jit(policy.output)(jnp.asarray(row))) for row in rows])
@@ -67,7 +67,7 @@ def _outputs(policy: AbstractPolicy, rows: np.ndarray) -> np.ndarray:
 
 
 def check_size(tree: Any, *, source: str, largest: float = LARGEST) -> None:
-    """Check that all real numbers of a tree are finite and not too large for weights.
+    """Check that all floating-point numbers in a tree are finite and not too large for weights.
 
     Args:
         tree: A pytree of arrays.
@@ -75,7 +75,7 @@ def check_size(tree: Any, *, source: str, largest: float = LARGEST) -> None:
         largest: Largest absolute value.
 
     Raises:
-        CheckpointError: A number is not finite, or larger.
+        CheckpointError: A number is not finite or is too large.
     """
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if np.asarray(leaf).dtype.kind != "f" or not np.size(leaf):

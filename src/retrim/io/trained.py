@@ -1,4 +1,4 @@
-"""Files of policies with their presets, and of the learned state of a flight."""
+"""Files for policies with their presets, and for a flight's learned state."""
 
 import logging
 from collections.abc import Collection
@@ -30,11 +30,11 @@ from .releases import newer_release, this_release
 from .sanity import check_policy, check_size
 
 LOG = logging.getLogger(__name__)
-MOST = 1e12  # largest number in the state of a resumed learner
+MOST = 1e12  # largest number in a resumed learner's state
 
 
 def save_policy(path: str | Path, policy: AbstractPolicy, preset: Preset) -> None:
-    """Write a policy and the preset that it was trained with.
+    """Write a policy together with its preset.
 
     Args:
         path: The file; its folder is created if necessary.
@@ -48,14 +48,14 @@ def save_policy(path: str | Path, policy: AbstractPolicy, preset: Preset) -> Non
 
 
 def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[AbstractPolicy, Preset]:
-    """Read a policy and its preset from a file, or from a folder that holds ``policy.safetensors``.
+    """Read a policy and its preset from a file, or from a folder that contains ``policy.safetensors``.
 
     Args:
-        path: The file.
+        path: The file or folder.
         trust: Python names that its preset may refer to, for example ``mine:task``; they are imported.
 
     Raises:
-        CheckpointError: The file is missing, truncated, damaged or of another kind, its weights are not finite, or
+        CheckpointError: The file is missing, truncated, damaged or of a different kind, its weights are not finite, or
             its preset cannot be used, does not fit the weights, or names Python code that is not trusted.
     """
     policy, header = read_policy(path, lambda header: _network_like(header, str(path), trust))
@@ -65,11 +65,11 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Abstr
 
 
 def save_learner_state(path: str | Path, state: LearnerState, preset: Preset) -> None:
-    """Write the learned state of a flight: policy, residual and optimiser states, with the preset.
+    """Write a flight's learned state: the policy, the residual and the optimiser states, with the preset.
 
     Args:
         path: The file; its folder is created if necessary.
-        state: State of the learner, for example ``pilot.state`` of an adaptive pilot.
+        state: The learner's state, for example an adaptive pilot's ``pilot.state``.
         preset: Preset of the flight.
 
     Raises:
@@ -83,15 +83,15 @@ def save_learner_state(path: str | Path, state: LearnerState, preset: Preset) ->
 
 
 def load_learner_state(path: str | Path, *, trust: Collection[str] = ()) -> tuple[LearnerState, Preset]:
-    """Read the learned state of a flight, to continue from it.
+    """Read a flight's learned state, to continue from it.
 
     Args:
         path: The file.
         trust: Python names that its preset may refer to, for example ``mine:task``; they are imported.
 
     Raises:
-        CheckpointError: The file is missing, truncated, damaged or of another kind, or its preset cannot be used, does
-            not fit the learned state, or names Python code that is not trusted.
+        CheckpointError: The file is missing, truncated, damaged or of a different kind, or its preset cannot be used,
+            does not fit the learned state, or names Python code that is not trusted.
     """
     path = Path(path)
     data = read_bounded(path, "`retrim fly --out DIR` makes a learner_state.safetensors")
@@ -111,7 +111,7 @@ def load_learner_state(path: str | Path, *, trust: Collection[str] = ()) -> tupl
 
 
 def _policy_like(header: dict[str, str], setup: Setup, source: str) -> AbstractPolicy | LoraPolicy:
-    """Return the shapes of the policy of a learner state."""
+    """Return the shapes of the policy in a learner state."""
     if header.get("architecture", "") == NETWORK:
         return _shapes(setup)
     base = policy_like(header.get("architecture", ""), source=source)
@@ -129,7 +129,7 @@ def _shapes(setup: Setup) -> AbstractPolicy:
 
 
 def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[str]) -> Setup:
-    """Return the set-up of a header's preset, checked against the architecture of the weights."""
+    """Return the set-up for a header's preset, after a check against the weights' architecture."""
     try:
         preset = parse(header.get("preset", ""), source=f"{source}, header, preset")
         check_trust(preset, trust, source=source)
@@ -153,7 +153,7 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
 
 
 def _seen_at_rest(setup: Setup) -> Float[Array, " o"]:
-    """Return the observation of a vehicle that has rested at home."""
+    """Return the observation for a vehicle that has been at rest at home."""
     seen: Float[Array, " o"] = _observed(setup.env.task.observation, setup.env.task.home())
     return seen
 

@@ -19,14 +19,14 @@ from .transposed_layers import with_transposed_copy
 
 
 class PolicyState(eqx.Module):
-    """A policy, plain or low-rank, and the state of its optimiser, which holds moments of ``policy.params`` only."""
+    """A policy, plain or low-rank, and the state of its optimiser, which holds moments only for ``policy.params``."""
 
     policy: AbstractPolicy | LoraPolicy
     optimiser: optax.OptState
 
 
 def policy_loss(policy: AbstractPolicy, env: Env, x0: Start) -> Float[Array, ""]:
-    """Return minus the reward, averaged over ticks and over the batch of starts ``x0`` (leading axis)."""
+    """Return the negative reward, averaged over ticks and over the batch of starts ``x0`` (leading axis)."""
     flying, laid = with_transposed_copy((policy, env))
 
     def fly(start: Start) -> Trajectory:
@@ -67,7 +67,7 @@ def _perceptron_gradient(policy: Policy, env: Env, x0: Start) -> tuple[Float[Arr
 def bptt(
     state: PolicyState, env: Env, x0: Start, *, optimiser: optax.GradientTransformation
 ) -> tuple[PolicyState, Float[Array, " updates"]]:
-    """Optimise a policy by one optimiser step per row of starts.
+    """Optimise a policy with one optimiser step per row of starts.
 
     The function is pure and traceable, so callers compile it once. A step whose gradient is not finite is skipped,
     since one bad start must not destroy a policy.
@@ -75,8 +75,8 @@ def bptt(
     Args:
         state: Policy and optimiser state to start from.
         env: Model, task and delay.
-        x0: Starts; two leading axes, updates x environments.
-        optimiser: The optimiser that made ``state.optimiser``.
+        x0: Starts with two leading axes, updates x environments.
+        optimiser: The optimiser that created ``state.optimiser``.
 
     Returns:
         The new state, and the loss before each step.

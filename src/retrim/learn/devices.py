@@ -1,7 +1,7 @@
 """Devices of a computation: an axis of environments, flights or vehicles is divided among all JAX devices.
 
-A training with few starts and a small network stays on the CPU: its steps follow one another, and an accelerator waits
-for each next program.
+Training with few starts and a small network stays on the CPU: its steps follow one another, and an accelerator would
+wait for each next program.
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -21,13 +21,14 @@ MANY = "many"
 """Name of the divided axis."""
 
 
-# Weights times starts of a training from which an accelerator is faster: on one H200, 300 steps of 16 starts and 20,000
-# weights took 5 s (3 s on two CPU cores), and 300 steps of 100 starts and 280,000 weights 5 s as well (80 s).
+# Product of weights and starts from which an accelerator is faster. On one H200, 300 steps with 16 starts and 20,000
+# weights took 5 s (3 s on two CPU cores); 300 steps with 100 starts and 280,000 weights also took 5 s (80 s on the CPU
+# cores).
 LEAST_WORK = 500_000
 
 
 def suitable_device(policy: Any, starts: int) -> AbstractContextManager[Any]:
-    """Return a context in which a training runs on the device that suits its size: the CPU if it is small.
+    """Return a context in which training runs on the device that suits its size: the CPU if it is small.
 
     Args:
         policy: Policy to train.
@@ -48,8 +49,8 @@ def num_shards(n: int, devices: int) -> int:
 def shard(tree: T, *, axis: int = 0) -> T:
     """Divide the arrays of a tree among the devices, along one common axis; with one device, return the tree unchanged.
 
-    Inside ``jit`` this is a constraint, from which the compiler derives how to divide later computations; outside, the
-    arrays are moved. Values do not change, but sums over the axis are taken in another order.
+    Inside ``jit``, this is a constraint, from which the compiler derives how to divide later computations. Outside, the
+    arrays are moved. Values do not change, but sums over the axis are taken in a different order.
 
     Args:
         tree: Arrays whose axis ``axis`` has the same length; other leaves are unchanged.
@@ -63,7 +64,7 @@ def shard(tree: T, *, axis: int = 0) -> T:
 
 
 def replicate(tree: T, n: int) -> T:
-    """Replicate the arrays of a tree on each device that shares ``n`` pieces of work; see :func:`spread`."""
+    """Replicate the arrays of a tree on each device that shares ``n`` pieces of work; see :func:`shard`."""
     return _laid(tree, n, PartitionSpec())
 
 

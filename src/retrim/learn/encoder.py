@@ -1,7 +1,7 @@
-"""Pretraining of the hidden layers of a vision policy: they learn to predict the state from keypoints.
+"""Pretraining of a vision policy's hidden layers: they learn to predict the state from keypoints.
 
 The paper (Sec. IV-A.2, after Heeg et al.) trains them on flights of a random policy. Here the histories are synthetic:
-random motions of constant velocity and body rates, drawn anew at each step, without roll-outs.
+random motions with constant velocity and body rates, redrawn at each step, without roll-outs.
 """
 
 import equinox as eqx
@@ -29,7 +29,7 @@ def pretrain_encoder(
 ) -> tuple[Policy, Float[Array, " steps"]]:
     """Train the hidden layers of ``policy`` to predict [p, R, v]; the output layer is unchanged.
 
-    The optimiser is Adam with a cosine schedule from 1e-3. The layers are first drawn anew at the usual scale (Glorot),
+    The optimiser is Adam with a cosine schedule from 1e-3. The layers are first redrawn at the usual scale (Glorot),
     since those of a fresh policy are small.
 
     Args:
@@ -41,7 +41,7 @@ def pretrain_encoder(
         batch: Random motions per step.
 
     Returns:
-        The policy, and the mean absolute error before each step (scaled state).
+        The policy, and the mean absolute error of the scaled state before each step.
     """
     k_layers, k_out, k_train = random.split(key, 3)
     hidden = policy.layers[:-1]

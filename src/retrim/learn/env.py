@@ -21,23 +21,23 @@ class Env(eqx.Module):
     """Environment in which a policy is trained and judged: one drone, one model, one task."""
 
     dynamics: AbstractDynamics[Any]
-    """Model of the vehicle; it has the tick of the task."""
+    """Vehicle model; it has the same tick as the task."""
     task: AbstractTask
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
-    """Transport delay of commands [s]. Another value does not need another compilation."""
+    """Transport delay of commands [s]. A new value does not trigger a recompilation."""
     frame_disturbance: Residual | None = None
-    """Disturbance that a controller around the policy compensates with the frame of the effective gravity, as a
+    """Disturbance for which a controller around the policy compensates with the frame of the effective gravity. It is a
     function of the state and the last command, world [m/s^2]; None if the policy observes in the world frame."""
     jump_cost: Float[Array, ""] | None = None
     """Cost of the squared change of a policy's command from tick to tick, [c, omega] in m/s^2 and rad/s; None for no
     cost."""
     family: PathFamily | None = None
-    """Vehicles from which training draws, each with a belief about it; None for the vehicle of the model."""
+    """Family of vehicles from which training draws, each with a belief about it; None for the model's vehicle."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
     """Longest delay that the command queue of a roll-out can hold [s]."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` for an invalid delay, and for a model and a task with different ticks.
+        """Raise ``ValueError`` if the delay is invalid, or if the model and the task have different ticks.
 
         A traced delay, or an array of delays, is not checked.
         """
@@ -50,7 +50,7 @@ class Env(eqx.Module):
         return dataclasses.replace(self, dynamics=Hybrid(self.dynamics, residual))
 
     def with_path(self, path: CommandPath) -> "Env":
-        """Return the same environment for a vehicle with another command path.
+        """Return the same environment for a vehicle with a different command path.
 
         Args:
             path: Delay and actuator response of that vehicle.
@@ -58,7 +58,7 @@ class Env(eqx.Module):
         return dataclasses.replace(self, dynamics=with_response(self.dynamics, path.response), delay=path.delay)
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Draw a start of training, with a vehicle of the family if there is one; the key is consumed."""
+        """Draw a training start, with a vehicle from the family if there is one; the key is consumed."""
         if self.family is None:
             return self.task.reset(key)
         k_start, k_member = random.split(key)
@@ -78,7 +78,7 @@ class Env(eqx.Module):
         )
 
     def cost_of_jump(self, before: Command, after: Command) -> Float[Array, ""]:
-        """Return the cost of the change of the policy's command from ``before`` to ``after`` in one tick."""
+        """Return the cost of changing the policy's command from ``before`` to ``after`` in one tick."""
         if self.jump_cost is None:
             return jnp.zeros_like(after.c)
         return self.jump_cost * jnp.sum((after.vector() - before.vector()) ** 2)

@@ -33,7 +33,7 @@ def train_chunk(
     num_updates: int,
     num_envs: int,
 ) -> tuple[PolicyState, Float[Array, " updates"]]:
-    """Make ``num_updates`` optimiser steps on fresh starts; compiled once for the same optimiser, sizes and shapes.
+    """Take ``num_updates`` optimiser steps on fresh starts; compile once for the same optimiser, sizes and shapes.
 
     Training is divided into such chunks, so that progress can be shown and an interrupted run keeps its results.
     Several devices share the starts of each step.
@@ -58,8 +58,8 @@ def pretrain(
         policy: Policy to start from.
         env: Nominal model, task and delay.
         key: Random key, consumed.
-        optimiser: Optimiser of the policy's parameters. Another call with the same object does not compile again.
-        num_updates: Optimiser steps, a multiple of ``chunk``, since every chunk runs the same program.
+        optimiser: Optimiser of the policy's parameters. A second call with the same object does not recompile.
+        num_updates: Number of optimiser steps; it is a multiple of ``chunk``, since every chunk runs the same program.
         num_envs: Starts per step.
         chunk: Steps between two results.
 
@@ -68,7 +68,7 @@ def pretrain(
 
     Raises:
         ValueError: ``num_updates`` is not a positive multiple of ``chunk``.
-        TrainingError: The loss is not a number, in ten consecutive steps or at the end.
+        TrainingError: The loss is not a number in ten consecutive steps or at the end.
     """
     if num_updates % chunk or num_updates <= 0:
         raise ValueError(f"num_updates = {num_updates} must be a positive multiple of {chunk}")

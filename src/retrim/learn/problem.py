@@ -1,4 +1,4 @@
-"""The environment of learning from rewards; it does not need gradients."""
+"""The environment for learning from rewards; it does not need gradients."""
 
 from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -8,11 +8,11 @@ S = TypeVar("S")
 
 
 class Outcome(NamedTuple):
-    """Result of a step of an environment."""
+    """Result of one environment step."""
 
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]
-    """True if the episode is over, without further rewards."""
+    """True if the episode is over and there are no further rewards."""
     truncated: Bool[Array, ""]
     """True if the time limit cuts the episode off."""
 
@@ -26,7 +26,7 @@ class Problem(Protocol, Generic[S]):
         ...
 
     def observe(self, s: S, key: Key[Array, ""]) -> Float[Array, " o"]:
-        """Return the observation; the key is for its noise."""
+        """Return the observation; the key is used for its noise."""
         ...
 
     def step(self, s: S, action: Float[Array, " a"], key: Key[Array, ""]) -> tuple[S, Outcome]:

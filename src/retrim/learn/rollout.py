@@ -24,7 +24,7 @@ class Trajectory(eqx.Module):
     u: Command
     """Mean command that acts during each tick."""
     reward: Float[Array, " horizon"]
-    """r(x_t, u_t). After termination: the worst reward of the roll-out so far, so that terminating never pays."""
+    """r(x_t, u_t). After termination, it is the worst reward of the roll-out so far, so that terminating never pays."""
     terminated: Bool[Array, " horizon"]
     """True after the tick in which the vehicle left the task's bounds; its state is then frozen."""
 
@@ -32,7 +32,7 @@ class Trajectory(eqx.Module):
 def rollout(env: Env, policy: AbstractPolicy, start: Start) -> Trajectory:
     """Fly ``env.task.horizon`` ticks from ``start``.
 
-    A command begins to act ``env.delay`` after it was issued; until the first one acts, the vehicle receives the hover
+    A command begins to act ``env.delay`` after it was issued. Until the first one acts, the vehicle receives the hover
     command. During a tick in which the acting command changes, the mean of the two commands acts.
 
     Args:
@@ -49,13 +49,13 @@ def rollout(env: Env, policy: AbstractPolicy, start: Start) -> Trajectory:
 def perturbed_rollout(
     env: Env, policy: Policy, start: Start, perturbations: Perturbations
 ) -> tuple[Trajectory, Inputs]:
-    """Fly as :func:`rollout`, with a perturbation added to each layer's output at each tick.
+    """Fly like :func:`rollout`, with a perturbation added to each layer's output at each tick.
 
     Args:
         env: Model, task and delay.
         policy: Policy of the flight; gradients do not flow to its weights.
         start: Time and state at which the roll-out starts.
-        perturbations: Perturbations per layer, horizon x width; the result is differentiable in them.
+        perturbations: Perturbations per layer, horizon x width; the result is differentiable with respect to them.
 
     Returns:
         The trajectory, and the inputs of each layer (per layer, horizon x fan-in).
@@ -79,7 +79,7 @@ def _scan(
     shares = commands.weights(env.delay, task.dt)  # the same in every tick
 
     def framed(x: State, issued: Command) -> tuple[EffectiveGravityFrame | None, AbstractTask, State]:
-        """Return the frame of the policy, and task and state in this frame."""
+        """Return the policy's frame, and the task and the state in this frame."""
         frame = env.frame(x, issued)
         return (None, task, x) if frame is None else (frame, task.in_frame(frame), frame.state(x))
 

@@ -1,4 +1,4 @@
-"""Screening of a window: finds measurements that contradict each other, and ticks that a learner can use."""
+"""Screening of a window: it finds contradictory measurements, and the ticks that a learner can use."""
 
 from collections.abc import Sequence
 
@@ -20,14 +20,14 @@ class Screening(eqx.Module):
     """Steps from one measurement to the next that pass all tests; steps of invalid ticks, and steps that are not one
     tick long, are not tested."""
     samples: Bool[Array, " n"]
-    """Measurements at one end of at least one such step."""
+    """Measurements at either end of at least one such step."""
     counts: Int[Array, "5"]
     """Number of contradicted steps by reason, in the order of :class:`~retrim.estimation.consistency.Findings`."""
     trusted: Bool[Array, ""]
-    """True if at least half of the steps are usable, and velocities have the scale of the positions."""
+    """True if at least half of the steps are usable, and the velocities match the scale of the positions."""
 
     def note(self) -> str:
-        """Return the reasons and their counts in words; an empty string without contradictions."""
+        """Return the reasons and their counts in words; return an empty string if there are no contradictions."""
         return describe_counts(self.counts)
 
 
@@ -41,7 +41,7 @@ REASONS = (
 
 
 def describe_counts(counts: Int[ArrayLike, "5"] | Sequence[int]) -> str:
-    """Return the reasons with their counts in words; an empty string if all are zero."""
+    """Return the reasons with their counts in words; return an empty string if all are zero."""
     result = zip(REASONS, np.asarray(counts, dtype=int).tolist(), strict=False)
     return ", ".join(f"{name}: {n}" for name, n in result if n)
 
@@ -85,7 +85,7 @@ def _rows(x: State, part: slice) -> State:
 
 
 def _median(values: Float[Array, " n"], counts: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Return the median of the values that count; zero if there is no such value."""
+    """Return the median of the values that count; return zero if no value counts."""
     ordered = jnp.sort(jnp.where(counts & jnp.isfinite(values), values, jnp.inf))
     middle = ordered[(jnp.sum(counts) - 1) // 2]  # the last value, which is infinite, if the count is zero
     return jnp.where(jnp.isfinite(middle), middle, 0.0)

@@ -1,8 +1,8 @@
-"""Weights in both layouts, for a roll-out, so that each product in a scan reads its matrix along the rows.
+"""Weights in both layouts, so that each product in a roll-out's scan reads its matrix along the rows.
 
-In the forward pass a layer is a product of a few rows with a matrix of fan-in x fan-out; in the backward pass, with one
-of fan-out x fan-in. A CPU multiplies ten rows by the transpose of a stored matrix at half to a third of the rate of the
-matrix itself, and a scan would do so at every tick. So both layouts are computed once, before the scan.
+In the forward pass, a layer multiplies a few rows by a fan-in x fan-out matrix; in the backward pass, by a fan-out x
+fan-in matrix. A CPU multiplies ten rows by the transpose of a stored matrix at half to a third of the rate of the
+matrix itself. A scan would do so at every tick, so both layouts are computed once, before the scan.
 """
 
 from typing import TypeGuard, TypeVar
@@ -16,18 +16,18 @@ Tree = TypeVar("Tree")
 
 
 class TransposedLinear(eqx.nn.Linear):
-    """A linear layer that also holds its transposed weight; its gradients are those of the layer."""
+    """A linear layer that also holds its transposed weight; its gradients are those of the plain layer."""
 
     transposed: Float[Array, "*members fan_in fan_out"]
 
     def __init__(self, layer: eqx.nn.Linear) -> None:
-        """Store both layouts of a layer, or of several layers that are stacked as by ``jax.vmap``."""
+        """Store both layouts of a layer, or of several layers that ``jax.vmap`` has stacked."""
         self.weight, self.bias, self.use_bias = layer.weight, layer.bias, layer.use_bias
         self.in_features, self.out_features = layer.in_features, layer.out_features
         self.transposed = layer.weight.mT
 
     def __call__(self, x: Float[Array, " fan_in"], *, key: Key[Array, ""] | None = None) -> Float[Array, " fan_out"]:
-        """Return the layer's output for one input; the key is ignored, as in the layer."""
+        """Return the layer's output for one input; the key is ignored, as in the plain layer."""
         y = _product(self.weight, self.transposed, x)
         return y if self.bias is None else y + self.bias
 
@@ -35,7 +35,7 @@ class TransposedLinear(eqx.nn.Linear):
 def with_transposed_copy(tree: Tree) -> Tree:
     """Return the same tree (policy, model or environment) with every linear layer in both layouts.
 
-    A subclass of a linear layer may compute something else, so it stays unchanged.
+    A subclass of a linear layer may compute something different, so it stays unchanged.
     """
 
     def is_layer(leaf: object) -> TypeGuard[eqx.nn.Linear]:

@@ -1,9 +1,9 @@
 """Weight gradients from one product after the scan.
 
-Differentiating a scan that closes over a policy adds to the weight cotangent at every step of the backward pass:
-``horizon`` read-modify-write passes over a 512 x 512 matrix, each for a product with only as many rows as there are
-environments. Instead a zero *perturbation* is added to each pre-activation; the loss is differentiated with respect to
-these alone, and every weight gradient is formed afterwards, from all rows (environments x ticks) at once:
+Differentiating a scan that closes over a policy adds to the weight cotangent at every step of the backward pass. This
+takes ``horizon`` read-modify-write passes over a 512 x 512 matrix, each for a product with only as many rows as there
+are environments. Instead, a zero *perturbation* is added to each pre-activation, and the loss is differentiated with
+respect to these alone. Every weight gradient is formed afterwards, from all rows (environments x ticks) at once:
 
     W_l gradient = (pre-activation cotangents of layer l)^T (inputs of layer l).
 """
@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 from ..control.policy import Inputs, Layers, Perturbations, Policy
 
 PerturbedLoss = Callable[[Perturbations], tuple[Float[Array, ""], Inputs]]
-"""From perturbations (per layer: rows... x width) to the loss and each layer's inputs (per layer: rows... x fan-in)."""
+"""Function from perturbations (per layer: rows... x width) to the loss and each layer's inputs (per layer: rows... x
+fan-in)."""
 
 
 def zero_perturbations(policy: Policy, rows: tuple[int, ...]) -> Perturbations:
@@ -26,7 +27,7 @@ def zero_perturbations(policy: Policy, rows: tuple[int, ...]) -> Perturbations:
 
 
 def value_and_grad(loss: PerturbedLoss, policy: Policy, rows: tuple[int, ...]) -> tuple[Float[Array, ""], Layers]:
-    """Return the loss and its gradient with respect to ``policy.layers``, equal to ``jax.value_and_grad``."""
+    """Return the loss and its gradient with respect to ``policy.layers``, as ``jax.value_and_grad`` does."""
     (value, inputs), cotangents = jax.value_and_grad(loss, has_aux=True)(zero_perturbations(policy, rows))
     gradients = []
     for layer, seen, cotangent in zip(policy.layers, inputs, cotangents, strict=True):

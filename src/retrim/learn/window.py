@@ -1,4 +1,4 @@
-"""The last seconds of a flight, as input of the learners."""
+"""The last few seconds of a flight, as input for the learners."""
 
 import equinox as eqx
 import jax

@@ -18,7 +18,7 @@ from ..transport.shared_memory import SharedMemoryBus
 from .refused_notes import NETWORK
 
 IDLE = 0.002  # [s]
-SILENCE = 10.0  # [s] without a measurement until a flight without a supervisor is over; an autopilot may still land
+SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; the autopilot may land
 PATIENCE = 10.0  # [s], longest time that the network may block the bridge
 LINGER = 2.0  # [s] after the end of the flight, so that the note about the end reaches the learners
 
@@ -28,13 +28,13 @@ class BridgePlan:
     """Arguments of the process."""
 
     folder: Path
-    """Folder of the bus of the flight."""
+    """Folder of the flight's bus."""
     address: Address
     parent: int
 
 
 def carry(plan: BridgePlan) -> None:
-    """Run the main function of the process: transfer messages until it is terminated.
+    """Transfer messages until the process is terminated, as the main function of the process.
 
     Without a supervisor it returns when the flight is over.
     """
@@ -59,7 +59,7 @@ def carry(plan: BridgePlan) -> None:
 
 
 def _told(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
-    """Publish the number of messages refused from the network and the reason why it receives no messages."""
+    """Publish the number of refused network messages and the reason why the network receives no messages."""
     now = network.refused, network.fault
     if now != before:
         bus.publish(NETWORK, pack_note(NETWORK, count=now[0], last=now[1] or "a message that was none, forged or old",

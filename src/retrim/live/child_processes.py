@@ -31,11 +31,11 @@ def watched(
         seconds: Time after which the vehicle lands [s].
         events: Events of the flight; this function adds to them.
         show: Called many times per second with the status and the new events.
-        stop: Lands the vehicle early.
-        wishes: Requests of the user in flight.
+        stop: Event that lands the vehicle early.
+        wishes: User requests in flight.
 
     Returns:
-        Last status.
+        The last status.
     """
     supervisor.take_off()
     landed_by = float("inf")

@@ -1,4 +1,4 @@
-"""Conversion of the controller of a set-up into programs for the control process."""
+"""Conversion of a set-up's controller into programs for the control process."""
 
 import hashlib
 from typing import Any
@@ -33,14 +33,14 @@ def parameter_groups(policy: AbstractPolicy, residual: Any) -> dict[str, Any]:
 
 
 def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
-    """Return the source of the controller of an adaptive policy.
+    """Return the controller source for an adaptive policy.
 
     Args:
-        setup: Set-up of the policy's preset with the reference of the flight.
+        setup: Set-up of the policy's preset with the flight's reference.
         state: Learned state from before the flight.
 
     Raises:
-        ConfigError: The controller has an operation without a NumPy form.
+        ConfigError: The controller uses an operation without a NumPy form.
     """
     policy = state.policy.policy.merged()
     parts = eqx.partition((policy, state.residual), eqx.is_array)
@@ -66,10 +66,10 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
 
 
 def plain_source(setup: Setup, controller: AbstractController[Any]) -> ControllerSource:
-    """Return the source of a controller that does not learn.
+    """Return the controller source for a controller that does not learn.
 
     Raises:
-        ConfigError: The controller has an operation without a NumPy form.
+        ConfigError: The controller uses an operation without a NumPy form.
     """
     half = vehicle_half(setup, controller)
     arrays, fixed = eqx.partition(controller, eqx.is_array)
@@ -146,7 +146,7 @@ def _on(setup: Setup, parameters: dict[str, Any]) -> Setup:
 
 
 def _arrays(memory: Any) -> Any:
-    """Return a memory; raise ``TypeError`` if it has leaves that are not arrays, which NumPy programs cannot carry."""
+    """Return a memory; raise ``TypeError`` if a leaf is not an array, since NumPy programs carry only arrays."""
     if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
         raise TypeError("a controller's memory must be a pytree of arrays to fly live")
     return memory

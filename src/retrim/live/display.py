@@ -21,7 +21,7 @@ def live_line(status: Status) -> str:
 
 
 def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
-    """Return the status of a flight as rows of label and value."""
+    """Return the status of a flight as rows of a label and a value."""
     control = status.control
     rows: list[tuple[str, str]] = []
     rows.append(("flown by", "watchdog" if status.watchdog_flies else control.get("mode", "not started")))
@@ -41,7 +41,7 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
 
 
 def figures(rows: Sequence[dict[str, Any]]) -> tuple[tuple[str, str, str], ...]:
-    """Return metric, unit and value of each row of the results."""
+    """Return the metric, unit and value of each row of the results."""
     return tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in rows)
 
 

@@ -19,7 +19,7 @@ WATCHDOG = "watchdog: the process that flew is gone or hangs, the watchdog flies
 
 
 class LiveEvents:
-    """Converts the status reports of a flight to events."""
+    """Converts the status reports of a flight into events."""
 
     def __init__(self) -> None:
         self.all: list[Event] = []

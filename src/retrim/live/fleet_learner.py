@@ -1,4 +1,4 @@
-"""Learning for many vehicles in one process: the updates due at the same time run as one program."""
+"""Learning for many vehicles in one process: updates that are due at the same time run as one program."""
 
 import hashlib
 import time
@@ -42,7 +42,7 @@ class FleetLearner:
 
     @property
     def loops(self) -> dict[str, LearnerLoop]:
-        """Loops by name of vehicle and layer, the longest waiting first."""
+        """Loops by the name of the vehicle and layer; the one that has waited longest comes first."""
         return {name: member.loop for name, member in self._members.items()}
 
     def add(self, name: str, plan: LearnerPlan, bus: Bus, wanted: Callable[[], bool] = lambda: True) -> None:
@@ -52,7 +52,7 @@ class FleetLearner:
             name: Name of the vehicle and layer.
             plan: Plan of the learner.
             bus: Bus of the flight.
-            wanted: Called before each publication; False if the vehicle has left in the meantime.
+            wanted: Called before each publication; it returns False if the vehicle has left in the meantime.
         """
         loop = LearnerLoop(plan, bus, self._clock, self._setup_of)
         loop.catch_up()
@@ -65,7 +65,7 @@ class FleetLearner:
         self._members.pop(name, None)
 
     def warm_up(self) -> None:
-        """Compile the programs of the present vehicles for each number of them that may be due at once."""
+        """Compile the present vehicles' programs for each number of vehicles that may be due at once."""
         for kind, members in self._kinds().items():
             loops = [member.loop for member in members.values()]
             for n in (1 << k for k in range(room_for(min(len(loops), self._most)).bit_length())):
@@ -82,8 +82,8 @@ class FleetLearner:
     def step(self) -> int:
         """Learn for the vehicles that are due, the longest waiting first; return their number.
 
-        On a CPU a few vehicles fill a core. With more of them in one program, each would only wait for the others. The
-        remaining vehicles are due in the next step and learn from the window of that time.
+        On a CPU a few vehicles fill a core. With more vehicles in one program, each would only wait for the others. The
+        remaining vehicles are due in the next step and learn from the window at that time.
         """
         done = 0
         for kind, members in self._kinds().items():
@@ -119,7 +119,7 @@ class FleetLearner:
         return updates
 
     def _setup_of(self, preset: Preset, reference: str | None) -> Setup:
-        """Return the set-up of a preset and a reference.
+        """Return the set-up for a preset and a reference.
 
         Vehicles with the same preset and reference share a learner, so that their updates can run as one program.
         """
@@ -137,7 +137,7 @@ class FleetLearner:
 
 
 class _Member(NamedTuple):
-    """Vehicle and layer."""
+    """One vehicle and layer."""
 
     loop: LearnerLoop
     base: str
@@ -146,7 +146,7 @@ class _Member(NamedTuple):
 
     @property
     def kind(self) -> tuple[str, int, str]:
-        """Key of vehicles that share a program: layer, set-up, whose reference may change in flight, and base."""
+        """Key of vehicles that share a program: layer, set-up (its reference may change in flight) and base."""
         return self.loop.plan.layer, id(self.loop.setup), self.base
 
 

@@ -31,12 +31,12 @@ class FleetPlan:
     """Arguments of the process."""
 
     folder: Path
-    """Folder of plans, ``NAME.plan``, one for each vehicle and layer; files appear and disappear during the run."""
+    """Folder of the plans: one file ``NAME.plan`` per vehicle and layer. Files appear and disappear during the run."""
     parent: int
 
 
 def learn_for_all(plan: FleetPlan) -> None:
-    """Run the main function of the process: learn until the parent has ended."""
+    """Learn until the parent has ended, as the main function of the process."""
     with contextlib.suppress(OSError, AttributeError):
         os.nice(NICE)
     enable_compile_cache()
@@ -87,7 +87,7 @@ def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
 
 @dataclass
 class FleetProcess:
-    """Process of a :class:`FleetLearner`. It starts with the first vehicle, and again if it died."""
+    """Process of a :class:`FleetLearner`. It starts with the first vehicle, and starts again if it has died."""
 
     folder: Path
     cores: set[int] | None = None
@@ -121,7 +121,7 @@ class FleetProcess:
 
 @dataclass(frozen=True)
 class FleetSlot:
-    """One vehicle and layer in the shared process; for a ground station it has the interface of a separate process."""
+    """One vehicle and layer in the shared process; the ground station uses it like a separate process."""
 
     process: "subprocess.Popen[bytes]"
     path: Path

@@ -35,7 +35,8 @@ from .status import Status
 from .supervisor import Supervisor
 
 Display = Callable[[LiveEvents], AbstractContextManager[Callable[[Status, list[Event]], None]]]
-"""Function from all events so far to a context manager; its value is called with the status and the new events."""
+"""Function that takes all events so far and returns a context manager. The value of the context manager is called with
+the status and the new events."""
 
 
 class LiveFlight(NamedTuple):
@@ -47,9 +48,9 @@ class LiveFlight(NamedTuple):
     paths: list[Path]
     """Output files, the most interesting first."""
     request: LiveRequest
-    """Request whose set-up follows the sequence of all references of the flight."""
+    """Request whose set-up follows all references of the flight in sequence."""
     landed: bool
-    """Whether the vehicle landed under control of this flight, rather than being lost or crashing."""
+    """Whether the vehicle landed under the control of this flight, rather than being lost or crashing."""
     outlet: Outlet
     """Location of the files, with faults for missing files."""
 
@@ -60,11 +61,11 @@ def fly_live(
     """Fly, and write the output files.
 
     Args:
-        request: Request of the flight.
-        run: Run with the folder of the flight and the flag for interruptions.
+        request: Request for the flight.
+        run: Run with the flight's folder and the interruption flag.
         reporter: Receives messages before take-off and at the end.
         display: Display of the flight.
-        opened: Called with the address of the page when the page is ready.
+        opened: Called with the page's address when the page is ready.
 
     Returns:
         The flight; None if it was interrupted before take-off.
@@ -124,7 +125,7 @@ def _written(
         run, result, seeds=[request.seed], preset=preset.name, seconds=float(flight.log.t[-1]),
         ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
     )  # fmt: skip
-    for start in run.folder.glob("start*.safetensors"):  # initial states, contained in the learned state
+    for start in run.folder.glob("start*.safetensors"):  # initial states, which the learned state contains
         start.unlink(missing_ok=True)
     paths = [*recorded, *([] if path is None else [path]), log, *complaints(run.folder)]
     return LiveFlight(flight, result, paths, request, status.ended == "landed", outlet)

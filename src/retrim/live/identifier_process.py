@@ -49,7 +49,7 @@ class IdentifierPlan:
     start: Path
     """File with the preset."""
     base: str
-    """Hash of the controller of the flight."""
+    """Hash of the flight's controller."""
     parent: int
     trust: tuple[str, ...] = ()
     """Python names that ``start`` may contain."""
@@ -62,8 +62,8 @@ class IdentifierLoop:
         """Initialise the loop.
 
         Args:
-            preset: Preset of the policy, with a family of vehicles.
-            base: Hash of the controller of the flight.
+            preset: Preset of the policy, with a vehicle family.
+            base: Hash of the flight's controller.
             bus: Bus of the flight.
 
         Raises:
@@ -80,10 +80,10 @@ class IdentifierLoop:
         self._published: np.ndarray | None = None
         self._reports: list[tuple[float, str]] = []
         message = bus.latest(f"parameters.{VEHICLE}")
-        self._version = 0 if message is None else message.version  # version of an earlier process
+        self._version = 0 if message is None else message.version  # version from an earlier process
 
     def warm_up(self) -> None:
-        """Compile the programs of the flight with rows of a hovering vehicle; the rows are then discarded."""
+        """Compile the flight's programs with rows from a hovering vehicle, and discard the rows."""
         row = np.zeros(len(COLUMNS))
         row[MEASURED] = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
         row[COMMAND] = np.asarray(Command.hover().vector())
@@ -158,7 +158,7 @@ def _vehicle(family: PathFamily, s: EstimatorState) -> VehicleEstimate:
 
 
 def identify(plan: IdentifierPlan) -> None:
-    """Run the main function of the process: identify until the flight is over."""
+    """Identify the vehicle until the flight is over, as the main function of the process."""
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     _, preset = load_learner_state(plan.start, trust=plan.trust)

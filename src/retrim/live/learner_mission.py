@@ -24,18 +24,18 @@ class LearnerMission:
     """Description of one flight for its learners."""
 
     number: int
-    """Number of the mission; an increase restarts the policy learner with another start."""
+    """Number of the mission; an increase restarts the policy learner from a new ``start``."""
     reference: str | None
     seed: int
     base: str
-    """Hash of the controller of the flight."""
+    """Hash of the flight's controller."""
     layers: tuple[Layer, ...]
     floor: int
     """Policy version; updates up to this version are older than ``start``."""
     capacities: Mapping[str, int]
-    """Longest message of each topic [bytes]."""
+    """Length of the longest message of each topic [bytes]."""
     start: bytes
-    """Content of the file with the learned state from before the flight and the preset."""
+    """Content of the file with the preset and the learned state from before the flight."""
 
     @classmethod
     def of(cls, number: int, reference: str | None, seed: int, base: str, layers: tuple[Layer, ...],
@@ -48,10 +48,10 @@ class LearnerMission:
         """Check that the mission uses only Python names that the user of this machine trusts.
 
         Args:
-            trust: Trusted Python names, as ``mine:task``.
+            trust: Trusted Python names, e.g. ``mine:task``.
 
         Raises:
-            MessageError: The file does not hold a learner state, or the mission names a file of this machine.
+            MessageError: The file does not hold a learner state, or the mission names a file on this machine.
             ConfigError: The preset cannot be used, or a Python name is not trusted.
         """
         header = describe(self.start, kind="learnt", source="mission")

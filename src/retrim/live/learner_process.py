@@ -1,4 +1,4 @@
-"""Process of one layer of learning: it reads windows of flight and publishes parameters."""
+"""Process of one learning layer: it reads flight windows and publishes parameters."""
 
 import contextlib
 import os
@@ -42,9 +42,9 @@ from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
 LOOKING, COMPUTING = 5.0, 60.0  # [s], longest time for a read of the bus and for an update
-VERDICT = 1.0  # [s] for control to accept or refuse a policy; after it, the policy counts as lost
+VERDICT = 1.0  # [s] for control to accept or refuse a policy; after that, the policy counts as lost
 NICE = 10
-REMEMBERED = 8  # number of past policies from the flight, kept for a rollback
+REMEMBERED = 8  # number of the flight's past policies that are kept for a rollback
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ class LearnerPlan:
     folder: Path
     layer: Layer
     start: Path
-    """File with the learned state from before the flight and the preset."""
+    """File with the preset and the learned state from before the flight."""
     reference: str | None
     seed: int
     base: str
-    """Hash of the controller of the flight."""
+    """Hash of the flight's controller."""
     parent: int
     floor: int = 0
     """Policy version; updates on the bus up to this version are older than ``start``."""
@@ -84,7 +84,7 @@ class LearnerLoop:
             plan: Plan of the learner.
             bus: Bus of the flight.
             clock: Function that returns the time [s].
-            setup_of: Function that returns a set-up; loops of several vehicles may share one.
+            setup_of: Function that returns a set-up, which the loops of several vehicles may share.
         """
         state, preset = load_learner_state(plan.start, trust=plan.trust)
         self.plan, self.bus, self.state, self._clock = plan, bus, state, clock
@@ -92,12 +92,12 @@ class LearnerLoop:
         self.every = preset.adapt.fit_every if plan.layer == "residual" else preset.adapt.update_every
         self._buffer = RollingBuffer(preset.adapt.window)
         self.worker = self.new_worker()
-        """Worker, which continues from the parameters in flight."""
+        """Worker that continues from the parameters in flight."""
         self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
         self._known: dict[str, int] = {}
         self._learnt = 0
         self.rolled_back = 0
-        """Number of times that control rolled back a policy."""
+        """Number of times control rolled back a policy."""
         self._pending: tuple[int, PolicyUpdate, float] | None = None
         self._flown: list[tuple[int, Update]] = []
 
@@ -106,12 +106,12 @@ class LearnerLoop:
         return make_worker(self.setup.learner, self.plan.layer, self.state, random.key(self.plan.seed))
 
     def warm_up(self) -> None:
-        """Compile the programs of the flight on a synthetic window and discard the result."""
+        """Compile the flight's programs on a synthetic window and discard the result."""
         self.worker.learn(self.dummy_window())
         self.worker = self.new_worker()
 
     def dummy_window(self) -> Window:
-        """Return a synthetic window with the shapes of a flight window and one tick of hover."""
+        """Return a synthetic window that has the shapes of a flight window and contains one tick of hover."""
         x, buffer = State.at(self.setup.flight_task.home()), RollingBuffer(self.setup.preset.adapt.window)
         buffer.push(0.0, x, Command.hover(x.p.dtype))
         return buffer.window()
@@ -156,7 +156,7 @@ class LearnerLoop:
         note = pack_note(topic, learnt=self._learnt, took=took, until=update.computed_from, excluded=excluded)
         self.bus.publish(topic, note)
         if self.plan.layer == "policy" and self._judge():
-            return  # meanwhile control has rolled back the policy from which it was trained
+            return  # control has since rolled back the policy from which it was trained
         if self._wanted():
             self._publish(update)
 
@@ -176,7 +176,7 @@ class LearnerLoop:
             self._last_tick, self._new_ticks = int(row[0]), self._new_ticks + 1
 
     def _follow(self) -> None:
-        """Learn on the present reference if the flight has changed to another one."""
+        """Learn on the new reference if the flight has changed its reference."""
         followed = self.setup.followed
         if followed is None or (message := self._fresh(f"parameters.{REFERENCE}")) is None:
             return
@@ -213,7 +213,7 @@ class LearnerLoop:
         return LearnerState(self.state.policy, update.state)
 
     def _judge(self) -> bool:
-        """Continue from an accepted policy, or after a rollback from the last valid one; return if there was one."""
+        """Continue from an accepted policy or, after a rollback, from the last valid one; return if there was one."""
         status = self._status()
         given_up, back = status.get("given_up", []), False
         while self._flown and self._flown[-1][0] in given_up:
@@ -231,20 +231,20 @@ class LearnerLoop:
             self.worker.receive(update)
             self._flown, self._pending = [*self._flown[-REMEMBERED:], (version, update)], None
         elif self._clock() - published > VERDICT:
-            self._pending = None  # it was corrupted in transit, or control does not accept policies any more
+            self._pending = None  # it was corrupted in transit, or control no longer accepts policies
         return back
 
     def _status(self) -> dict[str, Any]:
         return last_note(self.bus, "status")
 
     def _wanted(self) -> bool:
-        """Return whether control accepts updates, which it does in policy mode only, and learning is not paused."""
+        """Return whether learning is not paused and control accepts updates, which it does only in policy mode."""
         return self._status().get("mode", "policy") == "policy" and not last_note(self.bus, "learning").get(
             "paused", False
         )
 
     def _take_residual(self) -> None:
-        """Pass the newest residual fit to the worker, if it is new."""
+        """Pass the newest residual fit to the worker unless the worker already has it."""
         result = newest_update(self.bus, self.state, "residual", after=self._known.get("fit", 0))
         if result is not None:
             self._known["fit"] = result[0]
@@ -258,7 +258,7 @@ class LearnerLoop:
         return message.data
 
     def leave(self, folder: Path, patience: float = 3.0) -> None:
-        """Write the last learned state of the flight, once no policy is in control, or after ``patience`` [s]."""
+        """Write the flight's last learned state once no policy is in control, or after ``patience`` [s]."""
         until = self._clock() + patience
         while self._wanted() and self.bus.latest("ended") is None and self._clock() < until:
             time.sleep(CHECK_EVERY)
@@ -274,9 +274,9 @@ def _start(state: LearnerState) -> PolicyUpdate:
 
 
 def learn(plan: LearnerPlan) -> None:
-    """Run the main function of the process: learn until the flight is over."""
+    """Learn until the flight is over, as the main function of the process."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(NICE)  # so that a browser or terminal on the same machine responds before the next update is complete
+        os.nice(NICE)  # so that a browser or terminal on the same machine does not have to wait for an update
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     loop = LearnerLoop(plan, bus)

@@ -1,4 +1,4 @@
-"""Ground station: learners on another machine than the control process."""
+"""Ground station: learners on a different machine from the control process."""
 
 import os
 import tempfile
@@ -28,12 +28,12 @@ from .spec import MAINS
 
 IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before it
 BEAT_EVERY = TOLD_EVERY = 0.25  # [s]
-SILENCE = 5.0  # [s] without a message from the flight until this is reported
+SILENCE = 5.0  # [s] without a message from the flight, after which the silence is reported
 STARTING, ATTEMPTS = 300.0, 5  # [s] for a learner to compile and send its first heartbeat; restarts per learner
 
 
 class LearnerServer:
-    """Learners of one flight on another machine. Exit from the context ends them."""
+    """Learners of one flight on another machine. Leaving the context ends them."""
 
     def __init__(self, address: Address, fleet: FleetProcess | None = None, trust: tuple[str, ...] = ()) -> None:
         """Join the bus.
@@ -41,7 +41,7 @@ class LearnerServer:
         Args:
             address: Address of the flight.
             fleet: Process that learns for several flights; None for separate processes for this flight.
-            trust: Python names that the flight may use, as ``mine:task``; this machine imports them.
+            trust: Python names that the flight may use, e.g. ``mine:task``; this machine imports them.
 
         Raises:
             ConfigError: The bus cannot be joined.
@@ -77,7 +77,7 @@ class LearnerServer:
         """Yield the status until there is a flight to learn for.
 
         Raises:
-            ConfigError: The other machine has a different key, or does not have a key.
+            ConfigError: The other machine has a different key or no key.
         """
         while not self._look():
             if (fault := self._network.fault) and self._distrust is None:
@@ -89,7 +89,7 @@ class LearnerServer:
     def learn(self) -> Iterator[str]:
         """Learn until the flight is over; yield the status after each step.
 
-        A flight that has become silent may return, and another flight may begin.
+        A flight that has become silent may return, and a different flight may begin.
         """
         while True:
             self._look()
@@ -140,7 +140,7 @@ class LearnerServer:
         self._bus = SharedMemoryBus.create({**mission.capacities, **{beat_topic(x): 1024 for x in mission.layers}})
         topics = mission.capacities  # a controller without a residual has no topic for it
         out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
-        # The network still holds messages of the previous flight; its ticks, orders and reference do not apply here.
+        # The network still holds messages from the previous flight; its ticks, orders and reference do not apply here.
         before = {} if self._bridge is None else self._bridge.known
         known = {topic: before.get(topic, 0) for topic in out}
         self._bridge = Bridge(self._network, self._bus, out=out, into=into, known=known)
@@ -150,7 +150,7 @@ class LearnerServer:
             self._begin_with(layer)
 
     def _end(self) -> None:
-        """End the learners of the present flight."""
+        """End the learners of the current flight."""
         for process in self.processes.values():
             process.kill()
             process.wait()
@@ -161,7 +161,7 @@ class LearnerServer:
 
     def _begin_with(self, layer: Any) -> None:
         self._start(layer)
-        if self._fleet is None:  # a process that learns for several flights has no heartbeat for each of them
+        if self._fleet is None:  # a process that learns for several flights does not send a heartbeat for each
             self._pulses.expect(layer, STARTING)
 
     def _start(self, layer: Any) -> None:
@@ -173,7 +173,7 @@ class LearnerServer:
             self._bus.folder, layer, start, m.reference, m.seed, m.base, os.getpid(), m.floor, self._trust
         )
         if (old := self.processes.get(layer)) is not None:
-            old.kill()  # a seat in the process of a fleet remains after that process has died
+            old.kill()  # a slot in a fleet process remains after that process has died
         complaints = self.folder / f"{layer}.log"
         if self._fleet is not None:
             self.processes[layer] = self._fleet.start(layer, plan, complaints)
@@ -181,7 +181,7 @@ class LearnerServer:
             self.processes[layer] = launch(MAINS[layer], plan, complaints)
 
     def _beat(self) -> str:
-        """Report the living learners to the flight, restart dead learners, and return the status."""
+        """Report to the flight which learners are alive, restart dead ones, and return the status."""
         assert self._mission is not None
         failed = ""
         for layer in self._pulses.hanging([each for each in self.processes if self.processes[each].poll() is None]):
@@ -199,7 +199,7 @@ class LearnerServer:
         return failed or self._stands()
 
     def _tell(self, failed: str = "", *, over: bool = False) -> None:
-        """Report to the flight which learners are alive, and whether the ground has received the end of the flight."""
+        """Report to the flight which learners are alive and whether this station has received the end of the flight."""
         assert self._mission is not None
         alive = {layer: process.poll() is None for layer, process in self.processes.items()}
         note = pack_note("ground", base=self._mission.base, alive=alive, failed=failed, over=over)
@@ -231,20 +231,20 @@ def learn_for(
 ) -> str:
     """Learn for flights on other machines until all of them are over.
 
-    One flight has separate processes. Several flights share one process, which learns for all flights that are due at
-    the same time.
+    A single flight uses separate processes. Several flights share one process, which learns for all flights that are
+    due at the same time.
 
     Args:
         addresses: Addresses of the flights.
-        stop: Ends learning early; the flights continue with their last policies.
-        told: Called with the status of the flights, at a high rate.
-        trust: Python names that a flight may use, as ``mine:task``; this machine imports them.
+        stop: Event that ends learning early; the flights continue with their last policies.
+        told: Called at a high rate with the status of the flights.
+        trust: Python names that a flight may use, e.g. ``mine:task``; this machine imports them.
 
     Returns:
         The final status of the flights.
 
     Raises:
-        ConfigError: One of the buses cannot be joined, an address occurs twice, there are two rosmasters, or an
+        ConfigError: A bus cannot be joined, an address occurs twice, the addresses name two rosmasters, or an
             address is outside this machine and there is no shared key.
         Exception: The first failure, raised when the other flights are over.
     """
@@ -261,7 +261,7 @@ def learn_for(
             stack.callback(fleet.close)
         grounds = [stack.enter_context(LearnerServer(address, fleet, trust)) for address in addresses]
         stands = dict.fromkeys(grounds, "waiting for a flight")
-        # One thread for each flight, so that a slow network to one vehicle does not delay the others.
+        # One thread per flight, so that a slow network to one vehicle does not delay the others.
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
         flights = {pool.submit(_serve, ground, stands, stop): ground for ground in grounds}
         try:

@@ -18,7 +18,7 @@ from ..tasks.shapes import REFERENCES
 def choices(setup: Setup, present: str) -> tuple[str, ...]:
     """Return the references that a user may select in flight, the present one first.
 
-    The result is empty if the policy does not observe its reference: such a policy cannot follow another one.
+    The result is empty if the policy does not observe its reference: such a policy cannot follow a different one.
 
     Args:
         setup: Set-up of the flight.

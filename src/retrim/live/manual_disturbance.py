@@ -1,4 +1,4 @@
-"""Disturbances of a simulated vehicle that the user controls in flight: push, wind, load, weak rotor and kick."""
+"""Disturbances that the user applies to a simulated vehicle in flight: push, wind, load, weak rotor and kick."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ KICK = 15.0  # [m/s^2], maximum per axis
 
 @dataclass(frozen=True)
 class ManualDisturbance:
-    """Positions of the knobs. Their effects add to the disturbance of the scenario."""
+    """Positions of the knobs. Their effects are added to the scenario's disturbance."""
 
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """External acceleration, world [m/s^2]."""
@@ -32,14 +32,14 @@ class ManualDisturbance:
     load: float = 0.0
     """Mass of the payload under the vehicle [kg]."""
     rotor: float = 1.0
-    """Remaining share of the thrust of the front-right rotor."""
+    """Share of its thrust that the front-right rotor keeps."""
     kick: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Acceleration of the last kick, world [m/s^2]."""
     kicks: int = 0
     """Number of kicks so far; an increase triggers a kick."""
 
     def __post_init__(self) -> None:
-        """Raise :class:`MessageError` for a knob with a value out of range or of the wrong type."""
+        """Raise :class:`MessageError` if the value of a knob is out of range or has the wrong type."""
         read_fields("knobs", vars(self))
         for name, values, bound in (("push", self.push, PUSH), ("wind", self.wind, WIND), ("kick", self.kick, KICK)):
             if not all(abs(v) <= bound for v in values):
@@ -55,7 +55,7 @@ class ManualDisturbance:
 
     @classmethod
     def unpack(cls, data: bytes) -> "ManualDisturbance":
-        """Read knobs.
+        """Read the positions of the knobs.
 
         Raises:
             MessageError: The bytes are not knobs, or a knob is out of range.
@@ -79,7 +79,7 @@ class KnobbedPlant:
     """Plant with knobs that change in flight. It rejects unsupported knobs, and the flight continues."""
 
     def __init__(self, plant: Plant, scenario: Scenario, seed: int) -> None:
-        """Initialise; a user-defined plant without a method ``disturb`` has no knobs."""
+        """Initialise; a user-defined plant without a ``disturb`` method has no knobs."""
         self.refused = "" if hasattr(plant, "disturb") else "this plant has no knobs"
         """Reason why the last change of the knobs was rejected; empty if it was accepted."""
         self._plant, self._possible = plant, not self.refused

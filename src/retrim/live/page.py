@@ -1,4 +1,4 @@
-"""Process of the page, which shows a flight with knobs in a browser. It never blocks the flight."""
+"""Process of the page, which shows a flight and its knobs in a browser. It never blocks the flight."""
 
 import contextlib
 import io
@@ -40,9 +40,9 @@ FLOWN_BY = {
     "blind": " (the guard, without a measurement)",
     "drop": " (the guard, which stopped the motors after two seconds without a measurement)",
 }
-"""Explanations of the names of the modes."""
-NO_ROTATION = 0.1  # largest error of R R^T with which an attitude is shown
-FAR = 1e6  # [m], limit of drawn coordinates
+"""Explanations of the mode names."""
+NO_ROTATION = 0.1  # largest error of R R^T for which an attitude is drawn
+FAR = 1e6  # [m], limit on drawn coordinates
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ HOST = re.compile(r"(?:[\w-]{1,63}\.){0,9}[\w-]{1,63}|(?=.*:)[\da-fA-F:.]{2,45}(
 
 
 def free_port(host: str, wanted: int) -> int:
-    """Return the first free port of ``host`` among the ten ports from ``wanted`` on.
+    """Return the first free port of ``host`` among the ten ports that start at ``wanted``.
 
     Raises:
         ConfigError: All ten ports are in use, or this machine does not have the address.
@@ -71,22 +71,22 @@ def free_port(host: str, wanted: int) -> int:
         try:
             with socket.create_server((host, port)):
                 return port
-        except (OSError, ValueError) as error:  # not every text can be a name
+        except (OSError, ValueError) as error:  # not every text is a valid host name
             reason = str(getattr(error, "strerror", None) or error)[:160]
     raise ConfigError(f"page: no free port from {wanted} on at {excerpt(host)} ({reason})")
 
 
 def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
-    """Return host and port for a page; None if viser is not installed and the page was not requested.
+    """Return the host and port of a page; None if viser is not installed and the page was not requested.
 
     Args:
         host: Address to listen on.
         port: First port to try.
-        demanded: Whether the user requested a page explicitly, as opposed to the default.
+        demanded: Whether the user requested a page explicitly, rather than by default.
         say: Called with messages for the user.
 
     Raises:
-        ConfigError: There is no such port, or a requested page is not possible.
+        ConfigError: The port is out of range, or a requested page is not possible.
     """
     if not 1 <= port <= 65535:
         raise ConfigError(f"--page-port {port} must be between 1 and 65535")
@@ -105,11 +105,11 @@ def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], N
 
 
 def show(plan: PagePlan) -> None:
-    """Run the main function of the process: show the flight until the process is terminated."""
+    """Show the flight until the process is terminated, as the main function of the process."""
     import viser
 
     bus, parent, spec = SharedMemoryBus(plan.folder), ParentWatch(plan.parent), plan.page
-    # viser prints its address, and so does retrim: discard the output of viser.
+    # Both viser and retrim print the address: discard viser's output.
     with contextlib.redirect_stdout(io.StringIO()), only_for(spec.token, spec.host):
         server = viser.ViserServer(host=spec.host, port=spec.port, label=f"retrim: {spec.name}", verbose=False)
     page = _Page(spec, bus, server)
@@ -127,7 +127,7 @@ def show(plan: PagePlan) -> None:
 
 
 class _Page:
-    """Reads the bus for scene and panel, and publishes the actions of the user."""
+    """Reads the bus for the scene and the panel, and publishes the user's actions."""
 
     def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
         self._bus, self._lock = bus, threading.Lock()
@@ -155,7 +155,7 @@ class _Page:
         self._tick = -1
 
     def refresh(self, *, text: bool) -> None:
-        """Update scene and panel from new messages."""
+        """Update the scene and the panel from new messages."""
         status, sample = last_note(self._bus, "status"), self._sample()
         if sample is not None and sample.tick != self._tick:
             self._tick = sample.tick
@@ -200,7 +200,10 @@ class _Page:
             self._bus.publish(PAGE, pack_note(PAGE, count=self._refused, last=plain(why)))
 
     def _turn(self, turned: Callable[[ManualDisturbance], ManualDisturbance]) -> ManualDisturbance | None:
-        """Set knobs relative to their present positions, from any thread; return these positions if that fails."""
+        """Set the knobs relative to their current positions; return these positions if that fails.
+
+        This method may be called from any thread.
+        """
         with self._lock:
             before = self._knobs()
             try:
@@ -211,7 +214,7 @@ class _Page:
         return None
 
     def _wish(self, **wish: Any) -> dict[str, Any]:
-        """Publish a request of the user; return all present requests."""
+        """Publish a user request; return all current requests."""
         first = {"method": next(iter(self._spec.methods), "none"), "paused": False}
         with self._lock:
             try:
@@ -222,10 +225,10 @@ class _Page:
             return first | {"reference": next(iter(self._paths), "")} | self._wishes
 
     def _possible(self, wish: dict[str, Any]) -> dict[str, Any]:
-        """Return the known fields of a request, checked.
+        """Return the known fields of a request after a check.
 
         Raises:
-            MessageError: A field has another type, or there is no such choice.
+            MessageError: A field has the wrong type, or there is no such choice.
         """
         result = read_fields("wish", {name: value for name, value in wish.items() if name in FIELDS["wish"]})
         for name, there in (("method", (*self._spec.methods, "none")), ("reference", tuple(self._spec.paths))):
@@ -264,13 +267,13 @@ def _text(
 
 
 def _drawn(vector: Any) -> np.ndarray:
-    """Return a finite vector of limited size for drawing, for any reported values."""
+    """Return a finite vector of limited size for drawing, whatever values were reported."""
     drawn: np.ndarray = np.clip(np.nan_to_num(np.asarray(vector, dtype=float)), -FAR, FAR)
     return drawn
 
 
 def _escaped(text: str) -> str:
-    """Return a text in which Markdown markup is escaped, so that it is shown literally."""
+    """Return a text with its Markdown markup escaped, so that it is shown literally."""
     return "".join(c if c.isalnum() or c in " ,.:;()'+-/%=" else f"&#{ord(c)};" for c in plain(text))
 
 

@@ -1,8 +1,8 @@
-"""Access control of the page of a flight: only users with the printed address may open it, and only by that address.
+"""Access control of a flight's page: only users with the printed address may open it, and only by that address.
 
 Every website that is open in a browser can send requests to this machine. The server therefore answers a request only
 if its path begins with a random token, its ``Host`` is the address that it has reached, and its ``Origin`` is the page
-itself. The name of an attacker that resolves to this machine (DNS rebinding) is a different ``Host``.
+itself. An attacker's name that resolves to this machine (DNS rebinding) is a different ``Host``.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from typing import Any
 from ..errors import PlantError
 
 EVERYWHERE = ("", "0.0.0.0", "::")
-"""Addresses that mean all addresses of this machine."""
+"""Addresses that stand for all addresses of this machine."""
 SEALED = {
     "Referrer-Policy": "no-referrer",  # otherwise a link to another site would send the token
     "Cache-Control": "no-store",
@@ -36,7 +36,7 @@ def page_url(host: str, port: int, token: str) -> str:
 def refusal(
     path: str, headers: Mapping[str, tuple[str, ...]], *, token: str, host: str, local: tuple[Any, ...]
 ) -> HTTPStatus | None:
-    """Return the status of the refusal of a request; None if the request is allowed.
+    """Return the status with which a request is refused; None if the request is allowed.
 
     Args:
         path: Path of the request with its query, unmodified.
@@ -61,14 +61,14 @@ def refusal(
 def only_for(token: str, host: str) -> Iterator[None]:
     """Restrict each server of ``websockets`` that starts in this context to requests with the token.
 
-    viser serves files and WebSockets with one such server and has no hook for access control.
+    viser serves files and WebSockets with one such server and provides no hook for access control.
 
     Args:
         token: First part of every path of the page.
         host: Address that the page listens on.
 
     Raises:
-        PlantError: No server has started in the context, so that the page may be unprotected.
+        PlantError: No server has started in the context, so the page may be unprotected.
     """
     import websockets.asyncio.server as servers
 

@@ -1,13 +1,13 @@
-"""Input filter of the page: a browser may change only the values of its controls."""
+"""Input filter of the page: a browser may change only the values of controls."""
 
 from collections.abc import Callable
 from typing import Any
 
 
 def take_values_only(server: Any, refuse: Callable[[str], None]) -> None:
-    """Restrict a viser server to changes of control values, and report any other input of a browser.
+    """Restrict a viser server to changes of control values, and report any other browser input.
 
-    By default viser lets a browser change every property of a control, for example its visibility.
+    By default viser lets a browser change every property of a control, such as its visibility.
 
     Args:
         server: The viser server.

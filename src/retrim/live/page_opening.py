@@ -1,4 +1,4 @@
-"""Opening of the page of a flight in a browser on this machine."""
+"""Opening of a flight's page in a browser on this machine."""
 
 import atexit
 import contextlib
@@ -13,11 +13,11 @@ from pathlib import Path
 def open_page(url: str, folder: Path) -> None:
     """Open a page through a file that only this user can read.
 
-    All users of a machine can read the command line of a browser, so the command line must not contain the token.
+    All users of a machine can read a browser's command line, so it must not contain the token.
 
     Args:
         url: Address of the page, with its token.
-        folder: Folder for the file, which is removed when this process ends.
+        folder: Folder for the file; the file is removed when this process ends.
     """
     if sys.platform != "darwin" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         return  # this machine does not have a screen

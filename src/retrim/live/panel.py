@@ -1,4 +1,4 @@
-"""Panel of the page, with the status of the flight and its controls."""
+"""Panel of the page, with controls and the status of the flight."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ WAITING = "Waiting for take-off."
 
 
 class Panel:
-    """Sliders, buttons and a history plot. It reports each action of the user immediately."""
+    """Panel of sliders, buttons and a history plot. It reports each user action immediately."""
 
     def __init__(
         self,
@@ -33,17 +33,17 @@ class Panel:
 
         Args:
             server: The viser server.
-            turn: Called with a function from the present to the new positions of the knobs; it returns the present
-                positions if the new ones are not possible.
-            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``; it returns the present
+            turn: Called with a function that maps the current positions of the knobs to the new ones; it returns the
+                current positions if the new ones are not possible.
+            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``; it returns the current
                 requests, which may differ from the arguments.
             knobs: Positions of the knobs.
             wishes: Earlier requests.
-            methods: Available learning methods, the present one first; empty if the flight does not learn.
+            methods: Available learning methods, the current one first; empty if the flight does not learn.
             references: Available references, the initial one first; empty if there is no choice.
             mass: Mass of the vehicle [kg].
             rate: Refresh rate of the panel [Hz].
-            world: Description of plant and disturbance, in Markdown.
+            world: Description of the plant and the disturbance, in Markdown.
         """
         self._tell, self._wish, self._gui, self._pull = turn, wish, server.gui, np.zeros(3)
         self._setting, self._choices = False, dict[str, Any]()
@@ -92,12 +92,12 @@ class Panel:
         self._gui.add_button("Land", color="red").on_click(lambda _: wish(land=True))
 
     def pull(self, a: np.ndarray) -> None:
-        """Set the acceleration of the pull with the mouse, world [m/s^2]."""
+        """Set the acceleration of the mouse pull, world [m/s^2]."""
         self._pull = a
         self._turned()
 
     def note(self, t: float, error: float, policies: int) -> None:
-        """Add to the history: time since take-off [s], distance from the target [m], number of policies so far."""
+        """Add the time since take-off [s], distance from the target [m] and number of policies to the history."""
         self._history.append((t, 100.0 * error, policies))
 
     def show(self, text: str) -> None:
@@ -106,7 +106,7 @@ class Panel:
         if len(self._history) > 1:
             t, error, policies = np.array(self._history).T
             top = max(1.0, 1.1 * error.max())
-            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # others: below the axis
+            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # others lie below the axis
             self._plot.scales = _scales((t[0], t[-1]), top)
             self._plot.data = (t, error, marks)
 
@@ -119,7 +119,7 @@ class Panel:
         self._set(*((self._choices[name], wished[name]) for name in names))
 
     def _set(self, *values: tuple[Any, Any]) -> None:
-        """Set values of controls without reporting them as actions of the user."""
+        """Set the values of controls without reporting them as user actions."""
         self._setting = True
         try:
             for control, value in values:

@@ -1,4 +1,4 @@
-"""Process of a simulated plant. It runs in wall-clock time, as a vehicle does."""
+"""Process of a simulated plant. It runs in wall-clock time, like a vehicle."""
 
 import contextlib
 import time
@@ -25,7 +25,7 @@ from ..transport.shared_memory import SharedMemoryBus
 from .manual_disturbance import KnobbedPlant, ManualDisturbance
 from .states import state_of, vector_of
 
-ALONE = 5.0  # [s] without a command until a plant without a supervisor ends
+ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
 CRASHED = "crashed"
 """Reason for the end of a flight without a landing."""
 
@@ -37,7 +37,7 @@ class PlantPlan:
     folder: Path
     scenario: Scenario
     vehicle: Any
-    """Vehicle of the training: a name or a specification."""
+    """Vehicle used in training: a name or a specification."""
     x0: np.ndarray
     """Initial state: p, R by rows, v."""
     dt: float
@@ -48,7 +48,7 @@ class PlantPlan:
 
 
 def simulate(plan: PlantPlan) -> None:
-    """Run the main function of the process: simulate until the vehicle has landed."""
+    """Simulate until the vehicle has landed, as the main function of the process."""
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # compute each tick synchronously, without a thread pool
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
@@ -115,13 +115,13 @@ def _flown(
         behind = time.monotonic() - (epoch + tick * plan.dt)
         if behind > 0:
             late += 1
-            epoch += max(0.0, behind - plan.dt)  # the simulation falls behind rather than skip time
+            epoch += max(0.0, behind - plan.dt)  # the simulation falls behind rather than skipping time
         if tick % 25 == 0:
             bus.publish("world", pack_note("world", late=late, held=held, knobs_refused=plant.refused))
 
 
 def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
-    """Return the setpoint of control or fallback for a sample; None if it does not arrive before ``until`` [s]."""
+    """Return the setpoint from control or the fallback for a sample; None if it does not arrive by ``until`` [s]."""
     while True:
         for topic in ("setpoint", "fallback"):
             message = bus.latest(topic)

@@ -1,6 +1,6 @@
 """Full updates, including optimiser states, which learners publish on the bus in addition to parameters.
 
-A restarted learner continues from such an update. The bus keeps two versions of each layer: the last one, and the
+A restarted learner continues from such an update. The bus keeps two updates of each layer: the last one, and the
 newest one in flight.
 """
 

@@ -1,4 +1,4 @@
-"""Changes of the reference in flight: the user selects a reference, and the vehicle changes to it smoothly."""
+"""Reference changes in flight: the user selects a reference, and the vehicle changes to it smoothly."""
 
 from concurrent.futures import Executor, Future
 
@@ -20,7 +20,7 @@ from .supervisor import Supervisor
 LEAD = 0.8 * BEFORE  # [s] between the publication of a table and the start of its transition
 ATTEMPTS = 3
 TOLD = "followed"
-"""Topic of the name of the present reference."""
+"""Topic with the name of the current reference."""
 
 
 class ReferenceSwitcher:
@@ -30,7 +30,7 @@ class ReferenceSwitcher:
         """Initialise for a flight.
 
         Args:
-            request: Request of the flight.
+            request: Request for the flight.
             supervisor: Supervisor of its processes.
             work: Executor that computes the tables.
         """
@@ -46,18 +46,18 @@ class ReferenceSwitcher:
         self._sent: tuple[str, float, Reference] | None = None
 
     def ask(self, name: str, t: float) -> list[Event]:
-        """Begin a change to another reference as soon as no other change is pending; return the events.
+        """Begin a change to a different reference as soon as no other change is pending; return the events.
 
         Args:
             name: Name of the reference, one of the choices. Repeated requests for the same one have no effect.
-            t: Time of the flight [s].
+            t: Flight time [s].
         """
         if name in self._choices:
             self._next = name
         return self._begun(t)
 
     def obey(self, status: Status) -> list[Event]:
-        """Publish a table that is complete, and register one that control has accepted; return the events."""
+        """Publish a completed table, and register a table that control has accepted; return the events."""
         new = list[Event]()
         if self._coming is not None and self._coming[1].done():
             (name, made), self._coming = self._coming, None
@@ -97,9 +97,9 @@ class ReferenceSwitcher:
         self._coming = name, self._work.submit(self._table, name)
 
     def _table(self, name: str) -> tuple[float, Reference]:
-        """Return the start of the transition and the table.
+        """Return the start time of the transition, and the table.
 
-        The first call compiles, so that the compile time does not shift the start.
+        A first call compiles the program, so that the compile time does not shift the start.
         """
         old, new = self.pieces[-1][1], make_reference(name)
         transition_between(old, new, 0.0, self._vehicle)
@@ -113,9 +113,9 @@ class ReferenceSwitcher:
         return at, table
 
     def _now(self) -> float:
-        """Return the time of the control process, which evaluates the table [s].
+        """Return the time [s] of the control process, which evaluates the table.
 
-        On a busy machine a simulated plant falls behind wall-clock time, and control uses the time of the plant.
+        On a busy machine a simulated plant falls behind wall-clock time, and control uses the plant's time.
         """
         message = self._supervisor.bus.latest("flight")
         try:

@@ -1,4 +1,4 @@
-"""Invalid notes between processes, which are counted and reported at intervals rather than each time."""
+"""Invalid notes between processes: they are counted, and reported at intervals rather than each time."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ NOTES = ("airborne", "beat.", "ended", "followed", "ground", "knobs", "learner."
          "refusals.", "stalls", "status", "wish", "world")  # fmt: skip
 """Topics of notes, or prefixes of their names."""
 PAGE, NETWORK = "refusals.page", "refusals.network"
-"""Topics of refusals: of browser inputs by the page, and of network messages by the bridge."""
+"""Topics of refusals: the page refuses browser inputs, and the bridge refuses network messages."""
 
 
 class RefusedNotes:

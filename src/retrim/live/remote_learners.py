@@ -1,4 +1,4 @@
-"""Interface of the flight to learners on another machine."""
+"""The flight's interface to learners on another machine."""
 
 import time
 from pathlib import Path
@@ -11,7 +11,7 @@ from .refused_notes import NETWORK
 from .spec import LiveSpec
 from .topics import topics
 
-LOST = 2.0  # [s] without a message until learners count as lost
+LOST = 2.0  # [s] without a message, after which learners count as lost
 PARTING = 5.0  # [s], time limit for the learners to confirm the end of the flight
 
 
@@ -35,7 +35,7 @@ class RemoteLearners:
         self._bus.publish("mission", mission.pack())
 
     def alive(self) -> dict[str, bool]:
-        """Return for each learner whether it is alive, from the last message of its machine."""
+        """Return whether each learner is alive, according to the last message from its machine."""
         message, said = self._bus.latest("ground"), None
         if message is not None:
             if message.version != self._beat[0]:
@@ -49,7 +49,7 @@ class RemoteLearners:
         return last_note(self._bus, f"ready.{layer}", "ready").get("base") == self._spec.controller.base
 
     def failed(self) -> str | None:
-        """Return why learners cannot learn: a wrong key, or the last output of a permanently dead one; else None."""
+        """Return why the learners cannot learn: a wrong key, or the last output of a dead learner; else None."""
         fault = last_note(self._bus, NETWORK).get("fault", "")
         self._distrust = (self._distrust or time.monotonic()) if fault else None
         if self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
@@ -61,7 +61,10 @@ class RemoteLearners:
         return words
 
     def part(self) -> None:
-        """Wait until the learners confirm the end of the flight, or are gone; they run until they receive the end."""
+        """Wait until the learners confirm the end of the flight or are gone.
+
+        The learners run until they receive the note about the end.
+        """
         base, began = self._spec.controller.base, time.monotonic()
         while (waited := time.monotonic() - began) < PARTING:
             said = last_note(self._bus, "ground")

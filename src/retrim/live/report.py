@@ -32,10 +32,10 @@ GAP_S = 0.5  # [s], allowed gap in a log, since a stalled machine does not send 
 def flight_of(
     request: LiveRequest, events: Sequence[Event], status: Status, learnt: LearnerState | None, path: Path
 ) -> tuple[Flight, np.ndarray]:
-    """Return the flight from a log, up to its landing, and the rows of the log.
+    """Return the flight in a log, up to its landing, and the rows of the log.
 
     Args:
-        request: Request of the flight.
+        request: Request for the flight.
         events: Events of the flight.
         status: Last status.
         learnt: Learned state at the end.
@@ -72,7 +72,7 @@ def results(
     """Return the rows of ``results.json``, which exclude the landing.
 
     Args:
-        request: Request of the flight.
+        request: Request for the flight.
         flight: Flight, up to its landing.
         rows: All rows of the log, including the landing.
         status: Last status.
@@ -81,7 +81,7 @@ def results(
     scenario, log = request.scenario, flight.log
     end = float(log.t[-1])
     changes = change_times(scenario.disturbance, request.setup.flight_task.home(), end)
-    # The log may lack the state of a crash.
+    # The log may lack the state at the crash.
     lost = (status.ended or "").startswith((CRASHED, STOPPED)) and status.control.get("reason") != "landing"
     crashed = log.terminated or lost
     back = recoveries(log.t, flight.error, changes, 0.05, terminated=crashed)
@@ -113,7 +113,7 @@ def results(
 
 
 def _stalls(status: Status, dt: float) -> dict[str, Any]:
-    """Return statistics of stalls of the machine and the ticks missed in them, or null values without stall reports."""
+    """Return statistics of the machine's stalls and the ticks missed in them, or null values without stall reports."""
     seen = status.stalls
     if not seen:
         return dict.fromkeys(("missed_in_stalls", "stalls", "stall_max_ms"))
@@ -161,7 +161,7 @@ def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()
 
     Args:
         bus: Bus of the flight.
-        status: Present status.
+        status: Current status.
         start: File with the initial state of the learners.
         trust: Python names that the file may contain.
     """

@@ -26,7 +26,7 @@ class Scene:
             arm: Distance from the centre of the vehicle to a rotor [m].
             rate: Update rate of the scene [Hz].
         """
-        # Without shadows the page appears in a sixth of the time in software rendering.
+        # Without shadows the page appears in a sixth of the time with software rendering.
         server.scene.configure_default_lights(cast_shadow=False)
         self._scene, self._trail = server.scene, deque[np.ndarray](maxlen=round(TRAIL_S * rate))
         middle, size = path.mean(0), float(np.ptp(path, axis=0).max())
@@ -55,12 +55,16 @@ class Scene:
         }
 
     def on_pull(self, pull: Callable[[np.ndarray], None]) -> None:
-        """Call ``pull`` with an acceleration, world [m/s^2], while the user pulls the vehicle; zero at the end."""
+        """Call ``pull`` with an acceleration while the user pulls the vehicle, and with zero at the end.
+
+        Args:
+            pull: Called with the acceleration, world [m/s^2].
+        """
 
         async def dragged(event: Any) -> None:  # the server preserves the order of calls for coroutines only
             grip, hand = (np.asarray(place, dtype=float) for place in (event.start_position, event.end_position))
             over = event.phase == "end" or grip.shape != (3,) or hand.shape != (3,)
-            if over or not np.isfinite([grip, hand]).all():  # a pull must end for any message of a browser
+            if over or not np.isfinite([grip, hand]).all():  # an invalid browser message must end a pull, too
                 self._rope.visible = False
                 pull(np.zeros(3))
                 return
@@ -70,7 +74,7 @@ class Scene:
         self._grip.on_drag("left")(dragged)
 
     def follow(self, path: np.ndarray) -> None:
-        """Show the present reference: positions along it, world [m], (n, 3)."""
+        """Show the current reference by positions along it, world [m], (n, 3)."""
         pairs = np.stack([path[:-1], path[1:]], axis=1)
         self._scene.add_line_segments("/reference", pairs, GREY, thickness=0.006)
 
@@ -84,7 +88,7 @@ class Scene:
             R: Attitude, body to world.
             target: Target position, world [m].
             disturbance: Acceleration that the simple model does not describe, world [m/s^2].
-            estimate: Estimate of this acceleration by the residual model, world [m/s^2].
+            estimate: Estimate of this acceleration from the residual model, world [m/s^2].
         """
         self._vehicle.position, self._vehicle.wxyz = tuple(p), quaternion(R)
         self._shadow.position = (p[0], p[1], 0.0)  # vertically below the vehicle, to make its height visible

@@ -39,16 +39,16 @@ from .states import vector_of
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
 PATH_S = 20.0  # [s], duration of the reference path on the page
 STEP = 0.05  # [s] between two positions on the path
-BELOW_GROUND = 0.3  # [m], depth of a fence below z = 0, since starts may be there and transients go lower
+BELOW_GROUND = 0.3  # [m], depth of the fence below z = 0: flights may start there, and transients go lower
 LONGEST = 3600.0  # [s], maximum length of a flight
 
 
 def check_limits(fence: float, seconds: float | None, policy_age: float | None) -> None:
-    """Check the limits of a live flight, before training begins.
+    """Check the limits of a live flight before training begins.
 
     Args:
         fence: Maximum distance of the vehicle from the reference [m].
-        seconds: Length of the flight [s]; None for a flight until the user stops it.
+        seconds: Length of the flight [s]; None to fly until the user stops the flight.
         policy_age: Maximum age of the flight data from which the policy was learned [s]; None for any age.
 
     Raises:
@@ -67,7 +67,7 @@ class LiveRequest:
     """Request for a live flight."""
 
     setup: Setup
-    """Set-up of the policy's preset with the reference of the flight."""
+    """Set-up of the policy's preset with the flight's reference."""
     policy: AbstractPolicy
     scenario: Scenario
     method: str
@@ -83,7 +83,7 @@ class LiveRequest:
     page: tuple[str, int] | None = None
     """Address and port of the page, if the flight has one."""
     learners: Address | None = None
-    """Address of learners on another machine, if they are not on this machine."""
+    """Address of the learners if they run on another machine."""
     policy_age: float = float("inf")
     """Maximum age of the flight data from which the policy was learned [s]."""
     record: Path | None = None
@@ -104,7 +104,7 @@ class LiveRequest:
 
 
 def live_spec(request: LiveRequest) -> LiveSpec:
-    """Return the specification of all processes of a flight, without starting them.
+    """Return the specification of all processes of a flight without starting them.
 
     Raises:
         ConfigError: The method cannot be used in a live flight, or the reference is not finite.
@@ -137,7 +137,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
             raise ConfigError(f"method {request.method!r} must learn or return a ControllerPilot to fly live")
         controller = plain_source(setup, pilot.controller)
         save_learner_state(start, learner_state(request, request.policy, "full"), preset)
-    # Makes the hash unique: parameters and learners of another flight must not match, even for the same controller.
+    # Make the hash unique: parameters and learners of a different flight must not match, even with the same controller.
     controller = replace(controller, base=f"{controller.base}-{secrets.token_hex(4)}")
     return LiveSpec(
         controller=controller,
@@ -165,16 +165,16 @@ def live_spec(request: LiveRequest) -> LiveSpec:
 
 
 def learners_at(text: str | None, say: Callable[[str], None], key: Path | None = None) -> Address | None:
-    """Return the address of learners on another machine; None if they are on this machine.
+    """Return the address of the learners on another machine; None if they run on this one.
 
     Args:
-        text: Address, as ``zenoh:192.168.1.5:7447``; None for this machine.
+        text: Address, e.g. ``zenoh:192.168.1.5:7447``; None for this machine.
         say: Called with messages for the user.
-        key: File with the key that the learners share; None for the key of ``RETRIM_KEY``, if there is one.
+        key: File with the key that the learners share; None for the key from ``RETRIM_KEY``, if there is one.
 
     Raises:
-        ConfigError: The text is not an address, a required package is not installed, there is no key for an address
-            outside this machine, or there is a key that is not needed.
+        ConfigError: The text is not an address, a required package is not installed, an address outside this machine
+            has no key, or a key was passed but is not needed.
     """
     shared = read_key(key)
     if text is None:
@@ -215,9 +215,9 @@ def learner_state(request: LiveRequest, policy: AbstractPolicy, method: str, res
     """Return the initial state of the learners.
 
     Args:
-        request: Request of the flight.
-        policy: Policy in flight.
-        method: Method that learns.
+        request: Request for the flight.
+        policy: Policy from which the learners start.
+        method: Learning method.
         residual: State of the fitted residual, if there is one.
     """
     key, prepare = request.flight.key(), find_method(method).learns
@@ -242,7 +242,7 @@ def _page(request: LiveRequest) -> PageSpec:
 
 
 def _limits(request: LiveRequest) -> Limits:
-    """Return the command limits of the vehicle and a box around all positions of the reference."""
+    """Return the vehicle's command limits and a box around all reference positions."""
     setup, fence = request.setup, request.fence
     vehicle = request.scenario.make_vehicle(setup.preset.vehicle)
     places = _places(request, request.seconds)

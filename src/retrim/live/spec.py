@@ -27,7 +27,7 @@ MAINS = {
 }
 """Main function of each process, by role."""
 UNHURRIED = ("residual", "policy", "identifier", "recorder", "page", "bridge")
-"""Roles that do not run on the core of the processes with real-time requirements."""
+"""Roles that do not run on the core of the real-time processes."""
 RESTARTED = (*UNHURRIED, "watchdog")
 """Roles that are restarted when their process dies or hangs."""
 VEHICLE = "retrim.live.vehicle_process:fly"
@@ -36,7 +36,7 @@ VEHICLE = "retrim.live.vehicle_process:fly"
 
 @dataclass(frozen=True)
 class PageSpec:
-    """Specification of the page of a flight."""
+    """Specification of a flight's page."""
 
     host: str
     port: int
@@ -45,18 +45,18 @@ class PageSpec:
     path: np.ndarray
     """Positions along the reference, world [m], (n, 3)."""
     methods: tuple[str, ...]
-    """Available learning methods, the present one first; empty if the flight does not learn."""
+    """Available learning methods, the current one first; empty if the flight does not learn."""
     arm: float
     """Distance from the centre of the vehicle to a rotor [m]."""
     mass: float
     """Mass of the vehicle [kg]."""
     paths: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Available references by name, the present one first, with positions along each, world [m], (n, 3); empty if there
-    is no choice."""
+    """Positions along each available reference, world [m], (n, 3), by name, the current one first; empty if there is no
+    choice."""
     world: str = ""
-    """Description of plant and disturbance."""
+    """Description of the plant and the disturbance."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
-    """First part of every path of the page, a secret that only the printed address contains."""
+    """Secret first part of every path of the page; only the printed address contains it."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,13 @@ class LiveSpec:
 
     controller: ControllerSource
     layers: tuple[Layer, ...]
-    """Layers of learning: ``residual`` and ``policy``; empty if the flight does not learn."""
+    """Learning layers: ``residual`` and ``policy``; empty if the flight does not learn."""
     start: Path
     """File with the learned state from before the flight."""
     reference: str | None
     scenario: Scenario
     vehicle: Any
-    """Vehicle of the training: a name or a specification."""
+    """Vehicle used in training: a name or a specification."""
     x0: np.ndarray
     home: np.ndarray
     limits: Limits

@@ -17,26 +17,26 @@ class Status:
     ended: str | None
     """Reason for the end of the flight; None before the end."""
     rejections: list[str]
-    """Reasons of learners for rejecting their own results since the last status."""
+    """Learners' reasons for rejecting their own results since the last status."""
     watchdog_flies: bool
     """Whether the newest command comes from the watchdog."""
     watchdog_ticks: int
-    """Number of commands of the watchdog."""
+    """Number of commands from the watchdog."""
     log_failed: str | None
     """Reason why the flight is no longer logged; None while it is logged."""
     stalls: dict[str, Any] = field(default_factory=dict)
-    """Number and duration of stalls of the machine."""
+    """Number and duration of the machine's stalls."""
     refusals: list[str] = field(default_factory=list)
-    """Refusals of notes between processes since the last status."""
+    """Descriptions of the notes between processes that were refused since the last status."""
     refused_notes: int = 0
     """Number of refused notes and browser inputs so far."""
     excluded: list[int] = field(default_factory=list)
-    """Number of measurements that the last fit excluded, for each reason."""
+    """Number of measurements that the last fit excluded, per reason."""
     hangs: dict[str, int] = field(default_factory=dict)
-    """Number of times that each process was ended because it was silent."""
+    """Number of times each process was ended because it was silent."""
     log_moved: str = ""
-    """Message with the reason for a change of the log file and its new path; empty without a change."""
+    """Message with the reason for a change of the log file and its new path; empty if it has not changed."""
     ticks: int = 0
     """Number of ticks that the plant has sent so far."""
     vehicles: list[tuple[float, str]] = field(default_factory=list)
-    """Times of the flight [s] and descriptions of the vehicle identified at these times."""
+    """Flight times [s] and descriptions of the vehicle as identified at these times."""

@@ -1,4 +1,4 @@
-"""Supervisor of a live flight, which starts all processes, arms the flight, restarts dead processes and ends it."""
+"""Supervisor of a live flight: it starts the processes, arms and ends the flight, and restarts dead processes."""
 
 import contextlib
 import json
@@ -29,20 +29,20 @@ from .status import Status
 from .topics import topics
 
 LANDING = 60.0  # [s] for a landing; afterwards the processes are ended wherever the vehicle is
-LAST = 5  # [ticks] for the log to receive the last reports of control after the plant has ended
+LAST = 5  # [ticks] for the log to receive the last reports from control after the plant has ended
 ATTEMPTS = 5  # restarts per process
 READY_S = 300.0  # [s], including compilation
 
 
 @dataclass
 class Supervisor:
-    """Processes of one flight. Exit from the context ends all of them."""
+    """Processes of one flight. Leaving the context ends all of them."""
 
     spec: LiveSpec
     processes: dict[str, "Popen[bytes]"] = field(default_factory=dict)
     restarts: dict[str, int] = field(default_factory=dict)
     hangs: dict[str, int] = field(default_factory=dict)
-    """Number of times that each process was ended because it was silent."""
+    """Number of times each process was ended because it was silent."""
     refused: dict[str, list[str]] = field(default_factory=dict)
     """Requests that the operating system refused, by process."""
     epoch: float | None = None
@@ -55,7 +55,7 @@ class Supervisor:
     def __enter__(self) -> "Supervisor":
         """Create the bus."""
         self.bus, self.floor = SharedMemoryBus.create(topics(self.spec)), 0
-        self.start = self.bus.take_in(self.spec.start)  # the folder of the results may disappear
+        self.start = self.bus.take_in(self.spec.start)  # the results folder may disappear
         self.spec = replace(self.spec, start=self.start)
         self._notes, self._pulses = RefusedNotes(self.bus, topics(self.spec)), Pulses(self.bus)
         self._heart = Heart(self.bus, "supervisor")
@@ -91,10 +91,10 @@ class Supervisor:
         self.bus.remove()
 
     def warm_up(self) -> Iterator[tuple[str, float]]:
-        """Start the processes; yield the names of the processes that are not ready and the waiting time [s].
+        """Start the processes; yield the names of those that are not ready, and the waiting time [s].
 
         Raises:
-            PlantError: A process ended, or was not ready in time; the message has the last line of its output.
+            PlantError: A process ended (the message contains its last line of output), or was not ready in time.
         """
         began = time.monotonic()
         if self._remote is not None:
@@ -133,7 +133,7 @@ class Supervisor:
             self._pulses.expect(role)
 
     def _lift_off(self) -> Iterator[tuple[str, float]]:
-        """Make a vehicle take off under control of its autopilot when all processes are ready."""
+        """Make a vehicle take off under its autopilot's control once all processes are ready."""
         began, self._airborne_ordered = time.monotonic(), True
         self.bus.publish("order", pack_note("order", order="take off"))
         while self.bus.latest("airborne") is None:
@@ -174,7 +174,7 @@ class Supervisor:
         return last_note(self.bus, "ready.page", "ready").get("port")
 
     def watch(self) -> Status:
-        """Restart processes that died or hang, if their role permits it; return the status of the flight."""
+        """Restart processes that died or hang if their role permits it; return the flight's status."""
         assert self.epoch is not None
         self._heart.beat()
         ended = last_note(self.bus, "ended").get("reason")
@@ -234,7 +234,7 @@ class Supervisor:
     def _restart(self, role: str) -> None:
         self.restarts[role] = self.restarts.get(role, 0) + 1
         if role == "recorder":
-            self._record()  # before the new recorder runs, ticks may drop out of the reports
+            self._record()  # otherwise ticks may drop out of the reports before the new recorder runs
         with contextlib.suppress(OSError):  # the flight continues without the process
             self._start(role)
             self._pulses.expect(role, READY_S)

@@ -1,4 +1,4 @@
-"""Process of a link to a vehicle: it transfers samples and commands in real time."""
+"""Process of the link to a vehicle: it transfers samples and commands in real time."""
 
 import math
 import signal
@@ -24,7 +24,7 @@ HOLD_S = 0.05  # [s] between two reads of the orders while the autopilot holds
 
 
 def fly(plan: PlantPlan) -> None:
-    """Run the main function of the process: take off, transfer until landing, and return control to the autopilot."""
+    """Take off, transfer until landing and return control to the autopilot, as the main function of the process."""
     signal.signal(signal.SIGTERM, _ended)  # so that control returns to the autopilot in this case, too
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
 
@@ -87,8 +87,8 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: ParentWatch
 
 def _sample(tick: int, dt: float, now: VehicleState, accepted: np.ndarray) -> Sample:
     state, truth = (np.concatenate([x.p, x.R.ravel(), x.v]) for x in (now, now.truth or now))
-    # Normally the age after extrapolation, for which the controller compensates. If the measurement is too old for the
-    # guard, its full age, so that the guard refuses it.
+    # Normally report the age after extrapolation, for which the controller compensates. If the measurement is too old
+    # for the guard, report its full age, so that the guard refuses it.
     age = now.age if now.news <= Limits.state_age else now.news
     return Sample(tick, tick * dt, time.monotonic(), age, state, truth, accepted)
 

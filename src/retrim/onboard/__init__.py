@@ -1,1 +1,1 @@
-"""Real-time control of a vehicle. It uses NumPy and the standard library, and neither JAX nor compilation."""
+"""Real-time control of a vehicle. It uses only NumPy and the standard library, without JAX or compilation."""

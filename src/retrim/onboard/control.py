@@ -1,4 +1,4 @@
-"""The control loop: the urgent work of each tick, and other work in the remaining time of the tick."""
+"""The control loop: the urgent work of each tick, and other work in the time that remains."""
 
 import contextlib
 import time
@@ -25,7 +25,7 @@ FELT = 0.1  # weight of a tick in the running mean of the disturbance
 
 
 class ControlLoop:
-    """One flight. :meth:`tick` contains the whole control step, so that a test does not need a clock."""
+    """Control loop of one flight. :meth:`tick` contains the whole control step, so that tests do not need a clock."""
 
     def __init__(self, plan: ControlPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
@@ -45,8 +45,8 @@ class ControlLoop:
         self.gaps: deque[tuple[float, float, int]] = deque(maxlen=GAPS)
         """Gaps in the ticks: start and end [s, monotonic], and number of missed ticks."""
         self.felt, self.estimate = np.zeros(3), np.zeros(3)
-        """Acceleration error of the simple model over the last tenths of a second, and its estimate by the residual
-        model, world [m/s^2]."""
+        """Acceleration error of the simple model over the last few tenths of a second, and the residual model's
+        estimate of it, world [m/s^2]."""
         self.stages: deque[tuple[float, int, int]] = deque(maxlen=GAPS)
         """Changes of the controller's stage: time since the start [s], stage, cause."""
         self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
@@ -109,20 +109,20 @@ class ControlLoop:
         elif self.mode in (Mode.BLIND, Mode.DROP):
             self._finish_row(None)
             self.rows.append(blind_row(sample, stamp, now, self._start, self.plan.dt, self._issued, self.mode))
-        if setpoint.landed:  # publish the ticks first: plant and recorder end flight and log at this command
+        if setpoint.landed:  # publish the ticks first: at this command the plant ends the flight, the recorder the log
             self._finish_row(None)
             self._publish_rows()
             self.bus.publish("setpoint", setpoint.pack())
         return setpoint
 
     def rehearse(self) -> None:
-        """Run the computation of the next measurement and discard its result, to fill the caches of the processor."""
+        """Run the computation for the next measurement and discard the result, to fill the processor's caches."""
         if (sample := self.sample) is not None and self.mode == Mode.POLICY and self._usual < BRIEF * self.plan.dt:
             self.pilot.rehearse(sample.t - self._start, sample.age, sample.state)
             self.plan.limits.broken(Sample.unpack(sample.pack()).state)
 
     def idle(self) -> None:
-        """Do the work that is not urgent: orders, new parameters, reports."""
+        """Do the work that is not urgent: read orders and new parameters, and publish reports."""
         began = time.monotonic()
         t = 0.0 if self.sample is None else self.sample.t - self._start
         if (order := self._new("order")) is not None and order.get("order") == "land":
@@ -161,7 +161,7 @@ class ControlLoop:
         self._landing = self._landing or reason
 
     def _policy(self, sample: Sample, t: float, age: float, new: bool) -> np.ndarray | None:
-        """Return the policy's command; record the reason and return None if the policy must not fly any more."""
+        """Return the policy's command; if the policy must no longer fly, record the reason and return None."""
         limits = self.plan.limits
         wrong = self._landing or self._gap
         if age > limits.state_age:
@@ -220,7 +220,7 @@ class ControlLoop:
         return True
 
     def _follow(self, before: Sample, sample: Sample) -> None:
-        """Process the plant's report about the past tick: accepted command and missed ticks."""
+        """Process the plant's report about the past tick: the accepted command and missed ticks."""
         accepted, lost = np.asarray(sample.accepted), sample.tick - before.tick - 1
         if lost and not self._landing:
             self.missed += lost

@@ -17,14 +17,14 @@ class Mode(IntEnum):
 
     POLICY = 0
     HOLD = 1
-    """Geometric controller, at the position of the reference."""
+    """The geometric controller holds the position of the reference."""
     DESCEND = 2
-    """Geometric controller, sinking."""
+    """The geometric controller makes the vehicle sink."""
     BLIND = 3
-    """The state is unknown: level by the last known attitude, sinking."""
+    """The state is unknown; the vehicle levels by its last known attitude and sinks."""
     LANDED = 4
     WATCHDOG = 5
-    """Fallback of the watchdog, because the control process is dead."""
+    """The watchdog flies the fallback, because the control process is dead."""
     DROP = 6
     """The motors stop wherever the vehicle is, because its state has been unknown for too long."""
 
@@ -54,10 +54,10 @@ class Limits:
     state_age: float = 0.1
     """Largest age of the newest measurement [s]."""
     policy_age: float = float("inf")
-    """Largest flight time since the newest measurement in the training data of the policy [s]."""
+    """Largest flight time since the newest measurement in the policy's training data [s]."""
 
     def within(self, u: np.ndarray) -> np.ndarray:
-        """Return a command [c, omega], clipped to the limits of the vehicle."""
+        """Return a command [c, omega], clipped to the vehicle's limits."""
         taken: np.ndarray = np.clip(u, self.u_min, self.u_max)
         return taken
 
@@ -89,7 +89,7 @@ class GeometricHover:
     dt: float
     integral: np.ndarray = field(default_factory=lambda: np.zeros(3))
     felt: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    """Low-pass filtered acceleration by external disturbances, world [m/s^2]."""
+    """Low-pass filtered acceleration from external disturbances, world [m/s^2]."""
 
     def feel(self, before: np.ndarray, after: np.ndarray, u: np.ndarray) -> None:
         """Update the disturbance estimate with one tick: the acceleration beyond thrust and gravity.
@@ -134,28 +134,28 @@ def turn(R: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Fallback:
-    """Fallback controller if the policy must not fly: hold, then sink, then stop. A simple timed sequence."""
+    """Fallback controller for when the policy must not fly: a simple timed sequence of hold, sink and stop."""
 
     hover: GeometricHover
     hold_s: float = 2.0
     sink: float = 0.5
     """Sink rate [m/s]."""
     still_s: float = 0.0
-    """Time for which the vehicle has not moved during the descent [s], because it stands on something."""
+    """Time for which the vehicle has not moved during the descent [s]; a still vehicle stands on something."""
     sinking_s: float = 0.0
     since: float = 0.0
     """Time for which the fallback has been active [s]."""
     blind_s: float = 0.0
     place: np.ndarray | None = None
-    """Position that it holds, and start of the descent."""
+    """Position to hold, from which the descent starts."""
 
     def rest(self) -> None:
-        """Reset, because another controller is active: the next step is the first one of a new sequence."""
+        """Reset, because a different controller is active; the next step begins a new sequence."""
         self.since, self.blind_s, self.sinking_s, self.still_s, self.place = 0.0, 0.0, 0.0, 0.0, None
         self.hover.integral[:] = 0.0
 
     def step(self, x: np.ndarray, fresh: bool, target: np.ndarray, *, land: bool) -> tuple[np.ndarray, Mode]:
-        """Return the command of the next tick.
+        """Return the command for the next tick, and the mode.
 
         Args:
             x: Last known state: p, R by rows, v.
@@ -172,7 +172,7 @@ class Fallback:
         if self._down(x, fresh):
             return np.zeros(4), Mode.LANDED
         if not fresh:
-            # Level for a quarter of a second by the last known attitude; after that zero rates and a slow descent.
+            # Level for a quarter of a second by the last known attitude; then zero rates and a slow descent.
             rates = 4.0 * turn(x[3:12].reshape(3, 3), UP) if self.blind_s <= 0.25 else np.zeros(3)
             return self.hover.limits.within(np.concatenate([[0.95 * G], rates])), Mode.BLIND
         if land or self.since > self.hold_s:

@@ -1,8 +1,8 @@
 """Heartbeats: each process of a flight reports many times per second that its main loop is running.
 
-The messages that plant and control publish each tick serve as their heartbeats. A loop that computes for seconds has a
-thread that sends its heartbeats, but only for the time that the loop announced beforehand. A loop that hangs therefore
-becomes silent even if its threads continue.
+The messages that the plant and control publish each tick serve as their heartbeats. A loop that computes for several
+seconds uses a thread to send its heartbeats, but only for the time that the loop announced beforehand. A loop that
+hangs therefore becomes silent even if its threads continue.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ EVERY = 0.1  # [s] between two heartbeats
 
 
 def beat_topic(role: str) -> str:
-    """Return the topic of the heartbeats of a process."""
+    """Return the heartbeat topic of a process."""
     return {"plant": "sample", "control": "setpoint"}.get(role, f"beat.{role}")
 
 
@@ -26,10 +26,10 @@ class Heart:
     """Sends heartbeats when the main loop calls it."""
 
     def __init__(self, bus: Bus, role: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Build a sender of heartbeats for a process.
+        """Build a heartbeat sender for a process.
 
         Args:
-            bus: Bus of the flight; if it has no topic for the heartbeats of the role, they are not published.
+            bus: Bus of the flight; heartbeats are not published if the bus has no topic for those of the role.
             role: Role of the process.
             clock: Function that returns the time [s].
         """

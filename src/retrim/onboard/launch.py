@@ -1,4 +1,4 @@
-"""Start of the processes of a live flight. They receive a plan and ignore Ctrl-C, which the supervisor handles."""
+"""Start of a live flight's processes. They receive a plan and ignore Ctrl-C, which the supervisor handles."""
 
 import contextlib
 import importlib
@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 PYTHON = (sys.executable, "-P", "-m")
-"""Command that runs a module of this package; files of the current folder cannot shadow its modules."""
+"""Command that runs a module of this package; files in the current folder cannot shadow its modules."""
 
 
 def module_path() -> str:
     """Return the module path of a child process: the path of this process, with the current folder moved to the end.
 
-    The current folder may contain a module of the user. A ``numpy.py`` in the same folder does not replace NumPy.
+    The current folder may contain a user's module. A ``numpy.py`` in the same folder does not replace NumPy.
     """
     here, places = os.path.realpath(os.curdir), [place for place in sys.path if place]
     last = [place for place in places if os.path.realpath(place) == here]
@@ -35,7 +35,7 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     Returns:
         The process.
     """
-    # One thread: the arrays are small, and a pool of threads is late.
+    # One thread: the arrays are small, and a thread pool would be late.
     quiet = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     with _opened(complaints) as file:
         process = subprocess.Popen(
@@ -50,7 +50,7 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
         with contextlib.suppress(OSError):
             os.sched_setaffinity(process.pid, cores)
     assert process.stdin is not None
-    with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # if it has died, those who wait for it notice
+    with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # whoever waits for a dead process notices
         pickle.dump(plan, pipe)
     return process
 
@@ -74,7 +74,7 @@ def last_words(complaints: Path) -> str:
 
 
 def main() -> None:
-    """Read the plan and run."""
+    """Read the plan and run the named function."""
     module, _, name = sys.argv[1].partition(":")
     function = getattr(importlib.import_module(module), name)
     function(pickle.load(sys.stdin.buffer))  # the parent wrote it

@@ -51,7 +51,7 @@ class LogFile:
         """Write lines; if that fails, remove those that were partly written.
 
         Raises:
-            OSError: The lines cannot be written, or the file is not at its path any more.
+            OSError: The lines cannot be written, or the file is no longer at its path.
         """
         there, mine = os.stat(self.path), os.fstat(self._file)
         if (there.st_ino, there.st_dev) != (mine.st_ino, mine.st_dev):

@@ -14,7 +14,7 @@ from .note_fields import plain, read_fields
 
 STATE = 15  # p, R by rows, v
 STOPPED = "stopped without measurements"
-"""Beginning of the reason for the end of a flight if the motors were stopped in the air."""
+"""Beginning of the reason for the end of a flight whose motors were stopped in the air."""
 
 
 class StaleError(MessageError):
@@ -23,12 +23,12 @@ class StaleError(MessageError):
 
 @dataclass(frozen=True)
 class Stamp:
-    """Tick and send time of a sample; an answer needs both, even if the state of the sample is not finite."""
+    """Tick and send time of a sample; an answer needs both, even if the sample's state is not finite."""
 
     tick: int
     """Ticks since the start of the flight."""
     sent: float
-    """Send time, monotonic clock of the machine [s]."""
+    """Send time on the machine's monotonic clock [s]."""
 
     @classmethod
     def unpack(cls, data: bytes) -> "Stamp":
@@ -50,15 +50,15 @@ class Sample:
     tick: int
     """Ticks since the start of the flight."""
     t: float
-    """Time by the plant's clock [s]."""
+    """Time on the plant's clock [s]."""
     sent: float
-    """Send time, monotonic clock of the machine [s]."""
+    """Send time on the machine's monotonic clock [s]."""
     age: float
     """Time since the state was valid [s]."""
     state: np.ndarray
     """p [m], R by rows, v [m/s], world."""
     truth: np.ndarray
-    """The same, but the true state if the plant has it; used for scores, never by pilots."""
+    """Like ``state``, but the true state if the plant provides it. It is used for scores, never by pilots."""
     accepted: np.ndarray
     """Command [c, omega] that the plant accepted for the past tick; with a command delay it acts later."""
 
@@ -95,15 +95,15 @@ class Setpoint:
     tick: int
     """Tick of the sample that it answers."""
     sent: float
-    """Send time, monotonic clock [s]."""
+    """Send time on the monotonic clock [s]."""
     u: np.ndarray
     """c [m/s^2], omega [rad/s]."""
     target: np.ndarray
     """Current target position, world [m]; a controller that takes over holds the vehicle there."""
     landed: bool = False
-    """The vehicle has landed, or must be dropped: the plant stops."""
+    """Whether the vehicle has landed or must be dropped; the plant then stops."""
     blind: bool = False
-    """The vehicle must be dropped because its state is unknown."""
+    """Whether the vehicle must be dropped because its state is unknown."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -121,7 +121,7 @@ class Setpoint:
         return cls(int(row[0]), float(row[1]), row[3:7], row[7:10], bool(row[2]), bool(row[10]))
 
     def ending(self, height: float) -> str:
-        """Return the reason for the end of the flight; this is its last command.
+        """Return the reason for the end of the flight, whose last command this is.
 
         Args:
             height: Last known height [m].
@@ -157,10 +157,10 @@ class FlightRows:
 
     @classmethod
     def unpack(cls, data: bytes) -> "FlightRows":
-        """Read rows.
+        """Read the rows.
 
         Raises:
-            MessageError: The bytes are not rows of a flight.
+            MessageError: The bytes are not flight rows.
         """
         ticks = describe(data, kind="flight", source="flight").get("ticks", "")
         if not ticks.isdecimal() or len(ticks) > 6 or int(ticks) > MOST_TICKS:
@@ -171,13 +171,13 @@ class FlightRows:
 
 @dataclass(frozen=True)
 class Parameters:
-    """New parameters of one part (``half``) of a controller, for example ``policy`` or ``residual``."""
+    """New parameters of one part (``half``) of a controller, such as ``policy`` or ``residual``."""
 
     half: str
     version: int
     """Increasing number; a message with a version that is not newer is stale."""
     base: str
-    """Hash of the controller that the receiver was started with; parameters for another controller are refused."""
+    """Hash of the controller that the receiver was started with; parameters for a different controller are refused."""
     computed_from: float
     """Flight time of the newest measurement in their training data [s]."""
     arrays: Mapping[str, Any] = field(repr=False)
@@ -199,12 +199,12 @@ class Parameters:
         Args:
             data: Bytes of a message.
             expected: Shape and type of each array.
-            half: Part of the controller that they should be for.
-            base: Hash that they should contain.
-            after: Newest version that was read.
+            half: Expected part of the controller.
+            base: Expected hash of the controller.
+            after: Newest version read so far.
 
         Raises:
-            MessageError: The parameters are truncated, damaged, for another controller or not finite.
+            MessageError: The parameters are truncated, damaged, for a different controller or not finite.
             StaleError: The parameters are not newer than ``after``.
         """
         kind = f"parameters of {half}"
@@ -223,7 +223,7 @@ class Parameters:
 
 
 def pack_note(kind: str, **fields: Any) -> bytes:
-    """Return the bytes of a small message of plain values, as an order or a report; inverse of :func:`unpack_note`."""
+    """Return the bytes of a small message of plain values, such as an order; inverse of :func:`unpack_note`."""
     return pack_arrays({}, kind=kind, about={"fields": json.dumps(fields)})
 
 
@@ -246,7 +246,7 @@ def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
     """Return the fields of the last small message of a topic; empty if there is no message or it is damaged.
 
     Args:
-        bus: Bus that it was published on.
+        bus: Bus of the flight.
         topic: Name of the topic.
         kind: Expected kind of the message; by default the name of the topic.
     """
@@ -258,10 +258,10 @@ def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
 
 
 def last_sent(bus: Bus, topic: str) -> float:
-    """Return the send time of the newest command of a topic, monotonic clock [s]; minus infinity without a command.
+    """Return the send time of a topic's newest command on the monotonic clock [s]; minus infinity if there is none.
 
     Args:
-        bus: Bus that it was published on.
+        bus: Bus of the flight.
         topic: ``setpoint`` or ``fallback``.
     """
     message = bus.latest(topic)
@@ -275,7 +275,7 @@ def ticks_of(bus: Bus) -> int:
     """Return the number of ticks that the plant has sent so far.
 
     Args:
-        bus: Bus that they were published on.
+        bus: Bus of the flight.
     """
     message = bus.latest("sample")
     try:
@@ -288,7 +288,7 @@ def last_height(bus: Bus) -> float:
     """Return the height that the plant reported last [m]; NaN if it has not reported a height.
 
     Args:
-        bus: Bus that it was published on.
+        bus: Bus of the flight.
     """
     message = bus.latest("sample")
     try:

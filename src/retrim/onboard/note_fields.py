@@ -1,4 +1,4 @@
-"""Types and ranges of the fields of notes between processes, checked before use."""
+"""Types and ranges of the fields of notes between processes, which are checked before use."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -16,7 +16,7 @@ LAST_STAGE, LAST_CAUSE = 4, 5
 
 
 def shown(value: Any) -> str:
-    """Return a short text of a value, without control characters, for use in an error message."""
+    """Return a short text for a value, without control characters, for use in an error message."""
     text = ascii(value) if isinstance(value, str | int | float | bool | type(None)) else type(value).__name__
     return text if len(text) <= 80 else f"{text[:77]}..."
 
@@ -73,7 +73,7 @@ def maybe(read: Read) -> Read:
 
 
 def list_of(*reads: Read, length: int | None = None) -> Read:
-    """Return a reader of lists: one kind of item with any or a given length, or several kinds in the given order."""
+    """Return a reader of lists: items of one kind with any or a given length, or of several kinds in a given order."""
     exact = length if len(reads) == 1 else len(reads)
 
     def read(value: Any) -> list[Any]:

@@ -15,19 +15,19 @@ from .rollback import FlownError
 from .topics import REFERENCE, UNLEARNED, VEHICLE
 
 AHEAD = 1.0  # [s] by which the time stamp of parameters may lie in the future
-IN_TIME = 0.7  # [s] in which a reference must be taken, before it departs from the current one
+IN_TIME = 0.7  # [s] within which a reference must be taken, before it departs from the current one
 REMEMBERED = 50  # swaps in a report, which is published ten times a second
 
 
 class ParameterReceiver:
-    """New parameters of the active controller."""
+    """Intake of new parameters for the active controller."""
 
     def __init__(self, pilot: LivePilot, bus: Bus, base: str, dt: float) -> None:
         """Build an intake.
 
         Args:
             pilot: Pilot that receives the parameters.
-            bus: Bus that the parameters are published on.
+            bus: Bus of the flight.
             base: Hash of the controller.
             dt: Control tick [s].
         """
@@ -48,7 +48,7 @@ class ParameterReceiver:
 
     @property
     def open(self) -> bool:
-        """Whether the learned parameters are in use; if not, the controller uses those of take-off."""
+        """Whether the learned parameters are in use; if not, the controller uses those from take-off."""
         return self._open
 
     @open.setter

@@ -1,4 +1,4 @@
-"""The pilot of the control process: a controller as NumPy programs, whose parameters are swapped in flight."""
+"""Pilot of the control process: a controller in the form of NumPy programs whose parameters are swapped in flight."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from ..compile.ops.program import Arrays, NumpyProgram, ProgramSource
 from .messages import STATE, Parameters
 from .topics import UNLEARNED, VEHICLE
 
-BLEND = 5  # ticks over which a jump of the command at a swap is faded out
+BLEND = 5  # ticks over which a jump in the command at a swap is faded out
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class ControllerSource:
     decide: ProgramSource
     """(parameters, [memory, time, age, state]) -> command, stage of the controller and its cause, memory"""
     accepted: ProgramSource
-    """(parameters, [memory, command]) -> memory, if the plant accepted a different command than was issued"""
+    """(parameters, [memory, command]) -> memory, if the plant accepted a different command from the one issued"""
     target: ProgramSource
     """(parameters, time) -> target position of the vehicle"""
     predicted: ProgramSource
-    """(parameters, [state, command]) -> acceleration by the corrected model"""
+    """(parameters, [state, command]) -> acceleration that the corrected model predicts"""
     parameters: Mapping[str, Mapping[str, Any]]
     """Initial parameters, by part (``policy``, ``residual``, ``reference``, ``vehicle``) and name, in the order of the
     programs."""
@@ -105,8 +105,8 @@ class LivePilot:
     def swap(self, parameters: Parameters) -> None:
         """Use new parameters from the next tick on.
 
-        The command is blended to the new controller's within a few ticks. For new parameters of the vehicle there is no
-        blending, because the controller itself follows them slowly.
+        The command is blended into that of the new controller within a few ticks. New parameters of the vehicle are not
+        blended, because the controller itself follows them slowly.
         """
         half = parameters.half
         self._parameters[half] = list(parameters.arrays.values())
@@ -119,7 +119,7 @@ class LivePilot:
             self._change()
 
     def restart(self) -> None:
-        """Use the learned parameters of take-off again from the next tick on."""
+        """Use the learned parameters from take-off again, starting with the next tick."""
         self._parked = self._parameters, self.versions, self._policies
         followed = {half: leaves for half, leaves in self._parameters.items() if half in UNLEARNED}
         first = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
@@ -137,7 +137,7 @@ class LivePilot:
             self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:
-        """Return parameters of a part as examples of their shapes and types."""
+        """Return a part's parameters as examples of their shapes and types."""
         return self._source.parameters[half]
 
     def proven(self, version: int) -> None:
@@ -145,7 +145,7 @@ class LivePilot:
         self._policies = {v: leaves for v, leaves in self._policies.items() if v >= version}
 
     def back(self) -> list[int]:
-        """Return to the last proven policy; return the versions that are given up."""
+        """Return to the last proven policy; return the versions that were given up."""
         version = min(self._policies)
         given_up = sorted(v for v in self._policies if v > version)
         self._policies = {version: self._policies[version]}

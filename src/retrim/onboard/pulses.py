@@ -1,4 +1,4 @@
-"""Detection of processes of a flight that hang: they are alive but do not send heartbeats."""
+"""Detection of a flight's hanging processes, which are alive but do not send heartbeats."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable
 from ..transport.bus import Bus
 from .heartbeat import beat_topic
 
-SILENCE = 2.0  # [s] without a heartbeat, after which a process hangs
-LOOK = 0.25  # [s] that one check counts at most, because a stall of the machine is not a silence of the process
+SILENCE = 2.0  # [s] without a heartbeat, after which a process counts as hanging
+LOOK = 0.25  # [s], most that one check counts, since a stall of the machine is not silence of the process
 
 
 class Pulses:
-    """Measures the silence of each process; it is updated at each check."""
+    """Measures how long each process has been silent. The durations are updated at each check."""
 
     def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic, silence: float = SILENCE) -> None:
         """Begin without processes.
@@ -19,17 +19,17 @@ class Pulses:
         Args:
             bus: Bus of the flight.
             clock: Function that returns the time [s].
-            silence: Time without a heartbeat, after which a process hangs [s].
+            silence: Time without a heartbeat after which a process counts as hanging [s].
         """
         self._bus, self._clock, self._last, self._silence = bus, clock, clock(), silence
         self._versions, self._silent, self._allowed = dict[str, int](), dict[str, float](), dict[str, float]()
 
     def expect(self, role: str, within: float | None = None) -> None:
-        """Expect heartbeats of a process from now on.
+        """Expect a process to send heartbeats from now on.
 
         Args:
             role: Role of the process.
-            within: Time limit for the first heartbeat [s], since a process compiles at its start; None: the same as for
+            within: Time limit for the first heartbeat [s], since a process compiles at its start; None for the limit of
                 later heartbeats.
         """
         self._versions[role], self._silent[role] = self._version(role), 0.0

@@ -64,7 +64,7 @@ def cores_of(role: str, allowed: set[int] | None = None) -> set[int]:
 
 
 def sleep_until(instant: float) -> None:
-    """Return at ``instant`` of the monotonic clock [s], or at once if it has passed."""
+    """Sleep until ``instant`` of the monotonic clock [s]; return at once if it has passed."""
     while (left := instant - time.monotonic()) > LATER:
         time.sleep(left)
 
@@ -84,7 +84,7 @@ class ParentWatch:
     """Detects the end of another process, immediately and without its cooperation."""
 
     def __init__(self, pid: int) -> None:
-        """Watch a process of this machine."""
+        """Watch a process on this machine."""
         self.pid, self._poll = pid, select.poll()
         self._descriptor: int | None = None
         with contextlib.suppress(OSError, AttributeError):

@@ -34,7 +34,7 @@ class RecorderPlan:
     folder: Path
     """Folder of the bus."""
     path: Path
-    """Path of the log, a CSV file with a line per tick."""
+    """Path of the log, a CSV file with one line per tick."""
     dt: float
     parent: int
     """Id of the process that removes the bus; if it has ended, the recorder removes the bus."""
@@ -43,7 +43,7 @@ class RecorderPlan:
 
 
 class Recorder:
-    """Appends new ticks to the log. It fills gaps from the last seconds of flight, which every report contains."""
+    """Appends new ticks to the log. It fills gaps from the last few seconds of flight, which every report contains."""
 
     def __init__(self, path: Path, bus: Bus, spare: Sequence[Path] = ()) -> None:
         """Continue a log, or create one.
@@ -72,7 +72,7 @@ class Recorder:
         return self._take("flight") + self._take("fallback.flight")
 
     def tell(self) -> None:
-        """Publish that the log is ready, and its state."""
+        """Publish that the log is ready, and whether it failed or moved."""
         self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed, moved=self.moved))
 
     def close(self) -> None:
@@ -125,7 +125,7 @@ class Recorder:
         self.tell()
 
     def _note(self, rows: np.ndarray) -> None:
-        """Record the written rows; after any row of a tick, the row of a merely observing watchdog is redundant."""
+        """Record the written rows; once a tick has any row, the row of a merely observing watchdog is redundant."""
         for tick, has, flew in _authors(rows):
             self._written |= {(tick, has, flew), (tick, False, False)}
 
@@ -167,7 +167,7 @@ def _authors(rows: np.ndarray) -> list[tuple[int, bool, bool]]:
 
 
 def record(plan: RecorderPlan) -> None:
-    """Write until the flight is over; main function of the process."""
+    """Write until the flight is over, as the main function of the process."""
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus, plan.spare)
     recorder.tell()

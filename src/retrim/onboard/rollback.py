@@ -30,10 +30,10 @@ class Watched(NamedTuple):
 
 @dataclass
 class FlownError:
-    """Compares the distance from the target before and after swaps; swaps may come faster than the verdict.
+    """Compares the distance from the target before and after swaps; further swaps may come before the verdict.
 
     Policies are clearly worse if the mean error of the last half second exceeds both ``factor`` times the error before
-    the first of them and ``least``. This is checked from ``settle_s`` after the first swap.
+    the first of them and ``least``. The check begins ``settle_s`` after the first swap.
     """
 
     dt: float
@@ -72,7 +72,7 @@ class FlownError:
         error, missed = self._means()
         first = self._watched[0]
         flown_s = (self._tick - first.since) * self.dt
-        if missed > first.missed + self.surprise:  # the world has changed: a comparison is not possible, keep the last
+        if missed > first.missed + self.surprise:  # the world has changed, so errors are not comparable: keep the last
             last = self._watched[-1].version
             self._watched.clear()
             return Judgement(proven=last)

@@ -1,8 +1,8 @@
 """Stalls of the machine: intervals in which even the process with the highest priority did not run.
 
 The watchdog wakes up every two milliseconds with the highest priority and does very little work. If its wake-up is
-delayed, every process on its core was delayed, by the kernel or by the host of a virtual machine. Ticks that are missed
-in such an interval are not caused by a slow control or plant process.
+delayed, every process on its core was delayed, by the kernel or by the host of a virtual machine. A slow control
+or plant process is not the cause of ticks missed in such an interval.
 """
 
 from collections import deque
@@ -16,7 +16,7 @@ KEPT = 100  # the newest stalls are kept
 
 
 class Stalls:
-    """The stalls that were detected."""
+    """Record of the detected stalls."""
 
     def __init__(self, every: float) -> None:
         """Begin without stalls.
@@ -34,7 +34,7 @@ class Stalls:
         """Record a wake-up; return whether the machine stalled before it.
 
         Args:
-            now: Monotonic clock [s].
+            now: Current time of the monotonic clock [s].
         """
         before, self._woke = self._woke, now
         if before is None or now - before <= self._every + STALL:
@@ -50,11 +50,11 @@ class Stalls:
 
 
 def lost_in(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]], dt: float) -> int:
-    """Return the number of ticks that were missed during a stall or while the plant caught up within a tick after it.
+    """Return the number of ticks missed during a stall or within one tick after it, while the plant caught up.
 
     Args:
         stalls: Start and end of each stall [s].
-        gaps: Times of the measurements before and after missed ticks [s], and number of missed ticks.
+        gaps: Times of the measurements before and after missed ticks [s], and the number of missed ticks.
         dt: Control tick [s].
     """
     return sum(int(n) for a, b, n in gaps if any(begin < b and end + dt > a for begin, end in stalls))

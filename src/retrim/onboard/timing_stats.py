@@ -11,7 +11,7 @@ EDGES_MS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 
 def summary(seconds: np.ndarray) -> dict[str, Any]:
-    """Return p50, p99 and maximum [ms], and the counts between successive ``EDGES_MS`` and outside the first and last.
+    """Return the p50, p99 and maximum [ms], and the counts between successive ``EDGES_MS`` and outside them.
 
     Args:
         seconds: Durations [s].
@@ -41,9 +41,9 @@ def blind_row(
 
     Args:
         sample: The last measurement.
-        stamp: Stamp of the last message of the plant; the state of that message may have been refused.
-        now: Monotonic clock [s].
-        start: Time of the first measurement by the plant's clock [s].
+        stamp: Stamp of the last message from the plant; the state in that message may have been refused.
+        now: Current time of the monotonic clock [s].
+        start: Time of the first measurement on the plant's clock [s].
         dt: Control tick [s].
         u: The command.
         mode: Active mode of the guard.

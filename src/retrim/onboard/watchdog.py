@@ -1,4 +1,4 @@
-"""The watchdog process: it runs only the fallback, and sends its commands when the control process died or hangs."""
+"""The watchdog process: it runs only the fallback, and sends commands when the control process has died or hangs."""
 
 import time
 from collections import deque
@@ -19,7 +19,7 @@ from .timing_stats import blind_row
 
 PATIENCE = 1.6  # ticks without a command
 CHECK_EVERY = 0.002  # [s]
-ROWS = 50  # of a report, with the ticks from before the takeover
+ROWS = 50  # rows of a report, including ticks from before the takeover
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Watchdog:
         """Publish and return a command if one is due.
 
         Args:
-            now: Monotonic clock [s].
+            now: Current time of the monotonic clock [s].
             gone: Whether the control process has ended.
         """
         if (message := self.bus.latest("setpoint", self._version)) is not None:
@@ -89,7 +89,7 @@ class Watchdog:
         return setpoint
 
     def _hear(self, data: bytes, now: float) -> None:
-        """Record a command of the control process: its time, the target, and whether the vehicle has landed."""
+        """Record a command from the control process: its time, the target, and whether the vehicle has landed."""
         try:
             said = Setpoint.unpack(data)
         except MessageError:
@@ -129,7 +129,7 @@ class Watchdog:
 
 
 def watch(plan: WatchdogPlan) -> None:
-    """Watch until the flight is over; main function of the process."""
+    """Watch until the flight is over, as the main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
     bus = SharedMemoryBus(plan.folder)
     watchdog, control, parent = Watchdog(plan, bus), ParentWatch(plan.control), ParentWatch(plan.parent)

@@ -1,4 +1,7 @@
-"""Physics: pure, differentiable, unbatched; without networks, input or output; keys only at construction."""
+"""Physics: pure, differentiable, unbatched functions, without networks and without input or output.
+
+Random keys are used only at construction.
+"""
 
 from . import precision as precision
 from .actuator_response import ActuatorResponse as ActuatorResponse

@@ -1,11 +1,11 @@
 """Response of thrust and body rates to the commands that arrive.
 
-Thrust follows through a gain and a first-order lag, and each body rate through a gain and a loop of second order,
+Thrust follows through a gain and a first-order lag, and each body rate through a gain and a second-order loop,
 
     tau_c c' + c = k_c c_cmd,    (tau kappa / 2)^2 w'' + tau w' + w = k w_cmd,
 
-with tau = 2 zeta / omega_n and kappa = 1 / zeta. For kappa = 0 the loop is of first order with the time constant tau.
-All values are arrays, so that another lag or damping does not need another compilation.
+with tau = 2 zeta / omega_n and kappa = 1 / zeta. For kappa = 0, the loop is of first order with the time constant tau.
+All values are arrays, so that a different lag or damping does not need a new compilation.
 """
 
 import equinox as eqx
@@ -21,7 +21,7 @@ SERIES = 7  # number of terms, for double precision up to NEAR_CRITICAL
 
 
 class ActuatorState(eqx.Module):
-    """State of actuators and rate loop."""
+    """State of the actuators and the rate loop."""
 
     command: Command
     """Present thrust [m/s^2] and body rates [rad/s]."""
@@ -30,7 +30,7 @@ class ActuatorState(eqx.Module):
 
     @classmethod
     def at(cls, u: Command) -> "ActuatorState":
-        """Return the state at rest at a command."""
+        """Return the steady state under the command ``u``."""
         return cls(u, jnp.zeros_like(u.omega))
 
 
@@ -42,11 +42,11 @@ class ActuatorResponse(eqx.Module):
     thrust_lag: Float[Array, ""]
     """Time constant of the thrust [s]."""
     rate_gain: Float[Array, "3"]
-    """Body rates over commanded ones: roll, pitch, yaw."""
+    """Body rates over commanded body rates: roll, pitch, yaw."""
     rate_lag: Float[Array, "3"]
     """Time constant 2 zeta / omega_n of each body rate [s]."""
     inverse_damping: Float[Array, "3"]
-    """1 / zeta of each rate loop; zero is a loop of first order."""
+    """1 / zeta of each rate loop; zero means a first-order loop."""
 
     @classmethod
     def of(
@@ -63,9 +63,9 @@ class ActuatorResponse(eqx.Module):
         Args:
             thrust_lag: Time constant of the thrust [s].
             rate_lag: Time constant 2 zeta / omega_n of roll, pitch and yaw [s].
-            inverse_damping: 1 / zeta of each rate loop; zero is a loop of first order.
+            inverse_damping: 1 / zeta of each rate loop; zero means a first-order loop.
             thrust_gain: Thrust over commanded thrust.
-            rate_gain: Body rates over commanded ones.
+            rate_gain: Body rates over commanded body rates.
         """
         axes = [jnp.broadcast_to(strong_array(each), (3,)) for each in (rate_gain, rate_lag, inverse_damping)]
         return cls(strong_array(thrust_gain), strong_array(thrust_lag), *axes)
@@ -74,8 +74,8 @@ class ActuatorResponse(eqx.Module):
     def settling_time(self) -> Float[Array, ""]:
         """Three time constants of the response that moves the vehicle [s].
 
-        A turn about the thrust axis does not move the vehicle, and yaw may take a second. A loop that rings settles
-        with its envelope.
+        Yaw does not count: a turn about the thrust axis does not move the vehicle, and may take a second. A loop that
+        rings settles with its envelope.
         """
         envelope = self.rate_lag * jnp.maximum(1.0, 0.5 * self.inverse_damping**2)
         return 3.0 * jnp.maximum(self.thrust_lag, jnp.max(envelope[:2]))
@@ -85,7 +85,7 @@ class ActuatorResponse(eqx.Module):
         return Command(self.thrust_gain.astype(u.c.dtype) * u.c, self.rate_gain.astype(u.omega.dtype) * u.omega)
 
     def __call__(self, s: ActuatorState, u: Command, time: float | Float[Array, ""]) -> tuple[Command, ActuatorState]:
-        """Advance under a constant command; exact, and differentiable in all arguments.
+        """Advance under a constant command; the result is exact, and differentiable in all arguments.
 
         Args:
             s: State at the beginning.
@@ -93,13 +93,13 @@ class ActuatorResponse(eqx.Module):
             time: Duration [s]; zero is allowed.
 
         Returns:
-            Difference of thrust and body rates from :meth:`target`, integrated over the duration [m/s, rad], and the
+            Thrust and body rates minus :meth:`target`, integrated over the duration [m/s, rad], and the
             state at its end.
         """
         dtype, target = u.c.dtype, self.target(u)
         h = jnp.asarray(time, dtype)
         thrust, c = self.thrust(s.command.c, target.c, h)
-        # The integral follows from the equation of the loop, which spares another exponential.
+        # The integral follows from the equation of the loop, which saves an exponential.
         rate_lag, kappa = self.rate_lag.astype(dtype), self.inverse_damping.astype(dtype)
         error, quarter = s.command.omega - target.omega, 0.25 * kappa**2
         mean, half = _modes(h / jnp.maximum(rate_lag, FASTEST), kappa)
@@ -112,7 +112,7 @@ class ActuatorResponse(eqx.Module):
     def thrust(
         self, c: Float[Array, ""], target: Float[Array, ""], time: float | Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Advance the thrust alone.
+        """Advance only the thrust.
 
         Args:
             c: Thrust at the beginning [m/s^2].
@@ -128,7 +128,7 @@ class ActuatorResponse(eqx.Module):
 
 
 def strong_array(value: float | Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return an array of strong type, since one of weak type would need another compilation."""
+    """Return a strongly typed array, since a weakly typed one would need a separate compilation."""
     return jnp.asarray(value, dtype=float)
 
 
@@ -146,7 +146,7 @@ def _modes(x: Float[Array, "3"], kappa: Float[Array, "3"]) -> tuple[Float[Array,
     square = b**2 * (1.0 - kappa**2)
     near = jnp.abs(square) < NEAR_CRITICAL
     slow, quick = ~near & (kappa < 1.0), ~near & (kappa >= 1.0)
-    # Where another branch applies, each branch is evaluated at safe numbers, since its gradient must be finite.
+    # A branch that does not apply is evaluated at safe numbers, since its gradient must be finite.
     k = jnp.where(slow, kappa, 0.5)
     rho = jnp.sqrt(1.0 - k**2)
     late = jnp.exp(-2.0 * x / (1.0 + rho))

@@ -19,7 +19,7 @@ U = TypeVar("U")
 
 
 class LagState(eqx.Module, Generic[X]):
-    """State of the model, and of the actuators in front of it."""
+    """State of the model and of the actuators in front of it."""
 
     inner: X
     actuators: ActuatorState
@@ -29,13 +29,14 @@ def lagged(acting: U, u: U, dt: float, tau: Float[Array, "*axes"] | Command) -> 
     """Return the output of a first-order lag for a command over a tick.
 
     Args:
-        acting: Command at the actuators at the beginning of the tick; or arrays of commands.
+        acting: Command at the actuators at the beginning of the tick, or arrays of commands.
         u: Command that reaches them, of the same kind.
         dt: Length of the tick [s].
-        tau: Time constant [s], of all parts or of each part of a command; an array broadcasts with arrays of commands.
+        tau: Time constant [s]: one for all parts of a command, or one for each. An array broadcasts with arrays of
+            commands.
 
     Returns:
-        Mean output over the tick, and output at its end.
+        Mean output over the tick, and the output at its end.
     """
     taus: Any = tau if isinstance(tau, Command) else jax.tree.map(lambda _: tau, u)
     decay = jax.tree.map(lambda each: jnp.exp(-dt / each), taus)
@@ -48,9 +49,10 @@ def lagged(acting: U, u: U, dt: float, tau: Float[Array, "*axes"] | Command) -> 
 
 
 def is_followed(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
-    """Return whether all parts of a command are away from their limits, where vehicles do not follow commands.
+    """Return whether all parts of a command are away from their limits.
 
-    At the smallest thrust, for example, a mixer adds thrust to reach the commanded rates.
+    At the limits, vehicles do not follow commands. At the smallest thrust, for example, a mixer adds thrust to reach
+    the commanded rates.
 
     Args:
         u: Command.
@@ -74,7 +76,7 @@ class RateBiased(AbstractWrapper[X]):
 
 
 class Lagged(AbstractDynamics[LagState[X]]):
-    """A model with the response of actuators and rate loop in front of it."""
+    """A model with the response of the actuators and the rate loop in front of it."""
 
     base: AbstractDynamics[X]
     response: ActuatorResponse
@@ -114,7 +116,7 @@ class Lagged(AbstractDynamics[LagState[X]]):
 
 
 def with_response(model: AbstractDynamics[Any], response: ActuatorResponse) -> AbstractDynamics[Any]:
-    """Return a model with another response of its actuators; actuators are added to a model without them.
+    """Return a model with a different actuator response; actuators are added to a model without them.
 
     Args:
         model: A model, or wrappers around one.

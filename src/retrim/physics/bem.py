@@ -1,4 +1,4 @@
-"""The realistic plant: blade-element rotors, body drag, rate controller of the firmware and motors, at 1 kHz."""
+"""The realistic plant at 1 kHz: blade-element rotors, body drag, the firmware's rate controller, and motors."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -36,12 +36,12 @@ class RateController(Protocol):
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command, /
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
-        """Return commanded rotor speeds [rad/s], the integral of the rate error [rad], and the slow command [rad/s]."""
+        """Return the commanded rotor speeds [rad/s], integral of the rate error [rad], and slow command [rad/s]."""
         ...
 
 
 class Loads(NamedTuple):
-    """Force and torque on the body, body frame."""
+    """Force and torque on the body, in the body frame."""
 
     force: Float[Array, "3"]
     """Force [N]."""
@@ -65,7 +65,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         """Return the model of a vehicle.
 
         Args:
-            vehicle: Constants of the vehicle.
+            vehicle: Vehicle constants.
             dt: Control tick [s], a whole number of milliseconds.
             thrust_error: Relative thrust error: in still air, u_hover gives (1 + thrust_error) m g.
 
@@ -76,7 +76,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return cls(vehicle, Betaflight.suited(vehicle, thrust_map, blades), dt)
 
     def init(self, x: State) -> BemState:
-        """Return the state of a vehicle that hovers at ``x``: rotor speeds of u_hover, settled inflow, no rotation."""
+        """Return the state of a vehicle that hovers at ``x``, with the rotor speeds of u_hover and settled inflow."""
         vehicle, zero = self.vehicle, jnp.zeros_like(x.p)
         speed = jnp.sqrt(vehicle.mass * STANDARD_GRAVITY / (4.0 * self.loop.thrust_map))
         body = RotorState(x, zero, jnp.ones(4, dtype=x.p.dtype) * speed, zero, zero, zero)
@@ -95,11 +95,11 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
 
     @property
     def command_limits(self) -> tuple[Command, Command]:
-        """Smallest and largest command of the vehicle."""
+        """The vehicle's smallest and largest commands."""
         return self.vehicle.command_min, self.vehicle.command_max
 
     def rotor_state(self, s: BemState) -> RotorState:
-        """Return body rates and rotor speeds."""
+        """Return the body rates and rotor speeds."""
         return s.body
 
     def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
@@ -134,17 +134,17 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return jax.vmap(one)(motors, v_hor, -air[:, 2], inflow)
 
     def hub_velocities(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "4 3"]:
-        """Return the velocity of each hub through the air, body frame [m/s]."""
+        """Return the velocity of each hub through the air, in the body frame [m/s]."""
         return (b.x.R.T @ (b.x.v - wind))[None] + jnp.cross(b.omega[None], self.places())
 
     def places(self) -> Float[Array, "4 3"]:
-        """Return the positions of the hubs, body frame [m]."""
+        """Return the hub positions in the body frame [m]."""
         arm = self.vehicle.arm
         turn = signs(arm.dtype)  # a rotor at (x, y) turns the body about x by its y, about y by -x
         return jnp.stack([-arm[0] * turn[1], arm[1] * turn[0], jnp.zeros(4, dtype=arm.dtype)], axis=1)
 
     def loads(self, b: RotorState, motors: Float[Array, "4"], blades: BladeForces, effects: ExternalEffects) -> Loads:
-        """Return force and torque of rotors, body drag, yaw reaction of the motors and gyroscopic effects."""
+        """Return the force and torque of rotors, body drag, the motors' yaw reaction and gyroscopic effects."""
         vehicle = self.vehicle
         air = self.hub_velocities(b, effects.wind)
         along = air[:, :2] / jnp.sqrt(air[:, :1] ** 2 + air[:, 1:2] ** 2 + 1e-12)
@@ -161,6 +161,6 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return Loads(obstruction * jnp.sum(forces, axis=0) + self.body_drag(b, effects.wind), torque)
 
     def body_drag(self, b: RotorState, wind: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return F_k = -1/2 rho (c A)_k u_k |u_k|, body frame [N]."""
+        """Return the body drag F_k = -1/2 rho (c A)_k u_k |u_k| in the body frame [N]."""
         through = b.x.R.T @ (b.x.v - wind)
         return -0.5 * AIR_DENSITY * self.vehicle.drag_area * through * jnp.abs(through)

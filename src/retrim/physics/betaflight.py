@@ -1,4 +1,4 @@
-"""Rate controller of flight firmware: PID in throttle units, mixer, speed controllers, at 1 kHz."""
+"""Rate controller of flight firmware at 1 kHz: PID in throttle units, mixer and speed controllers."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ class Betaflight(eqx.Module):
 
     @classmethod
     def of(cls, thrust_map: Float[Array, ""]) -> "Betaflight":
-        """Return the settings of the Agilicious platform: P 40, 40, 30, I 80, 80, 60, D 20, 20, 0.
+        """Return the settings of the Agilicious platform: P 40, 40, 30; I 80, 80, 60; D 20, 20, 0.
 
         The limit of the integral is that of the firmware, 40 % of the throttle.
         """
@@ -44,10 +44,10 @@ class Betaflight(eqx.Module):
     @classmethod
     @eqx.filter_jit
     def suited(cls, vehicle: Vehicle, thrust_map: Float[Array, ""], coefficient: Float[Array, ""]) -> "Betaflight":
-        """Return the settings of :meth:`of` if the vehicle's step response is damped, otherwise tuned settings.
+        """Return the settings of :meth:`of` if they damp the vehicle's step response, otherwise tuned settings.
 
         Args:
-            vehicle: Constants of the vehicle.
+            vehicle: Vehicle constants.
             thrust_map: As in :meth:`of`.
             coefficient: True T / Omega^2 of one rotor [N s^2].
         """
@@ -65,7 +65,7 @@ class Betaflight(eqx.Module):
         """Return the gains in units of angular acceleration.
 
         Args:
-            power: Authority of the vehicle.
+            power: The vehicle's authority.
         """
         return Gains(power.alpha * P_SCALE * self.kp, power.alpha * I_SCALE * self.ki, power.alpha * D_SCALE * self.kd)
 
@@ -76,7 +76,7 @@ class Betaflight(eqx.Module):
         low, high = vehicle.command_min, vehicle.command_max
         wanted = jnp.clip(u.omega, low.omega, high.omega)
         error = wanted - s.omega
-        # The integral pauses while the command moves fast, so that it does not wind up in a turn.
+        # The integral pauses while the command changes fast, so that it does not wind up in a turn.
         relaxed = jnp.maximum(0.0, 1.0 - jnp.abs(wanted - s.wanted_slow) / RELAX_RATE)
         grown = s.integral + SUBSTEP * error * relaxed
         integral = jnp.clip(grown, -self.integral_max, self.integral_max)

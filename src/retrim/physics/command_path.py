@@ -1,8 +1,8 @@
 """The command path of a vehicle, from the controller to the motion.
 
-A command acts after a transport delay, and thrust and body rates then follow it as
-:class:`~retrim.physics.actuator_response.ActuatorResponse` describes. Commands wait in a queue of fixed length, so that
-another delay does not need another compilation.
+A command acts after a transport delay. Thrust and body rates then follow it with the response of
+:class:`~retrim.physics.actuator_response.ActuatorResponse`. Commands wait in a queue of fixed length, so that a
+different delay does not need a new compilation.
 """
 
 import math
@@ -16,15 +16,15 @@ from jaxtyping import Array, Float
 from .actuator_response import ActuatorResponse, ActuatorState, strong_array
 from .state import Command
 
-LONGEST_DELAY = 0.2  # [s], default of the longest delay that a queue can hold
+LONGEST_DELAY = 0.2  # [s], default for the longest delay that a queue can hold
 ROUNDING = 1e-4  # steps; a delay this close to a whole number of steps counts as whole
 
 
 class CommandQueue(eqx.Module):
-    """The commands of the last ticks, in a queue of fixed length."""
+    """The commands of the last few ticks, in a queue of fixed length."""
 
     commands: Command
-    """Commands, oldest first (leading axis); each was held for a tick."""
+    """Commands along the leading axis, oldest first; each was held for one tick."""
 
     @classmethod
     def of(cls, u: Command, dt: float, *, longest: float = LONGEST_DELAY) -> "CommandQueue":
@@ -39,7 +39,7 @@ class CommandQueue(eqx.Module):
         return cls(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), u))
 
     def push(self, u: Command) -> "CommandQueue":
-        """Return the queue after the command ``u`` was issued for the tick that begins."""
+        """Return the queue after the command ``u`` was issued for the tick that begins now."""
         rows = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), self.commands, u)
         return CommandQueue(rows)
 
@@ -54,7 +54,9 @@ class CommandQueue(eqx.Module):
         return CommandQueue(rows)
 
     def arrival(self, delay: Float[Array, ""], dt: float) -> Command:
-        """Return the mean command that arrives during the tick that begins: a mean of two neighbours in the queue.
+        """Return the mean command that arrives during the tick that begins now.
+
+        It is a weighted mean of two neighbours in the queue.
 
         Args:
             delay: Transport delay [s], at most the longest that the queue can hold.
@@ -63,7 +65,7 @@ class CommandQueue(eqx.Module):
         return self.combine(self.weights(delay, dt))
 
     def pieces(self, delay: Float[Array, ""], dt: float) -> tuple[Command, Command, Float[Array, ""]]:
-        """Return the two commands that arrive during the tick that begins, and the time of the change [s].
+        """Return the two commands that arrive during the tick that begins now, and the time of the change [s].
 
         Args:
             delay: Transport delay [s], at most the longest that the queue can hold.
@@ -75,7 +77,7 @@ class CommandQueue(eqx.Module):
         return before, after, (ticks - n) * dt
 
     def substeps(self, delay: Float[Array, ""], dt: float, n: int) -> Command:
-        """Return the mean command that arrives in each of ``n`` equal parts of the tick that begins (leading axis).
+        """Return the mean command that arrives in each of ``n`` equal parts of the tick that begins now (leading axis).
 
         Args:
             delay: Transport delay [s], at most the longest that the queue can hold.
@@ -86,23 +88,23 @@ class CommandQueue(eqx.Module):
         late = whole_steps(n * self._age(delay, dt), 1.0)
         begin = jnp.arange(n, dtype=late.dtype)[:, None]
         issue = n * jnp.arange(1.0 - rows, 1.0, dtype=late.dtype)[None] + late
-        # The share of a part in which a command acts: from its arrival until that of the next one.
+        # Share of each part in which a command acts: from its arrival until the arrival of the next command.
         shares = jnp.clip(begin + 1.0 - issue, 0.0, 1.0) - jnp.clip(begin + 1.0 - n - issue, 0.0, 1.0)
         return jax.vmap(self.combine)(shares)
 
     def weights(self, delay: Float[Array, ""], dt: float) -> Float[Array, " n"]:
-        """Return the share of each row in the mean command during the tick that begins; shares add up to one."""
+        """Return the share of each row in the mean command of the tick that begins now; the shares add up to one."""
         return self._hat(self._age(delay, dt))
 
     def combine(self, weights: Float[Array, " n"]) -> Command:
         """Return a weighted sum of the rows."""
-        # Without a matrix product, since accelerators round its factors to fewer digits.
+        # A matrix product is avoided, since accelerators round its factors to fewer digits.
         c = jnp.sum(weights * self.commands.c)
         return Command(c, jnp.sum(weights[:, None] * self.commands.omega, axis=0))
 
     def _age(self, delay: Float[Array, ""], dt: float) -> Float[Array, ""]:
         """Return the age in ticks of the command that arrives when the tick begins."""
-        # Beyond the queue its oldest command acts, since a traced delay cannot be refused.
+        # Beyond the end of the queue, its oldest command acts, since a traced delay cannot be rejected.
         return jnp.minimum(whole_steps(delay.astype(self.commands.c.dtype), dt), self.commands.c.shape[0] - 1.0)
 
     def _hat(self, age: Float[Array, ""]) -> Float[Array, " n"]:
@@ -112,14 +114,14 @@ class CommandQueue(eqx.Module):
 
 
 class PathState(eqx.Module):
-    """Commands under way, and the state of the actuators."""
+    """Commands under way and state of the actuators."""
 
     queue: CommandQueue
     actuators: ActuatorState
 
 
 class CommandPath(eqx.Module):
-    """The command path of a vehicle as one value: transport delay, and response of thrust and body rates."""
+    """The command path of a vehicle: the transport delay, and the response of thrust and body rates."""
 
     delay: Float[Array, ""]
     """Transport delay [s]."""
@@ -131,7 +133,7 @@ class CommandPath(eqx.Module):
 
         Args:
             delay: Transport delay [s].
-            response: Response of thrust and body rates; None if they follow at once.
+            response: Response of thrust and body rates; None if they follow immediately.
         """
         return cls(strong_array(delay), ActuatorResponse.of() if response is None else response)
 
@@ -140,7 +142,7 @@ class CommandPath(eqx.Module):
         return PathState(CommandQueue.of(u, dt, longest=longest), ActuatorState.at(u))
 
     def __call__(self, s: PathState, u: Command, dt: float) -> tuple[Command, PathState]:
-        """Advance by a control tick; exact for commands that are held over each tick.
+        """Advance by one control tick; the result is exact for commands that are held over each tick.
 
         Args:
             s: State at the beginning of the tick.
@@ -148,14 +150,14 @@ class CommandPath(eqx.Module):
             dt: Length of the tick [s].
 
         Returns:
-            Mean of thrust and body rates over the tick, and the state at its end.
+            Mean thrust and body rates over the tick, and the state at its end.
         """
         queue = s.queue.push(u)
         mean, end = self.advance(queue, s.actuators, dt)
         return mean, PathState(queue, end)
 
     def advance(self, queue: CommandQueue, actuators: ActuatorState, dt: float) -> tuple[Command, ActuatorState]:
-        """Advance the actuators by the tick whose command is the newest of the queue.
+        """Advance the actuators by the tick for which the newest command in the queue was issued.
 
         Args:
             queue: Commands.
@@ -163,7 +165,7 @@ class CommandPath(eqx.Module):
             dt: Length of the tick [s].
 
         Returns:
-            Mean of thrust and body rates over the tick, and the state at its end.
+            Mean thrust and body rates over the tick, and the state at its end.
         """
         before, after, change = queue.pieces(self.delay, dt)
         first, middle = self.response(actuators, before, change)
@@ -173,7 +175,7 @@ class CommandPath(eqx.Module):
         return mean, end
 
     def thrust(self, queue: CommandQueue, c: Float[Array, ""], dt: float) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Advance the thrust alone by the tick whose command is the newest of the queue.
+        """Advance only the thrust, by the tick for which the newest command in the queue was issued.
 
         Args:
             queue: Commands.
@@ -181,7 +183,7 @@ class CommandPath(eqx.Module):
             dt: Length of the tick [s].
 
         Returns:
-            Mean thrust over the tick, and thrust at its end [m/s^2].
+            Mean thrust over the tick, and the thrust at its end [m/s^2].
         """
         before, after, change = queue.pieces(self.delay, dt)
         first, middle = self.response.thrust(c, self.response.target(before).c, change)
@@ -190,12 +192,12 @@ class CommandPath(eqx.Module):
 
 
 def check_delay(delay: Float[Array, "*batch"], longest: float, name: str) -> None:
-    """Refuse a delay that a queue cannot hold; a traced delay, or an array of delays, is not checked.
+    """Reject a delay that a queue cannot hold; a traced delay or an array of delays is not checked.
 
     Args:
         delay: Transport delay [s].
         longest: Longest delay that the queue can hold [s].
-        name: Name of the object with the delay, for the message.
+        name: Name of the object with the delay, for the error message.
 
     Raises:
         ValueError: The delay is negative or too long.
@@ -207,12 +209,12 @@ def check_delay(delay: Float[Array, "*batch"], longest: float, name: str) -> Non
 
 
 def queue_length(dt: float, longest: float = LONGEST_DELAY) -> int:
-    """Return the length of a queue for delays of up to ``longest`` [s] at a tick of ``dt`` [s]."""
+    """Return the length of a queue for delays up to ``longest`` [s] at a tick of ``dt`` [s]."""
     return math.ceil(longest / dt - ROUNDING) + 1
 
 
 def whole_steps(time: Float[Array, "*shape"], dt: float) -> Float[Array, "*shape"]:
-    """Return a time in steps of ``dt``; a number that is whole except for rounding is made whole."""
+    """Return a time in steps of ``dt``; a number that is whole up to rounding errors is made whole."""
     steps = time / dt
     nearest = jnp.round(steps)
     rounding = jnp.where(jnp.abs(steps - nearest) < ROUNDING, nearest - steps, 0.0)

@@ -1,7 +1,7 @@
-"""Disturbances: functions (t, x) -> :class:`ExternalEffects`. This module has pushes; see also wind and faults.
+"""Disturbances: functions (t, x) -> :class:`ExternalEffects`. This module contains pushes; see also wind and faults.
 
 Disturbances belong to the plant; the nominal model does not contain them. Their random numbers are drawn at
-construction, so that a disturbance is a function of time and repeatable.
+construction, so that a disturbance is repeatable.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def effects_at(times: ArrayLike, x: State, disturbance: Disturbance) -> External
 
 
 class Push(eqx.Module):
-    """A function (t, x) -> external acceleration, world [m/s^2], as a disturbance."""
+    """A disturbance from a function (t, x) -> external acceleration, world [m/s^2]."""
 
     a_ext: Callable[[Float[Array, ""], State], Float[Array, "3"]]
 
@@ -64,7 +64,7 @@ class HeldEffects(eqx.Module):
 
 
 class Constant(eqx.Module):
-    """A constant acceleration; the cases none, small and large of the paper (Sec. IV-B)."""
+    """A constant acceleration, e.g. the paper's cases none, small and large (Sec. IV-B)."""
 
     a: Float[Array, "3"]
 
@@ -74,11 +74,11 @@ class Constant(eqx.Module):
 
 
 class Step(eqx.Module):
-    """An acceleration that begins at a time and remains."""
+    """An acceleration that begins at a given time and remains."""
 
     a: Float[Array, "3"]
     since: Float[Array, ""]
-    """Time of the beginning [s]."""
+    """Start time [s]."""
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Return a push of zero before ``since``, and ``a`` [m/s^2] from then on."""
@@ -90,7 +90,7 @@ class Kick(eqx.Module):
 
     a: Float[Array, "3"]
     since: Float[Array, ""]
-    """Time of the beginning [s]."""
+    """Start time [s]."""
     duration: Float[Array, ""]
     """Duration [s]."""
 
@@ -101,7 +101,10 @@ class Kick(eqx.Module):
 
 
 class Reversing(eqx.Module):
-    """Alternately ``+a`` and ``-a``, reversed every ``period`` seconds (paper, Sec. IV-B.3: every 15 s)."""
+    """An acceleration of alternately ``+a`` and ``-a``, reversed every ``period`` seconds.
+
+    In the paper, it is reversed every 15 s (Sec. IV-B.3).
+    """
 
     a: Float[Array, "3"]
     period: Float[Array, ""]

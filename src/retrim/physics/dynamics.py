@@ -1,4 +1,4 @@
-"""Models of motion: x_{t+1} = f(x_t, u_t) for one control tick.
+"""Motion models: x_{t+1} = f(x_t, u_t) for one control tick.
 
 The configurations of the paper's runtime study (Sec. IV-C) are expressions, with rotors = LinearDragQuadrotor.of(...)::
 
@@ -27,9 +27,9 @@ X = TypeVar("X")
 
 
 class AbstractDynamics(eqx.Module, Generic[X]):
-    """One control tick of a model whose own state is ``X``, and how ``X`` relates to a :class:`State`."""
+    """A model that advances its own state ``X`` by control ticks, and relates ``X`` to a :class:`State`."""
 
-    if TYPE_CHECKING:  # to a type checker an abstract variable would be a dataclass field
+    if TYPE_CHECKING:  # a type checker would treat an abstract variable as a dataclass field
 
         @property
         def dt(self) -> float:
@@ -44,7 +44,7 @@ class AbstractDynamics(eqx.Module, Generic[X]):
 
     @abc.abstractmethod
     def init(self, x: State) -> X:
-        """Return the state of the model for a vehicle that hovers at ``x``."""
+        """Return the model's state for a vehicle that hovers at ``x``."""
 
     @abc.abstractmethod
     def state(self, s: X) -> State:
@@ -55,7 +55,7 @@ class AbstractDynamics(eqx.Module, Generic[X]):
         """Return ``s`` with (p, R, v) replaced; the hidden state is kept."""
 
     def actuators(self, s: X) -> ActuatorState | None:
-        """Return the present thrust and body rates; None for a model that follows commands at once."""
+        """Return the present thrust and body rates; None for a model that follows commands immediately."""
         del s
         return None
 
@@ -64,12 +64,12 @@ class AbstractDynamics(eqx.Module, Generic[X]):
         """Advance one control tick.
 
         Args:
-            s: State of the model.
+            s: The model's state.
             u: Command, held over the tick.
             a_ext: External acceleration, world [m/s^2], held over the tick.
 
         Returns:
-            The state of the model at the end of the tick.
+            The model's state at the end of the tick.
         """
 
 
@@ -83,7 +83,7 @@ def f_a(x: State, u: Command, a_ext: Float[Array, "3"]) -> StateDot:
 class PointMass(AbstractDynamics[State]):
     """The low-fidelity model: Eq. (1), integrated by Runge-Kutta 4 over the coupled p, R, v (paper, Sec. III-E).
 
-    Within a tick the body rates are constant, so each stage's attitude ``R exp([omega] tau)`` is exact and on SO(3).
+    Within a tick, the body rates are constant, so each stage's attitude ``R exp([omega] tau)`` is exact and on SO(3).
     """
 
     dt: float = eqx.field(static=True)
@@ -126,7 +126,7 @@ def runge_kutta(s: State, u: Command, a_ext: Float[Array, "3"], h: float | Float
 
 @runtime_checkable
 class Residual(Protocol):
-    """Predicts the acceleration that a model misses, world frame [m/s^2]. It may be any function of (x, u)."""
+    """Predicts the acceleration that a model misses, in the world frame [m/s^2]. It may be any function of (x, u)."""
 
     def __call__(self, x: State, u: Command, /) -> Float[Array, "3"]:
         """Return the missing acceleration in the state ``x`` while ``u`` acts."""
@@ -134,7 +134,7 @@ class Residual(Protocol):
 
 
 class AbstractWrapper(AbstractDynamics[X]):
-    """A model around another one, with its state; subclasses differ in :meth:`step`."""
+    """A model that wraps another model and has the same state; subclasses differ in :meth:`step`."""
 
     base: eqx.AbstractVar[AbstractDynamics[X]]
 
@@ -166,10 +166,10 @@ class AbstractWrapper(AbstractDynamics[X]):
 
 
 class Hybrid(AbstractWrapper[X]):
-    """A model plus a residual, which is evaluated once and held over the tick (paper, Sec. III-E).
+    """A model plus a residual, which is evaluated once per tick and held over it (paper, Sec. III-E).
 
-    With ``backprop=False`` gradients do not flow through the residual: neither to its weights nor, through its inputs,
-    to state and command. This is the paper's back-propagation "through the analytical model only".
+    With ``backprop=False``, gradients do not flow through the residual, neither to its weights nor to the state and the
+    command at its inputs. This is the paper's back-propagation "through the analytical model only".
     """
 
     base: AbstractDynamics[X]
@@ -183,9 +183,9 @@ class Hybrid(AbstractWrapper[X]):
 
 
 class StraightThrough(AbstractDynamics[X]):
-    """The value of one model with the gradient of another: forward ``forward``, backward ``backward``.
+    """The value of the model ``forward`` with the gradient of the model ``backward``.
 
-    Only (p, R, v) carries a gradient; the hidden state of the forward model does not.
+    Only (p, R, v) carry a gradient; the hidden state of the forward model does not.
     """
 
     forward: AbstractDynamics[X]

@@ -2,7 +2,7 @@
 
 With the effective gravity gamma = g + d, let Q be the smallest rotation that takes -gamma/|gamma| to the vertical, and
 s = |g| / |gamma|. If p, R, v satisfy Eq. (1) of the paper with the thrust c and the disturbance d, then s Q p, Q R,
-s Q v satisfy Eq. (1) with the thrust s c and without disturbance: the equation is equivariant under rotations, and
+s Q v satisfy Eq. (1) with the thrust s c and without disturbance. The equation is equivariant under rotations, and
 under a change of the unit of length with an unchanged unit of time.
 """
 
@@ -21,9 +21,9 @@ class EffectiveGravityFrame(eqx.Module):
     Q: Float[Array, "3 3"]
     """Rotation into the frame."""
     scale: Float[Array, ""]
-    """Length in the frame of a metre of the world."""
+    """Length in the frame of one metre in the world."""
     d: Float[Array, "3"]
-    """Disturbance that is part of the gravity of the frame, world [m/s^2]."""
+    """Disturbance that is part of the frame's gravity, world [m/s^2]."""
 
     @classmethod
     def of(cls, d: Float[Array, "3"]) -> "EffectiveGravityFrame":
@@ -60,11 +60,11 @@ class EffectiveGravityFrame(eqx.Module):
         return State(so3.act(self.Q.T, x.p) / self.scale, back, so3.act(self.Q.T, x.v) / self.scale)
 
     def command(self, u: Command) -> Command:
-        """Transform a command from the world to the frame; body rates are the same."""
+        """Transform a command from the world to the frame; the body rates are unchanged."""
         return Command(self.scale * u.c, u.omega)
 
     def actuators(self, s: ActuatorState) -> ActuatorState:
-        """Transform thrust and body rates from the world to the frame; body rates are the same."""
+        """Transform thrust and body rates from the world to the frame; the body rates are unchanged."""
         return ActuatorState(self.command(s.command), s.slope)
 
     def world_command(self, u: Command) -> Command:

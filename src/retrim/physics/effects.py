@@ -1,4 +1,4 @@
-"""External effects on a vehicle at one instant: push, wind, rotor faults, load."""
+"""External effects on a vehicle at one instant: push, wind, rotor faults and load."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ class ExternalEffects(eqx.Module):
     push: Float[Array, "3"]
     """External acceleration, world [m/s^2]."""
     wind: Float[Array, "3"]
-    """Velocity of the air at the vehicle, world [m/s]; it acts through the aerodynamics."""
+    """Air velocity at the vehicle, world [m/s]; it acts through the aerodynamics."""
     gain: Float[Array, "4"]
-    """Factor of thrust and torque of each rotor."""
+    """Factor on the thrust and torque of each rotor."""
     mass: Float[Array, ""]
     """Mass of a load, in addition to that of the vehicle [kg]."""
     inertia: Float[Array, "3"]
@@ -36,7 +36,7 @@ class ExternalEffects(eqx.Module):
         mass: Float[Array, ""] | None = None,
         inertia: Float[Array, "3"] | None = None,
     ) -> "ExternalEffects":
-        """Return only the given effects."""
+        """Return the given effects; all others are those of an undisturbed vehicle."""
         calm = cls.calm(dtype)
         return cls(
             calm.push if push is None else push.astype(dtype),
@@ -47,7 +47,7 @@ class ExternalEffects(eqx.Module):
         )
 
     def __add__(self, other: "ExternalEffects") -> "ExternalEffects":
-        """Combine two effects: gains are multiplied, all other effects are added."""
+        """Combine two effects: gains are multiplied, and all other effects are added."""
         return ExternalEffects(
             self.push + other.push,
             self.wind + other.wind,

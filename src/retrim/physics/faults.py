@@ -1,4 +1,4 @@
-"""Faults of the vehicle itself: a load, a sagging battery, a weak rotor."""
+"""Faults of the vehicle itself: a load, a sagging battery or a weak rotor."""
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ from .vehicle import payload_inertia
 
 
 class Payload(eqx.Module):
-    """A load that is picked up at one time and dropped at another, unknown to the flight controller."""
+    """A load that is picked up and later dropped; the flight controller does not take it into account."""
 
     mass: Float[Array, ""]
     """Mass of the load [kg]."""
@@ -31,7 +31,7 @@ class Payload(eqx.Module):
 
     @classmethod
     def of(cls, mass: float, *, picked: float = 0.0, dropped: float = float("inf")) -> "Payload":
-        """Return the load of a small cube under the vehicle; see :func:`payload_inertia`."""
+        """Return a small cube under the vehicle as a load; see :func:`payload_inertia`."""
         return cls(jnp.array(mass), payload_inertia(mass), jnp.array(picked), jnp.array(dropped))
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
@@ -41,12 +41,12 @@ class Payload(eqx.Module):
 
 
 class BatterySag(eqx.Module):
-    """Decrease of the thrust with the battery voltage, at a constant rate, down to a floor."""
+    """Thrust that decreases with the battery voltage, at a constant rate, down to a floor."""
 
     rate: Float[Array, ""]
     """Share of the thrust lost per second [1/s]."""
     floor: Float[Array, ""]
-    """Share of the thrust that remains at the end."""
+    """Smallest share of the thrust that remains."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the rate is negative or the floor is not between 0 and 1."""
@@ -62,14 +62,14 @@ class BatterySag(eqx.Module):
 
 
 class WeakRotor(eqx.Module):
-    """Reduced thrust and torque of one rotor at a given speed, as with a chipped propeller."""
+    """Reduced thrust and torque of one rotor at a given speed, e.g. with a chipped propeller."""
 
     gain: Float[Array, "4"]
     """Gains of the rotors: front-right, back-left, back-right, front-left."""
 
     @classmethod
     def of(cls, rotor: int, share: float) -> "WeakRotor":
-        """Return a fault of ``rotor`` (0 to 3), which keeps ``share`` of its thrust."""
+        """Return a fault of the rotor ``rotor`` (0 to 3), which keeps ``share`` of its thrust."""
         if rotor not in range(4) or not 0 < share <= 1:
             raise ValueError(f"WeakRotor: rotor = {rotor} must be 0 to 3, share = {share} in (0, 1]")
         return cls(jnp.ones(4).at[rotor].set(share))

@@ -9,7 +9,7 @@ from .vehicle import Vehicle
 
 
 class CommandedSpeeds(eqx.Module):
-    """Replacement of a rate controller: the rotors have the given speeds, independent of the command."""
+    """Replacement for a rate controller: the rotors turn at the given speeds, whatever the command."""
 
     speeds: Float[Array, "4"]
     """Rotor speeds [rad/s]."""
@@ -19,5 +19,5 @@ class CommandedSpeeds(eqx.Module):
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
-        """Return the speeds, and the unchanged memory of a rate controller."""
+        """Return the given speeds, and the unchanged memory of the rate controller."""
         return self.speeds, s.integral, s.wanted_slow

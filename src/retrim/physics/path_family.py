@@ -1,9 +1,9 @@
 """A family of vehicles: the range of command paths for which one policy is trained, and the belief about a vehicle.
 
-The commands of a policy are thrust per mass and body rates, so that size, mass and inertia of a vehicle affect its
-command path alone: the delay of a command, and the lag of thrust and rates. A path has four coordinates in [-1, 1]:
-delay, logarithm of the rate lag, ringing of the rate loop, logarithm of the thrust lag. The belief about a vehicle is
-an interval of each; see :class:`PathBelief`.
+A policy commands thrust per mass and body rates. The size, mass and inertia of a vehicle therefore affect only its
+command path: the delay of a command, and the lag of thrust and rates. A path has four coordinates in [-1, 1]: the
+delay, the logarithm of the rate lag, the ringing of the rate loop, and the logarithm of the thrust lag. The belief
+about a vehicle is an interval of each coordinate; see :class:`PathBelief`.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ Coordinates = Float[Array, "4"]
 
 
 class PathBelief(eqx.Module):
-    """An interval of each coordinate that contains the vehicle, as observed by a policy of the family."""
+    """Intervals that contain the coordinates of a vehicle, as observed by a policy of the family."""
 
     centre: Coordinates
     half_width: Coordinates
@@ -36,17 +36,17 @@ class PathBelief(eqx.Module):
 
     @classmethod
     def between(cls, low: Coordinates, high: Coordinates) -> "PathBelief":
-        """Return the belief of an interval; the parts outside of the family are cut off.
+        """Return the belief for an interval of each coordinate; parts outside the family are cut off.
 
         Args:
-            low: Lower ends.
-            high: Upper ends.
+            low: Lower ends of the intervals.
+            high: Upper ends of the intervals.
         """
         low, high = jnp.clip(low, -1.0, 1.0), jnp.clip(high, -1.0, 1.0)
         return cls(0.5 * (low + high), 0.5 * (high - low))
 
     def towards(self, other: "PathBelief", step: float | Float[Array, ""]) -> "PathBelief":
-        """Return the belief after a change towards another one, with ends that move by at most ``step``."""
+        """Return the belief after a move towards another belief; each end moves by at most ``step``."""
         ends = [here + jnp.clip(there - here, -step, step) for here, there in zip(self.ends, other.ends, strict=True)]
         return PathBelief.between(*ends)
 
@@ -56,7 +56,7 @@ class PathBelief(eqx.Module):
         return self.centre - self.half_width, self.centre + self.half_width
 
     def vector(self) -> Float[Array, "8"]:
-        """Return centres and half widths as one vector of numbers of order one."""
+        """Return the centres and half widths as one vector, with entries of order one."""
         return jnp.concatenate([self.centre, self.half_width])
 
 
@@ -66,7 +66,7 @@ class Member(eqx.Module):
     path: CommandPath
     belief: PathBelief
     lateness: Float[Array, ""] | None = None
-    """Longest sum of delay and rate lag within the belief [s]; None outside of a flight."""
+    """Longest sum of delay and rate lag within the belief [s]; None outside a flight."""
 
 
 class PathFamily(eqx.Module):
@@ -77,7 +77,7 @@ class PathFamily(eqx.Module):
     rate_lag: Float[Array, "2"]
     """Smallest and largest time constant 2 zeta / omega_n of the body rates [s]."""
     ringing: Float[Array, "2"]
-    """Range of 1 / (1 + 2 zeta^2): 0 is a loop of first order, 1/3 critical damping."""
+    """Range of 1 / (1 + 2 zeta^2): 0 is a first-order loop, 1/3 is critical damping."""
     thrust_lag: Float[Array, "2"]
     """Smallest and largest time constant of the thrust [s]."""
     least_frequency: Float[Array, ""]
@@ -98,7 +98,7 @@ class PathFamily(eqx.Module):
         Args:
             delay: Shortest and longest delay of commands [s].
             rate_lag: Smallest and largest time constant of the body rates [s].
-            least_damping: Smallest damping ratio of the rate loop; the largest is that of a loop of first order.
+            least_damping: Smallest damping ratio of the rate loop; the largest is that of a first-order loop.
             thrust_lag: Smallest and largest time constant of the thrust [s].
             least_frequency: Smallest natural frequency of a drawn rate loop [rad/s].
 
@@ -124,7 +124,7 @@ class PathFamily(eqx.Module):
         ringing: Float[Array, ""],
         thrust_lag: Float[Array, ""],
     ) -> Coordinates:
-        """Return the coordinates of a path, which are outside of [-1, 1] for a vehicle outside of the family."""
+        """Return the coordinates of a path, which are outside [-1, 1] for a vehicle outside the family."""
         low, high = self._ends
         tiny = 1e-6
         values = jnp.stack(
@@ -133,7 +133,7 @@ class PathFamily(eqx.Module):
         return 2.0 * (values - low) / (high - low) - 1.0
 
     def path(self, at: Coordinates) -> CommandPath:
-        """Return the command path at given coordinates, with gains of one."""
+        """Return the command path at the given coordinates, with gains of one."""
         low, high = self._ends
         delay, log_lag, ringing, log_thrust = low + 0.5 * (at + 1.0) * (high - low)
         inverse_damping = jnp.sqrt(2.0 * ringing / (1.0 - ringing))
@@ -146,7 +146,7 @@ class PathFamily(eqx.Module):
         The vehicle is uniformly distributed within its belief, so that a belief is neither too narrow nor too wide.
         Vehicles at the edges of the family and narrow beliefs are more frequent than others, because they are harder to
         fly. Half of the vehicles are known equally well in all coordinates. A rate loop below the smallest natural
-        frequency rings less than in its belief, since otherwise it could not be flown.
+        frequency rings less than its belief implies, since the vehicle could not be flown otherwise.
         """
         k_common, k_width, k_centre, k_inside = random.split(key, 4)
         common, alike = random.uniform(k_common, (2,))

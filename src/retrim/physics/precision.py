@@ -1,4 +1,4 @@
-"""Precision of matrix products on accelerators, which the first import of this package sets; a user's choice stands.
+"""Set the precision of matrix products on accelerators at the first import; a user's choice takes precedence.
 
 By default, GPUs round the factors of products to ten bits, so that flights would differ from those on a CPU.
 """

@@ -1,8 +1,8 @@
-"""A propeller by blade-element momentum theory (NeuroBEM, arXiv 2106.08015; in brackets: numbers of its equations).
+"""A propeller model by blade-element momentum theory (NeuroBEM, arXiv 2106.08015).
 
-The air velocity at the hub is ``v_hor`` in the rotor's plane and ``v_ver`` along its axis, **positive when
-descending**. All speeds are in m/s, rotor speeds in rad/s. Flapping is left out, which has no visible effect below
-3 m/s.
+Numbers in brackets are those of its equations. The air velocity at the hub is ``v_hor`` in the rotor's plane and
+``v_ver`` along its axis, **positive when descending**. All speeds are in m/s, rotor speeds in rad/s. Flapping is left
+out, since it has no visible effect below 3 m/s.
 """
 
 from typing import NamedTuple
@@ -17,10 +17,10 @@ AIR_DENSITY = 1.204  # [kg/m^3], at 20 degrees Celsius
 OMEGA_FLOOR = 10.0  # [rad/s]; below it the model is not valid
 V_HOR_FLOOR = 1e-6  # [m/s]; keeps square roots differentiable at hover
 
-# Gauss-Legendre on [0, 1], six points: abscissae and weights.
+# Gauss-Legendre quadrature on [0, 1] with six points: abscissae and weights.
 _RADII = (0.0337652428984, 0.1693953067669, 0.3806904069584, 0.6193095930416, 0.8306046932331, 0.9662347571016)
 _RADII_W = (0.0856622461896, 0.1803807865241, 0.2339569672863, 0.2339569672863, 0.1803807865241, 0.0856622461896)
-# Eight equally spaced azimuths; the integrands depend on sin(psi) alone, so five are different.
+# Eight equally spaced azimuths; the integrands depend only on sin(psi), so only five differ.
 _SIN_PSI = (-1.0, -0.7071067811865476, 0.0, 0.7071067811865476, 1.0)
 _SIN_PSI_W = (0.125, 0.25, 0.25, 0.25, 0.125)
 
@@ -65,10 +65,10 @@ def five_inch() -> Propeller:
 
 
 def three_inch() -> Propeller:
-    """Return a proposal for the paper's small quadrotor, whose propeller is unpublished.
+    """Return a proposed propeller for the paper's small quadrotor, whose own propeller is unpublished.
 
-    The 5.1 in set, scaled in radius and chord, with cd0 such that hover gives the published c_T = 2.05e-7 N s^2 and
-    kappa = 0.00804 m.
+    It is the 5.1 in propeller, scaled in radius and chord. Its cd0 is chosen so that hover gives the published
+    c_T = 2.05e-7 N s^2 and kappa = 0.00804 m.
     """
     big, radius = five_inch(), jnp.array(0.03903)
     scale = radius / big.radius
@@ -97,7 +97,7 @@ class BladeForces(NamedTuple):
 
 
 class Inflow(eqx.Module):
-    """Induced velocities of one rotor, kept between milliseconds as the start of the next search."""
+    """Induced velocities of one rotor, kept from one millisecond to the next as the start of the search."""
 
     v_i: Float[Array, ""]
     """Induced velocity that solves the momentum balance [m/s]."""
@@ -151,9 +151,9 @@ def solved(
 ) -> Float[Array, ""]:
     """Solve for the largest root v_i of T(v_i) = 2 rho A v_i sqrt(v_hor^2 + (v_ver - v_i)^2) [5], by Newton's method.
 
-    Right of the largest root the balance falls and is concave, so that Newton's steps approach the root monotonically;
-    a start just left of it jumps to the right side first. The gradient is that of the root (one differentiable step
-    from it: the implicit function theorem); gradients do not flow through ``start``.
+    Above the largest root, the balance is decreasing and concave, so that Newton's steps approach the root
+    monotonically. A start just below the root jumps above it first. The gradient is that of the root: by the implicit
+    function theorem, one differentiable step from the root suffices. Gradients do not flow through ``start``.
     """
     disk = 2.0 * AIR_DENSITY * prop.area
 
@@ -168,7 +168,7 @@ def solved(
         return jnp.clip(v - (thrust - disk * v * speed) / lax.stop_gradient(slope), -20.0, 60.0)
 
     v = start
-    if steps > 2:  # a loop of many steps compiles in the time of one step
+    if steps > 2:  # a loop of many steps compiles as fast as one step
         v = lax.fori_loop(0, steps - 2, lambda _, v: step(v), v)
     for _ in range(min(steps, 2)):
         v = step(v)
@@ -176,7 +176,7 @@ def solved(
 
 
 def vortex_ring(inflow: Inflow, v_ver: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the induced velocity [m/s]: by the momentum balance, or in slow descent by the empirical rule [18, 19]."""
+    """Return the induced velocity [m/s] by the momentum balance, or by the empirical rule [18, 19] in slow descent."""
     v_i, v_h = inflow.v_i, inflow.v_h
     x = v_ver / v_h
     ring = v_h * (1.0 + x * (1.125 + x * (-1.372 + x * (1.718 - 0.655 * x))))
@@ -195,8 +195,8 @@ def rotor(
 ) -> tuple[BladeForces, Inflow]:
     """Return the forces of one rotor and its inflow, after ``steps`` of Newton's method for each root.
 
-    From the inflow of a millisecond before, two steps are exact to float32 in any usual manoeuvre; from
-    :meth:`Inflow.above`, use 16.
+    From the inflow one millisecond earlier, two steps are exact to float32 in any usual manoeuvre. From
+    :meth:`Inflow.above`, use 16 steps.
     """
     omega, v_hor = jnp.maximum(omega, OMEGA_FLOOR), jnp.maximum(v_hor, V_HOR_FLOOR)
     result = Inflow(

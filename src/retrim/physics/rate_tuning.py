@@ -1,4 +1,4 @@
-"""Gains of a simulated rate loop: those of the platform if they suit the vehicle, otherwise gains from its constants.
+"""Gains of a simulated rate loop: the platform's gains if they suit the vehicle, otherwise gains from its constants.
 
 About an axis, motors with the time constant tau turn the body: tau w'' + w' = A (u + lead u'). The loop u = P e +
 I int(e) - D w' has the polynomial tau s^3 + (1 + b + a lead) s^2 + (a + i lead) s + i, with a, i, b = A P, A I, A D.
@@ -13,9 +13,9 @@ from .state import STANDARD_GRAVITY
 from .vehicle import Vehicle
 
 LEAST_DAMPING, LEAST_MARGIN = 0.41, 2.7
-"""Smallest damping and margin with the platform's gains; a loop that just has both overshoots by 40 %."""
+"""Smallest damping and margin with the platform's gains; a loop that just reaches both overshoots by 40 %."""
 DAMPING, MARGIN, LEAST_D = 0.8, 20.0, 2.0
-"""Damping, margin and smallest D term of gains from the constants of the vehicle; they overshoot by a tenth."""
+"""Damping, margin and smallest D term of gains from the vehicle's constants; such a loop overshoots by a tenth."""
 
 
 class Gains(NamedTuple):
@@ -35,14 +35,14 @@ class Authority(NamedTuple):
     alpha: Float[Array, "3"]
     """Angular acceleration A per throttle [rad/s^2]."""
     lead: Float[Array, "3"]
-    """Angular acceleration per rate of throttle, over A [s]: the reaction of accelerating rotors, about yaw."""
+    """Angular acceleration per rate of throttle, over A [s]; about yaw, it is the reaction of accelerating rotors."""
 
 
 def authority(vehicle: Vehicle, coefficient: Float[Array, ""]) -> Authority:
     """Return the authority of a hovering vehicle.
 
     Args:
-        vehicle: Constants of the vehicle.
+        vehicle: Vehicle constants.
         coefficient: True T / Omega^2 of one rotor [N s^2].
     """
     hover = jnp.sqrt(vehicle.mass * STANDARD_GRAVITY / (4.0 * coefficient))
@@ -61,8 +61,8 @@ def is_damped(
 
     Args:
         gains: Gains of the loop.
-        lead: Lead as in an :class:`Authority` [s].
-        tau: Time constant of the motors [s].
+        lead: Lead of the :class:`Authority` [s].
+        tau: Motor time constant [s].
         least_margin: Smallest margin, as a multiple of that at the limit of stability; larger for an integral that does
             not pause.
     """
@@ -74,12 +74,14 @@ def is_damped(
 
 
 def tuned(gains: Gains, tau: Float[Array, ""]) -> Gains:
-    """Return gains from the time constant of the motors: damping 0.8, with an integral that does not change it.
+    """Return gains from the motor time constant.
+
+    The damping is 0.8, and the integral does not change it.
 
     Args:
-        gains: Gains of the platform; the D term is not smaller than theirs, and the ratio of integral and error gain
-            not larger.
-        tau: Time constant of the motors [s].
+        gains: Gains of the platform. The D term is not smaller than theirs, and the ratio of integral gain to error
+            gain is not larger.
+        tau: Motor time constant [s].
     """
     b = jnp.maximum(gains.b, LEAST_D)
     a = (1.0 + b) ** 2 / (4.0 * DAMPING**2 * tau)

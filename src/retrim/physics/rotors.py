@@ -1,6 +1,6 @@
-"""A rotor-level model at 1 kHz: rate loop, mixer, motors with lag, thrust-map error, rotor drag, rigid body.
+"""A rotor-level model at 1 kHz: rate loop, mixer, motors with lag, thrust-map error, rotor drag and rigid body.
 
-The first realistic plant, and a high-fidelity model for :class:`StraightThrough`. Rotors are ordered front-right,
+It is the first realistic plant, and a high-fidelity model for :class:`StraightThrough`. Rotors are ordered front-right,
 back-left, back-right, front-left; the first two turn so that their drag torque acts towards -z.
 """
 
@@ -16,7 +16,7 @@ from .vehicle import Vehicle
 
 
 class RateLoop(eqx.Module):
-    """PID on body rates, in units of angular acceleration. All gains are per axis."""
+    """PID controller of the body rates, in units of angular acceleration. All gains are per axis."""
 
     kp: Float[Array, "3"]
     """Gain of the rate error [1/s]."""
@@ -32,7 +32,7 @@ def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
     """Return gains that settle in about 0.1 s on both quadrotors of the paper, or gains tuned for slow motors.
 
     Args:
-        motor_tau: Time constant of the motors [s].
+        motor_tau: Motor time constant [s].
     """
     plain = Gains(jnp.array([25.0, 25.0, 12.5]), jnp.array([37.0, 37.0, 37.0]), jnp.array([0.05, 0.05, 0.0]))
     keep = is_damped(plain, jnp.zeros(3), motor_tau, least_margin=5.0)
@@ -43,9 +43,9 @@ def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
 class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
     """Rotor-level quadrotor under a CTBR command.
 
-    ``thrust_gain`` is the factor of the true thrust that models the error of the thrust map. ``drag`` [1/s] is the
-    linear rotor drag per body axis at hover speed; it is proportional to the rotor speeds (blade-element theory, first
-    order).
+    ``thrust_gain`` is a factor on the true thrust, which models the error of the thrust map. ``drag`` [1/s] is the
+    linear rotor drag per body axis at hover speed; the drag is proportional to the rotor speeds (blade-element theory,
+    first order).
     """
 
     vehicle: Vehicle
@@ -60,10 +60,10 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
 
     @classmethod
     def of(cls, vehicle: Vehicle, dt: float, *, thrust_error: float = 0.035) -> "LinearDragQuadrotor":
-        """Return the model of a vehicle, with rotor drag of 0.3, 0.3, 0.37 1/s.
+        """Return the model of a vehicle, with a rotor drag of 0.3, 0.3 and 0.37 1/s.
 
         Args:
-            vehicle: Constants of the vehicle.
+            vehicle: Vehicle constants.
             dt: Control tick [s], a whole number of milliseconds.
             thrust_error: Relative thrust error; 0.1 means 10 % more thrust than commanded.
         """
@@ -86,15 +86,15 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
 
     @property
     def command_limits(self) -> tuple[Command, Command]:
-        """Smallest and largest command of the vehicle."""
+        """The vehicle's smallest and largest commands."""
         return self.vehicle.command_min, self.vehicle.command_max
 
     def rotor_state(self, s: RotorState) -> RotorState:
-        """Return body rates and rotor speeds."""
+        """Return the body rates and rotor speeds."""
         return s
 
     def substep(self, s: RotorState, u: Command, effects: ExternalEffects) -> RotorState:
-        """Advance one millisecond: rate loop, motors, forces, rigid body."""
+        """Advance one millisecond: rate loop, motors, forces and rigid body."""
         vehicle = self.vehicle
         speeds, integral = self.rate_loop(s, u)
         motors = speeds + (s.motors - speeds) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
@@ -124,7 +124,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
     def wrench(
         self, s: RotorState, motors: Float[Array, "4"], thrusts: Float[Array, "4"], wind: Float[Array, "3"]
     ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Return force [N] and torque [Nm] of all rotors, body frame: the inverse of the mixer, plus rotor drag."""
+        """Return the body-frame force [N] and torque [Nm] of all rotors: the inverse of the mixer, plus rotor drag."""
         vehicle = self.vehicle
         levers = jnp.stack([vehicle.arm[1], vehicle.arm[0], vehicle.torque_ratio])
         torque = levers * (signs(thrusts.dtype) @ thrusts)

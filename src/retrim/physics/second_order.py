@@ -1,4 +1,4 @@
-"""A point mass with a second-order rate loop: the plant for vehicles with a numerically known command path.
+"""A point mass with a second-order rate loop: the plant for vehicles whose command path is given in numbers.
 
 Thrust and body rates follow their commands as in :class:`~retrim.physics.actuator_response.ActuatorResponse`, exactly
 in each millisecond. The model does not have rotors, so that every combination of lag, damping and gain is a possible
@@ -26,7 +26,7 @@ class SecondOrderState(eqx.Module):
 
 
 class SecondOrderQuadrotor(AbstractSubstepDynamics[SecondOrderState]):
-    """Point mass with a rate loop of second order, a thrust lag and linear drag, at 1 kHz."""
+    """Point mass with a second-order rate loop, a thrust lag and linear drag, at 1 kHz."""
 
     response: ActuatorResponse
     mass: Float[Array, ""]
@@ -43,7 +43,7 @@ class SecondOrderQuadrotor(AbstractSubstepDynamics[SecondOrderState]):
 
     @property
     def command_limits(self) -> tuple[Command, Command]:
-        """Smallest and largest command of the vehicle."""
+        """The vehicle's smallest and largest commands."""
         return self.limits
 
     def init(self, x: State) -> SecondOrderState:

@@ -1,7 +1,7 @@
 """Rotations: hat, exponential and logarithm of SO(3), with finite gradients at zero rotation.
 
-A rotation ``R`` maps body to world coordinates. A rotation vector has the direction of the axis and the length of the
-angle [rad].
+A rotation ``R`` maps body to world coordinates. The direction of a rotation vector is the axis; its length
+is the angle [rad].
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def hat(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def vee(W: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Return the inverse of :func:`hat`; for a general matrix, that of its skew-symmetric part."""
+    """Return the inverse of :func:`hat`, applied to the skew-symmetric part of a matrix."""
     return 0.5 * jnp.stack([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
 
 
@@ -35,7 +35,10 @@ def exp(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def mul(A: Float[Array, "3 3"], B: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return ``A @ B`` by sums of products, under ``vmap`` on a CPU several times faster than a batched product."""
+    """Return ``A @ B`` by sums of products.
+
+    Under ``vmap`` on a CPU, this is several times faster than a batched product.
+    """
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
 
 
@@ -45,7 +48,7 @@ def act(A: Float[Array, "3 3"], y: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def log(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Return the rotation vector [rad] of ``R``, with a length below pi; the inverse of :func:`exp`.
+    """Return the rotation vector [rad] of ``R``, with a length below pi: the inverse of :func:`exp`.
 
     The direction is ill-conditioned within about 1e-3 rad of a half turn.
     """

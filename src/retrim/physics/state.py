@@ -16,7 +16,7 @@ STANDARD_GRAVITY = 9.81  # [m/s^2], the paper's u_hover = [9.81, 0, 0, 0]
 
 
 class StateDot(eqx.Module):
-    """Rate of change of a :class:`State`; body rates describe that of the attitude."""
+    """Rate of change of a :class:`State`; the body rates describe the rotation."""
 
     p: Float[Array, "3"]
     """Velocity, world [m/s]."""
@@ -27,7 +27,7 @@ class StateDot(eqx.Module):
 
 
 class State(eqx.Module):
-    """x = (p, R, v): 15 numbers (paper, Sec. III-B)."""
+    """State x = (p, R, v): 15 numbers (paper, Sec. III-B)."""
 
     p: Float[Array, "3"]
     """Position, world [m]."""
@@ -38,7 +38,7 @@ class State(eqx.Module):
 
     @classmethod
     def at(cls, p: Float[Array, "3"]) -> "State":
-        """Return the state at rest and level at the position ``p`` [m]."""
+        """Return the state of a level vehicle at rest at the position ``p`` [m]."""
         return cls(p, jnp.eye(3, dtype=p.dtype), jnp.zeros_like(p))
 
     def vector(self) -> Float[Array, "15"]:
@@ -47,7 +47,7 @@ class State(eqx.Module):
 
 
 class Command(eqx.Module):
-    """u = (c, omega): collective thrust and body rates (CTBR), 4 numbers."""
+    """Command u = (c, omega): collective thrust and body rates (CTBR), 4 numbers."""
 
     c: Float[Array, ""]
     """Mass-normalised collective thrust along body z [m/s^2]; 9.81 for hover."""
@@ -59,8 +59,8 @@ class Command(eqx.Module):
         """Return u_hover = [9.81, 0, 0, 0].
 
         Args:
-            dtype: Type of the arrays; None for JAX's default, with a thrust of weak type. A command that is carried
-                from tick to tick needs the type of its successors, since otherwise the first tick is compiled
+            dtype: Type of the arrays; None for JAX's default, with a weakly typed thrust. A command that is carried
+                from tick to tick needs the same type as its successors. Otherwise, the first tick is compiled
                 separately.
         """
         return cls(jnp.array(STANDARD_GRAVITY, dtype=dtype), jnp.zeros(3, dtype=dtype))
@@ -71,7 +71,7 @@ class Command(eqx.Module):
 
     @classmethod
     def of(cls, vector: Float[Array, "4"]) -> "Command":
-        """Return the command from a vector; the inverse of :meth:`vector`."""
+        """Return the command from a vector, the inverse of :meth:`vector`."""
         return cls(vector[0], vector[1:])
 
     def within(self, low: "Command", high: "Command") -> "Command":

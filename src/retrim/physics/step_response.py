@@ -18,13 +18,13 @@ class StepResponse(NamedTuple):
     """Response to a step of 1 rad/s about one axis."""
 
     overshoot: float
-    """Largest rate beyond the step, as a share of the step."""
+    """Excess of the largest rate over the step, as a share of the step."""
     rise: float
     """Time to 63 % of the step [s]; infinite if it is not reached within 2 s."""
 
 
 def step_responses(vehicle: Vehicle) -> tuple[StepResponse, StepResponse, StepResponse]:
-    """Return the responses about roll, pitch and yaw of the rate loop of a vehicle on the plant ``bem``."""
+    """Return the responses of a vehicle's rate loop about roll, pitch and yaw on the plant ``bem``."""
     tau, throttle, idle = (float(x) for x in (vehicle.motor_tau, _throttle(vehicle), vehicle.esc.idle))
     room, axes = (1.0 - throttle, throttle - idle), [numbers.tolist() for numbers in _loop(vehicle)]
     roll, pitch, yaw = (_response(*(numbers[k] for numbers in axes), tau=tau, room=room) for k in range(3))
@@ -33,7 +33,7 @@ def step_responses(vehicle: Vehicle) -> tuple[StepResponse, StepResponse, StepRe
 
 @eqx.filter_jit
 def _loop(vehicle: Vehicle) -> tuple[Array, Array, Array, Array, Array]:
-    """Return P, I and D in throttle, authority and lead, per axis."""
+    """Return P, I and D in units of throttle, the authority, and the lead, per axis."""
     coefficient = vehicle.thrust_coefficient
     power, loop = authority(vehicle, coefficient), Betaflight.suited(vehicle, coefficient, coefficient)
     p, i, d = (gain / power.alpha for gain in loop.gains(power))

@@ -21,15 +21,15 @@ X = TypeVar("X")
 
 
 class AbstractSubstepDynamics(AbstractDynamics[X]):
-    """A model whose control tick is a whole number of millisecond steps, each with the effects of its instant."""
+    """A model whose control tick is a whole number of millisecond steps, each with its own external effects."""
 
     @property
     def command_limits(self) -> tuple[Command, Command] | None:
-        """Smallest and largest command that the vehicle accepts; None without limits."""
+        """Smallest and largest command that the vehicle accepts; None if there are no limits."""
         return None
 
     def rotor_state(self, s: X) -> "RotorState | None":
-        """Return body rates and rotor speeds; None if the model does not have them."""
+        """Return the body rates and rotor speeds; None if the model does not have them."""
         return None
 
     def body_rates(self, s: X) -> Float[Array, "3"] | None:
@@ -86,7 +86,10 @@ def rigid_body(
     push: Float[Array, "3"],
     wanted_slow: Float[Array, "3"] | None = None,
 ) -> RotorState:
-    """Advance one semi-implicit millisecond under ``force`` [N] and ``torque`` [Nm], body frame; attitude on SO(3)."""
+    """Advance one semi-implicit millisecond under ``force`` [N] and ``torque`` [Nm] in the body frame.
+
+    The attitude stays on SO(3).
+    """
     h = SUBSTEP
     omega_dot = (torque - jnp.cross(s.omega, inertia * s.omega)) / inertia
     omega = s.omega + h * omega_dot

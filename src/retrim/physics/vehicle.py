@@ -1,4 +1,4 @@
-"""Vehicles: the constants of quadrotors, each with its source.
+"""Constants of quadrotors, each with its source.
 
 The quadrotors are functions rather than constants, since creating an array at import would start a JAX backend.
 """
@@ -16,13 +16,13 @@ from .state import STANDARD_GRAVITY, Command
 
 
 class Esc(eqx.Module):
-    """Map of the speed controllers from throttle to rotor speed: Omega = base + linear d + root sqrt(d).
+    """The speed controllers' map from throttle to rotor speed: Omega = base + linear d + root sqrt(d).
 
     The firmware sends d = throttle (2048 - d_min) + d_min.
     """
 
     base: Float[Array, ""]
-    """Coefficient ``base`` at the nominal voltage of the battery [rad/s]."""
+    """Coefficient ``base`` at the battery's nominal voltage [rad/s]."""
     linear: Float[Array, ""]
     """Coefficient ``linear`` [rad/s]."""
     root: Float[Array, ""]
@@ -37,19 +37,19 @@ class Esc(eqx.Module):
         return self.base + self.linear * d + self.root * jnp.sqrt(d)
 
     def throttle(self, speed: Float[Array, "*rotors"]) -> Float[Array, "*rotors"]:
-        """Return the throttle for a rotor speed; the inverse of :meth:`speed`."""
+        """Return the throttle for a rotor speed, the inverse of :meth:`speed`."""
         rise = jnp.maximum(speed - self.base, 0.0)
         root_d = 2.0 * rise / (self.root + jnp.sqrt(self.root**2 + 4.0 * self.linear * rise))
         return (root_d**2 - self.d_min) / (2048.0 - self.d_min)
 
 
 class Vehicle(eqx.Module):
-    """Constants of a quadrotor in X configuration. Every leaf is an array, so a new mass does not cause compilation."""
+    """Constants of a quadrotor in X configuration. Every leaf is an array, so a new mass needs no recompilation."""
 
     mass: Float[Array, ""]
     """Mass [kg]."""
     inertia: Float[Array, "3"]
-    """Diagonal of the inertia, body frame [kg m^2]."""
+    """Diagonal of the inertia tensor in the body frame [kg m^2]."""
     arm: Float[Array, "2"]
     """Distance of the rotors from the centre along body x and y [m]."""
     thrust_max: Float[Array, ""]
@@ -57,29 +57,29 @@ class Vehicle(eqx.Module):
     omega_max: Float[Array, "3"]
     """Largest body rates that the rate loop accepts [rad/s]."""
     motor_tau: Float[Array, ""]
-    """Time constant of a motor [s]."""
+    """Motor time constant [s]."""
     motor_min: Float[Array, ""]
-    """Idle speed of a rotor [rad/s]."""
+    """Idle rotor speed [rad/s]."""
     motor_max: Float[Array, ""]
-    """Largest speed of a rotor [rad/s]."""
+    """Largest rotor speed [rad/s]."""
     rotor_inertia: Float[Array, ""]
     """Inertia of one motor and propeller about its axis [kg m^2]."""
     thrust_coefficient: Float[Array, ""]
-    """Coefficient c_T in T = c_T Omega^2 of one rotor [N s^2]."""
+    """Coefficient c_T in T = c_T Omega^2 for one rotor [N s^2]."""
     torque_ratio: Float[Array, ""]
-    """Ratio kappa in Q = kappa T of one rotor [m]."""
+    """Ratio kappa in Q = kappa T for one rotor [m]."""
     drag_area: Float[Array, "3"]
     """Drag area c A of the body along its axes [m^2]."""
     propeller: Propeller
     esc: Esc
     rate_lag: Float[Array, "3"] | None = None
-    """Time constants of the body rates behind their commands, if they are known [s]. Training models use them; those of
-    a plant follow from motors and rate loop."""
+    """Time constants with which the body rates follow their commands, if they are known [s]. Training models use them;
+    the time constants of a plant follow from its motors and its rate loop."""
     rate_damping: Float[Array, "3"] | None = None
     """Damping ratios of the rate loops; None for first-order loops."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` with the field if such a vehicle cannot exist; traced values are not checked."""
+        """Raise ``ValueError`` naming the field if such a vehicle cannot exist; traced values are not checked."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
             return
         for field in dataclasses.fields(self):
@@ -97,7 +97,7 @@ class Vehicle(eqx.Module):
 
     @property
     def command_min(self) -> Command:
-        """Smallest command: idling rotors, largest negative body rates."""
+        """Smallest command: idling rotors and the largest negative body rates."""
         idle = 4.0 * self.thrust_coefficient * self.motor_min**2
         return Command(idle / self.mass, -self.omega_max)
 
@@ -115,10 +115,10 @@ class Vehicle(eqx.Module):
 def small() -> Vehicle:
     """Return the paper's small quadrotor.
 
-    Mass, inertia, arm length 0.06 m, thrust and motor time constant: Table IV of the paper (inertia to three digits:
-    the description published with it). Rate limits, c_T, kappa, speeds, rotor inertia and the speed controllers'
-    curve at 17 V: the same description. Propeller: :func:`three_inch`. Drag area: that of the kingfisher, scaled with
-    the square of the arm.
+    Mass, inertia, arm length (0.06 m), thrust and motor time constant are from Table IV of the paper. The description
+    published with the paper gives the inertia to three digits. It also gives the rate limits, c_T, kappa, the speeds,
+    the rotor inertia and the speed controllers' curve at 17 V. The propeller is :func:`three_inch`. The drag area is
+    that of the kingfisher, scaled with the square of the arm.
     """
     return Vehicle(
         mass=jnp.array(0.19),
@@ -145,9 +145,9 @@ def small() -> Vehicle:
 
 
 def kingfisher() -> Vehicle:
-    """Return the Agilicious platform's research quadrotor, with all constants as published with that platform.
+    """Return the research quadrotor of the Agilicious platform, with the constants published with that platform.
 
-    Only kappa is from blade-element theory for these 5.1 in rotors (the description lists 0.022 m).
+    The exception is kappa, which is from blade-element theory for these 5.1 in rotors (the description lists 0.022 m).
     """
     return Vehicle(
         mass=jnp.array(0.752),
@@ -176,8 +176,8 @@ def kingfisher() -> Vehicle:
 def large() -> Vehicle:
     """Return the paper's large quadrotor.
 
-    Mass, inertia, arm length 0.13 m (with the kingfisher's aspect), thrust and motor time constant: Table IV of the
-    paper. All other constants are those of the kingfisher, from which it was built.
+    Mass, inertia, arm length (0.13 m, with the kingfisher's aspect ratio), thrust and motor time constant are from
+    Table IV of the paper. All other constants are those of the kingfisher, from which this quadrotor was built.
     """
     return dataclasses.replace(
         kingfisher(),
@@ -190,18 +190,18 @@ def large() -> Vehicle:
 
 
 def payload_inertia(mass: float, *, side: float = 0.05, below: float = 0.03) -> Float[Array, "3"]:
-    """Return the inertia [kg m^2] that a cube of ``mass`` [kg] and ``side`` [m] adds, centred ``below`` [m].
+    """Return the inertia [kg m^2] added by a cube of ``mass`` [kg] and ``side`` [m], ``below`` [m] under the centre.
 
-    The shift of the centre of mass is left out.
+    The shift of the centre of mass is neglected.
     """
     own = mass * side**2 / 6.0
     return jnp.array([own + mass * below**2, own + mass * below**2, own])
 
 
 def with_payload(vehicle: Vehicle, mass: float) -> Vehicle:
-    """Return a vehicle with a load that its commands include: with 0.07 kg, the paper's small quadrotor has 0.26 kg.
+    """Return a vehicle with a load that its commands take into account.
 
-    The thrust command is normalised by the total mass. For a load that is unknown to the vehicle, see
-    :class:`retrim.physics.Payload`.
+    With a load of 0.07 kg, the paper's small quadrotor has a mass of 0.26 kg. The thrust command is normalised by the
+    total mass. For a load that the commands do not take into account, see :class:`retrim.physics.Payload`.
     """
     return dataclasses.replace(vehicle, mass=vehicle.mass + mass, inertia=vehicle.inertia + payload_inertia(mass))

@@ -1,4 +1,7 @@
-"""Wind: steady, Dryden gusts, the jet of a fan. Wind acts through the relative air velocity at rotors and body."""
+"""Steady wind, Dryden gusts and the jet of a fan.
+
+Wind acts through the relative air velocity at the rotors and the body.
+"""
 
 import math
 
@@ -18,7 +21,7 @@ class SteadyWind(eqx.Module):
     """A wind that is constant in time and space."""
 
     wind: Float[Array, "3"]
-    """Velocity of the wind, world [m/s]."""
+    """Wind velocity, world [m/s]."""
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Return the wind."""
@@ -28,7 +31,7 @@ class SteadyWind(eqx.Module):
 class Turbulence(eqx.Module):
     """Gusts with Dryden's spectra as a sum of sinusoids of equal energy (spectral representation).
 
-    The first axis is along the mean wind and has the longitudinal spectrum, the others have the transverse one.
+    The first axis is along the mean wind and has the longitudinal spectrum; the others have the transverse one.
     """
 
     rate: Float[Array, "n 3"]
@@ -67,7 +70,7 @@ class Turbulence(eqx.Module):
 def _eddies(
     speed: Float[Array, ""], length: Float[Array, "3"], key: Key[Array, ""], n: int
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """Return rate [rad/s] and phase of each sinusoid."""
+    """Return the rate [rad/s] and phase of each sinusoid."""
     k_quantile, k_phase = random.split(key)
     share = (jnp.arange(n, dtype=float)[:, None] + random.uniform(k_quantile, (n, 3))) / n
     grid = jnp.tan(jnp.linspace(0.0, 1.0, 2001)[:-1] * jnp.pi / 2)
@@ -79,7 +82,7 @@ def _eddies(
 
 
 def axes_along(direction: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Return a matrix of rows: along ``direction`` (not vertical), across it in the horizontal plane, and up."""
+    """Return a matrix whose rows point along ``direction`` (not vertical), across it horizontally, and up."""
     along = direction / jnp.linalg.norm(direction)
     across = jnp.cross(jnp.array([0.0, 0.0, 1.0], dtype=along.dtype), along)
     across = across / jnp.linalg.norm(across)
@@ -87,17 +90,18 @@ def axes_along(direction: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 class Dryden(eqx.Module):
-    """A mean wind with Dryden gusts, low-altitude model (MIL-F-8785C)."""
+    """A mean wind with Dryden gusts from the low-altitude model (MIL-F-8785C)."""
 
     mean: Float[Array, "3"]
-    """Mean velocity of the wind, world [m/s]."""
+    """Mean wind velocity, world [m/s]."""
     turbulence: Turbulence
 
     @classmethod
     def of(cls, mean: Float[Array, "3"], *, key: Key[Array, ""], altitude: float = 10.0 * FEET) -> "Dryden":
         """Draw the gusts of a horizontal mean wind at an ``altitude`` of at least 3.048 m.
 
-        sigma_w = 0.1 of the wind at 20 ft, here ``mean``; lengths and the other sigmas depend on the altitude in feet.
+        sigma_w is 0.1 of the wind at 20 ft, here ``mean``. The lengths and the other sigmas depend on the altitude in
+        feet.
         """
         speed = float(jnp.linalg.norm(mean))
         if not speed > 0 or float(mean[2]) != 0.0 or altitude < 10.0 * FEET - 1e-9:
@@ -117,10 +121,10 @@ class Dryden(eqx.Module):
 
 
 class Fan(eqx.Module):
-    """A round jet in space with a turbulent part: the force depends on position, attitude and velocity.
+    """A round, turbulent jet; its force depends on the vehicle's position, attitude and velocity.
 
-    Far from the outlet a jet widens in proportion to the distance, and its momentum flux is constant: speed times width
-    is constant. The profile across the jet is a Gaussian.
+    Far from the outlet, a jet widens in proportion to the distance. Its momentum flux is constant, so that speed times
+    width is constant. The profile across the jet is a Gaussian.
     """
 
     outlet: Float[Array, "3"]
@@ -134,7 +138,7 @@ class Fan(eqx.Module):
     turbulence: Turbulence
     """Turbulence relative to the speed of the jet at the vehicle [-]."""
 
-    SPREAD = 0.1  # growth of the width per metre, free round jets
+    SPREAD = 0.1  # growth of the width per metre, for free round jets
 
     @classmethod
     def of(
@@ -147,7 +151,7 @@ class Fan(eqx.Module):
         key: Key[Array, ""],
         intensity: float = 0.15,
     ) -> "Fan":
-        """Draw a jet with gusts of ``intensity`` times its speed and eddies of the width of the outlet."""
+        """Draw a jet with gusts of ``intensity`` times its speed and eddies as wide as the outlet."""
         if not (speed > 0 and width > 0 and 0 <= intensity < 1) or float(jnp.linalg.norm(direction[:2])) == 0.0:
             raise ValueError(
                 f"Fan: speed = {speed}, width = {width}, intensity = {intensity}, direction = {direction} cannot be"

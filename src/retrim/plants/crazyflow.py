@@ -1,4 +1,4 @@
-"""crazyflow's identified Crazyflie as a plant."""
+"""A plant that simulates crazyflow's identified Crazyflie."""
 
 import contextlib
 import functools
@@ -25,20 +25,20 @@ _building = threading.Lock()
 
 @contextlib.contextmanager
 def _its_jax() -> Iterator[None]:
-    """Set JAX's defaults, which crazyflow needs: single precision, free promotion. Settings outside do not change."""
+    """Set JAX's defaults within the context, since crazyflow needs them: single precision and free promotion."""
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
 class CrazyflowPlant(ExternalPlant):
-    """crazyflow's Crazyflie 2.1 Brushless (43 g, lifts 38 g more) by first principles, in single precision.
+    """crazyflow's first-principles Crazyflie 2.1 Brushless (43 g, lifts 38 g more), in single precision.
 
-    The plant uses its stages without its scene, so that there is neither a floor nor a MuJoCo model. crazyflow's rate
-    loop is the firmware's Mellinger controller, which also levels the vehicle. Its attitude gains are zero here, as
-    crazyflow itself recommends for tracking body rates.
+    The plant uses crazyflow's stages without its scene, so there is neither a floor nor a MuJoCo model. crazyflow's
+    rate loop is the firmware's Mellinger controller, which also levels the vehicle. Its attitude gains are zero here,
+    as crazyflow itself recommends for tracking body rates.
 
-    crazyflow does not model wind. Its body drag is linear in the velocity, so that wind is exactly the drag of -wind,
-    applied as a force at each of its steps. Conditions are constant during a tick.
+    crazyflow does not model wind. Since its body drag is linear in the velocity, the effect of wind is exactly the drag
+    at the velocity -wind, which is applied as a force at each step. Conditions are constant during a tick.
     """
 
     def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:
@@ -52,7 +52,7 @@ class CrazyflowPlant(ExternalPlant):
     def _launch(self, x: Pose) -> None:
         q = self._rotation.from_matrix(x.R).as_quat()  # scalar last, as in crazyflow
         with _its_jax():
-            # to its device: a single array that is not bound to a device would cause a second compilation
+            # on its device, since one array that is not bound to a device would cause a second compilation
             p, q, v = jax.device_put([a[None, None].astype(np.float32) for a in (x.p, q, x.v)], _device())
             self._data = self._hovering.replace(states=self._hovering.states.replace(pos=p, quat=q, vel=v))
 
@@ -76,7 +76,7 @@ def _device() -> jax.Device:
 def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffects], Any], np.ndarray]:
     """Return a hovering Crazyflie, the compiled function for ``steps`` steps, and a rotor's thrust limits [N].
 
-    They are the same for all plants.
+    All plants share them.
     """
     sim = import_extra("crazyflow.sim.sim", "crazyflow")
     parts, functional = (

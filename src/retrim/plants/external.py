@@ -1,4 +1,4 @@
-"""Base class of plants that wrap another simulator: tick, command delay, external effects, measurements."""
+"""Base class of plants that wrap an external simulator: ticks, command delay, external effects and measurements."""
 
 import abc
 from typing import NamedTuple
@@ -20,20 +20,20 @@ class Pose(NamedTuple):
     """A :class:`State` in NumPy, double precision."""
 
     p: np.ndarray
-    """World [m]."""
+    """Position, world [m]."""
     R: np.ndarray
-    """Body to world."""
+    """Attitude, body to world."""
     v: np.ndarray
-    """World [m/s]."""
+    """Velocity, world [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
 
 
 class ExternalPlant(Plant, abc.ABC):
-    """A simulator with its own steps and a delay of one tick: the command of a tick acts in the next one.
+    """A simulator with its own steps and a delay of one tick: the command from one tick acts in the next.
 
     A subclass implements :meth:`_launch` and :meth:`_advance`. The disturbance is evaluated at ``instants`` evenly
-    spaced times of each tick, in the state at its beginning. Commands beyond the ``limits`` of [c, omega] are clipped.
+    spaced times of each tick, for the state at its start. Commands beyond the ``limits`` of [c, omega] are clipped.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class ExternalPlant(Plant, abc.ABC):
     def _advance(self, u: np.ndarray, effects: ExternalEffects) -> Pose:
         """Advance one tick under ``u`` = [c [m/s^2], body rates [rad/s]].
 
-        Leaves of ``effects`` are NumPy arrays with the instants on the leading axis. Raises ``PlantError`` before the
-        first step for conditions that the simulator does not support.
+        The leaves of ``effects`` are NumPy arrays with the instants on the leading axis. An implementation raises
+        ``PlantError`` before the first step for effects that the simulator does not support.
         """
 
     def reset(self, x0: State | None) -> Measurement:
-        """Hover at ``x0``; if it is None, 1 m above the ground."""
+        """Start hovering at ``x0``, or 1 m above the ground if it is None."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
         at_rest = jnp.zeros_like(start.p)
         pose = Pose(*(np.asarray(a, dtype=np.float64) for a in (start.p, start.R, start.v, at_rest)))
@@ -92,12 +92,12 @@ class ExternalPlant(Plant, abc.ABC):
         self._disturbance = disturbance
 
     def stop(self) -> None:
-        """Discard the state of the flight."""
+        """Discard the flight state."""
         self._x = None
 
 
 def thrust_limits(least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return limits of [c, omega] for a vehicle with known thrust limits only, mass-normalised [m/s^2]."""
+    """Return limits of [c, omega] from mass-normalised thrust limits [m/s^2]; body rates are unlimited."""
     free = np.full(3, np.inf)
     return np.append(least, -free), np.append(most, free)
 

@@ -1,4 +1,4 @@
-"""Packages that only one plant or method needs. They are imported when it is created, never with ``retrim``."""
+"""Packages that only one plant or method needs, which are imported when it is created and never with ``retrim``."""
 
 import contextlib
 import importlib
@@ -15,12 +15,12 @@ def import_extra(module: str, name: str, *, package: str | None = None, kind: st
     Args:
         module: Name of the module.
         name: Name of the extra.
-        package: Name in the package registry; by default that of the extra.
-        kind: Kind of component that has the name of the extra, for the error message.
+        package: Name in the package registry; by default the name of the extra.
+        kind: Kind of component that is named after the extra, for the error message.
 
     Raises:
-        PlantError: The extra is not installed; the message contains the command that installs it. Or SciPy was imported
-            before SCIPY_ARRAY_API=1 was set, which crazyflow needs.
+        PlantError: The extra is not installed (the message contains the command that installs it), or SciPy was
+            imported before SCIPY_ARRAY_API=1 was set, which crazyflow requires.
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints which accelerators it did not find
@@ -32,12 +32,12 @@ def import_extra(module: str, name: str, *, package: str | None = None, kind: st
 
 
 def check_extra(module: str, name: str, *, package: str | None = None) -> None:
-    """Check that a plant's package is installed, without the time of an import.
+    """Check that a plant's package is installed, without importing it.
 
     Args:
         module: Module of the package.
         name: Name of the extra, which is also the name of the plant.
-        package: Name in the package registry; by default that of the extra.
+        package: Name in the package registry; by default the name of the extra.
 
     Raises:
         PlantError: The package is not installed; the message contains the command that installs it.

@@ -1,7 +1,7 @@
 """Faults of a measurement system: measured states that are wrong, late, repeated or missing.
 
-A fault is a pure function of the last measurements and of the number of the newest one, so that a flight is
-reproducible. Faults are not announced: the age and the validity of a measurement stay as in the sensor model.
+A fault is a pure function of the last few measurements and the number of the newest one, so that a flight is
+reproducible. Faults are not announced: a measurement's age and validity remain as in the sensor model.
 """
 
 import abc
@@ -21,7 +21,7 @@ class AbstractMeasurementFault(eqx.Module):
     """Mapping from correct measurements to the reports of a faulty measurement system."""
 
     interrupts: ClassVar[bool] = False
-    """Whether measurements are missing or have wrong times. Flights with such a fault are simulated one by one."""
+    """Whether measurements are missing or have wrong times; flights with such a fault are simulated one by one."""
 
     @property
     def memory(self) -> int:
@@ -39,18 +39,18 @@ class AbstractMeasurementFault(eqx.Module):
         """
 
     def is_missing(self, tick: int) -> bool:
-        """Return whether the measurement of a tick is missing."""
+        """Return whether the measurement at a tick is missing."""
         del tick
         return False
 
     def clock_error(self, tick: int) -> float:
-        """Return the error of the time of a measurement [s]."""
+        """Return the error of a measurement's time [s]."""
         del tick
         return 0.0
 
 
 class VelocitySpikes(AbstractMeasurementFault):
-    """Periodically one velocity is wrong, as after a swap of two markers of a motion-capture system."""
+    """One velocity is periodically wrong, as when a motion-capture system swaps two markers."""
 
     v: Float[Array, "3"]
     """Error, world [m/s]."""
@@ -64,7 +64,7 @@ class VelocitySpikes(AbstractMeasurementFault):
 
 
 class SwappedMarkers(AbstractMeasurementFault):
-    """Periodically one pose is that of a rigid body with confused markers: rotated and shifted."""
+    """One pose is periodically rotated and shifted, as for a rigid body with confused markers."""
 
     p: Float[Array, "3"]
     """Shift, world [m]."""
@@ -110,7 +110,7 @@ class Frozen(AbstractMeasurementFault):
         return self.duration
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Return the state of the tick before the stop, or the newest one outside of a stop."""
+        """Return the state at the tick before the stop, or the newest state outside a stop."""
         since = tick % self.every
         frozen = (tick >= self.every) & (since < self.duration)
         row = self.duration - jnp.where(frozen, since + 1, 0)
@@ -161,7 +161,7 @@ class Biased(AbstractMeasurementFault):
 
 
 class DriftingPosition(AbstractMeasurementFault):
-    """The position drifts back and forth, as the estimate of a camera does; the velocity does not contain the drift."""
+    """The position drifts back and forth, as a camera-based estimate does; the velocity does not contain the drift."""
 
     amplitude: Float[Array, "3"]
     """Amplitude, world [m]."""
@@ -194,7 +194,7 @@ class Gaps(AbstractMeasurementFault):
 
 
 class JumpingClock(AbstractMeasurementFault):
-    """The clock of the measurements jumps ahead, and later back again."""
+    """The measurement clock jumps ahead, and later back again."""
 
     every: int = eqx.field(static=True)
     """Time between two jumps [ticks]."""
@@ -207,7 +207,7 @@ class JumpingClock(AbstractMeasurementFault):
         return _newest(past)
 
     def clock_error(self, tick: int) -> float:
-        """Return the jump in every other interval."""
+        """Return the jump in every other interval, and 0 otherwise."""
         return self.jump if tick // self.every % 2 else 0.0
 
 

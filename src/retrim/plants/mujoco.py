@@ -1,4 +1,4 @@
-"""A quadrotor in MuJoCo's medium as a plant."""
+"""A plant that simulates a quadrotor in MuJoCo's medium."""
 
 import math
 from typing import Any
@@ -38,24 +38,24 @@ MODEL = """
   </actuator>
 </mujoco>
 """
-"""MuJoCo model in SI units. Density and viscosity are those of air. The thrust has the time constant of the motors."""
+"""MuJoCo model in SI units. Density and viscosity are those of air. The thrust has the motors' time constant."""
 
 
 def semi_axes(drag_area: np.ndarray) -> np.ndarray:
-    """Return the semi-axes [m] of the ellipsoid with ``drag_area`` [m^2] as its silhouette along each axis.
+    """Return the semi-axes [m] of the ellipsoid whose silhouette along each axis is ``drag_area`` [m^2].
 
-    Silhouettes are pi b c, pi a c and pi a b. MuJoCo's drag is density k A v^2; with k = 0.5, A is our c A.
+    The silhouettes are pi b c, pi a c and pi a b. MuJoCo's drag is density k A v^2; with k = 0.5, A is our c A.
     """
     return math.sqrt(np.prod(drag_area) / math.pi**3) / (drag_area / math.pi)
 
 
 class MujocoPlant(ExternalPlant):
-    """One rigid body in MuJoCo: thrust at its centre, torques by a rate loop, drag of the medium on its body.
+    """One rigid body in MuJoCo, with thrust at its centre, torques from a rate loop, and drag from the medium.
 
-    Steps are 2 ms long. The drag is that of the vehicle's ``drag_area``; rotor drag is not modelled, so that wind moves
-    this plant less than the other plants. The rate loop is proportional: the torque of a weak rotor causes a steady
-    error. The rate loop does not account for loads. Loads and weak rotors are updated once per tick, wind and push at
-    each step. The ground is not modelled.
+    Steps are 2 ms long. The drag follows from the vehicle's ``drag_area``. Rotor drag is not modelled, so wind moves
+    this plant less than the other plants. The rate loop is proportional, so the torque from a weak rotor causes a
+    steady error. The rate loop does not account for loads. Loads and weak rotors are updated once per tick; wind and
+    push are updated at each step. The ground is not modelled.
     """
 
     def __init__(self, vehicle: Vehicle, disturbance: Disturbance, *, dt: float = 0.02) -> None:
@@ -79,7 +79,7 @@ class MujocoPlant(ExternalPlant):
             tau=float(vehicle.motor_tau),
         )
         self._model = self._mujoco.MjModel.from_xml_string(text)
-        self._model.geom_fluid[0, 6:] = 0.0  # no added mass: the ellipsoid represents drag areas, it is not solid
+        self._model.geom_fluid[0, 6:] = 0.0  # no added mass, since the ellipsoid only represents drag areas
         self._data = self._mujoco.MjData(self._model)
         self._load = np.zeros(4)
 
@@ -108,7 +108,7 @@ class MujocoPlant(ExternalPlant):
         return Pose(data.qpos[:3].copy(), R.reshape(3, 3), data.qvel[:3].copy(), data.qvel[3:].copy())
 
     def _carry(self, load: np.ndarray) -> None:
-        """Add ``load`` = [mass [kg], inertia [kg m^2]] to the mass and inertia of the vehicle."""
+        """Add ``load`` = [mass [kg], inertia [kg m^2]] to the vehicle's mass and inertia."""
         if not np.array_equal(load, self._load):
             self._model.body_mass[1] = self._mass + load[0]
             self._model.body_inertia[1] = self._inertia + load[1:]

@@ -15,10 +15,10 @@ P = TypeVar("P")
 
 
 class Measurement(NamedTuple):
-    """Measurement of a plant at the end of a tick."""
+    """Measurement from a plant at the end of a tick."""
 
     t: float
-    """Time by the plant's clock [s]; its origin is arbitrary."""
+    """Time on the plant's clock [s], whose origin is arbitrary."""
     x: State
     """Measured position, attitude and velocity."""
     omega: Float[Array, "3"] | None = None
@@ -32,7 +32,7 @@ class Measurement(NamedTuple):
     age: float = 0.0
     """Time since the state was valid [s]."""
     truth: State | None = None
-    """True state, if it is available in addition to the measured one. For scores, never for pilots."""
+    """True state, if it is available in addition to the measured one; for scores, never for pilots."""
 
     @property
     def p(self) -> Float[Array, "3"]:
@@ -57,13 +57,13 @@ class Measurement(NamedTuple):
 
 @runtime_checkable
 class Plant(Protocol):
-    """Three calls and a context manager, whose exit stops the plant.
+    """Interface of a plant: three calls, and a context manager that stops the plant on exit.
 
-    A plant derives from this class, or has the same methods.
+    A plant derives from this class or implements the same methods.
     """
 
     dt: float
-    """Control tick [s]."""
+    """Length of a control tick [s]."""
 
     def reset(self, x0: State | None) -> Measurement:
         """Start a flight.
@@ -95,7 +95,7 @@ class Plant(Protocol):
         ...
 
     def stop(self) -> None:
-        """Bring the vehicle to a safe state. Idempotent; always called at the end of a flight."""
+        """Bring the vehicle to a safe state; idempotent, and always called at the end of a flight."""
         ...
 
     def __enter__(self: P) -> P:
@@ -135,7 +135,7 @@ def check_command(u: Command, plant: str) -> np.ndarray:
 
 
 def limited(u: Command, wanted: np.ndarray, low: np.ndarray, high: np.ndarray) -> Command:
-    """Return ``u`` clipped to limits of [c, omega], or ``u`` itself if it is within them; ``wanted`` is its array."""
+    """Return ``u`` clipped to limits of [c, omega], or ``u`` itself if within them; ``wanted`` is ``u`` as an array."""
     if (low <= wanted).all() and (wanted <= high).all():
         return u
     accepted = np.clip(wanted, low, high).astype(wanted.dtype)

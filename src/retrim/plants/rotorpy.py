@@ -1,4 +1,4 @@
-"""rotorpy's Hummingbird as a plant."""
+"""A plant that simulates rotorpy's Hummingbird."""
 
 import math
 
@@ -12,14 +12,14 @@ from .external import ExternalPlant, Pose, thrust_limits
 from .extras import import_extra
 
 RATE_GAIN = 20.0  # [1/s]; with rotorpy's own default, 1 1/s, the rates lag by a second
-STEPS = 2  # rotorpy's rate loop runs once per step of its integrator: at 100 Hz, as in its own simulations
+STEPS = 2  # rotorpy's rate loop runs once per integrator step: at 100 Hz, as in its own simulations
 
 
 class RotorpyPlant(ExternalPlant):
-    """rotorpy's AscTec Hummingbird (0.5 kg): its rate loop, motors (5 ms), rotor and body drag, integrator.
+    """rotorpy's AscTec Hummingbird (0.5 kg): its rate loop, motors (5 ms), rotor and body drag, and integrator.
 
-    Wind and push are constant during a tick. The push is an external acceleration; rotorpy does not have an input for
-    it. It is therefore added to the weight, a force in the world frame that rotorpy uses for no other purpose. The
+    Wind and push are constant during a tick. The push is an external acceleration, for which rotorpy does not have an
+    input. It is therefore added to the weight, a force in the world frame that rotorpy uses for no other purpose. The
     ground is not modelled.
     """
 

@@ -1,4 +1,4 @@
-"""Sensor model: samples of the state at a rate, with latency, noise and dropouts; and an inertial unit."""
+"""Sensor model: state samples at a fixed rate with latency, noise and dropouts, and an inertial unit."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ class SensorModel(eqx.Module):
     attitude: Float[Array, ""]
     """Standard deviation of a rotation about each body axis [rad]."""
     dropout: Float[Array, ""]
-    """Probability that a sample is lost; the previous sample is then used again."""
+    """Probability that a sample is lost; the previous sample is then reused."""
     latency: int = eqx.field(static=True)
     """Age of a sample at its arrival [ms]; :attr:`age` is its age at the end of a tick."""
     period: int = eqx.field(static=True, default=10)
@@ -54,7 +54,7 @@ class SensorModel(eqx.Module):
         gyro: float = 0.0,
         accelerometer: float = 0.0,
     ) -> "SensorModel":
-        """Build a sensor model from plain numbers; the default is exact, without latency, every 10 ms.
+        """Build a sensor model from plain numbers; by default, exact samples arrive without latency every 10 ms.
 
         Args:
             position: Standard deviation per axis [m].
@@ -80,7 +80,7 @@ class SensorModel(eqx.Module):
 
     @property
     def held(self) -> int:
-        """Number of samples: those in transit, and the one that has arrived."""
+        """Number of samples in the queue: those in transit, and the one that has arrived."""
         return -(-self.latency // self.period) + 1
 
     @property
@@ -99,7 +99,7 @@ class SensorModel(eqx.Module):
         """Sample true states.
 
         Args:
-            queue: Samples, oldest first, :attr:`held` of them.
+            queue: The :attr:`held` samples, oldest first.
             xs: True states, one per period (leading axis).
             key: Seed of noise and dropouts; consumed.
 

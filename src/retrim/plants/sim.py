@@ -41,7 +41,7 @@ class SimState(eqx.Module):
     queue: CommandQueue
     """Issued commands, including those that have already acted."""
     samples: State
-    """Samples of the state, oldest first: the one that has arrived, and those that the latency still delays."""
+    """Samples of the state, oldest first: the one that has arrived, and those still delayed by the latency."""
     a: Float[Array, "3"]
     """Mean acceleration over the last tick, world [m/s^2]."""
     reports: Reports | None = None
@@ -54,20 +54,20 @@ class Simulation(eqx.Module):
     model: AbstractSubstepDynamics[Any]
     """The vehicle."""
     disturbance: Disturbance
-    """External effects, as a function of time since the start of the flight and state."""
+    """External effects, as a function of the time since the start of the flight and the state."""
     sensors: SensorModel | None
     """Sensor model; None for exact measurements."""
     key: Key[Array, ""]
-    """Seed of noise and dropouts. They depend only on it and the tick, so that a flight is reproducible."""
+    """Seed of noise and dropouts, which depend only on it and the tick, so that a flight is reproducible."""
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.02))
-    """Transport delay of commands [s]. A change does not cause recompilation."""
+    """Transport delay of commands [s]; a change does not cause recompilation."""
     fault: AbstractMeasurementFault | None = None
     """Fault of the measurements."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
-    """Capacity of the command queue as a delay [s]."""
+    """Longest delay that the command queue can hold [s]."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` for an impossible delay, and if a tick is not a whole number of samples."""
+        """Raise ``ValueError`` if the delay is impossible or a tick is not a whole number of samples."""
         check_delay(self.delay, self.longest_delay, "Simulation")
         if self.sensors is not None and round(self.model.dt / SUBSTEP) % self.sensors.period:
             raise ValueError(
@@ -96,9 +96,10 @@ class Simulation(eqx.Module):
         return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p), reports)
 
     def advance(self, s: SimState, u: Command, tick: Int[ArrayLike, ""]) -> SimState:
-        """Return the state one control tick later, in steps of 1 ms; ``u`` acts :attr:`delay` after the tick began.
+        """Return the state one control tick later, computed in steps of 1 ms.
 
-        In the millisecond in which the acting command changes, the mean of the two acts.
+        ``u`` acts :attr:`delay` after the start of the tick. In the millisecond in which the acting command changes,
+        the mean of the two commands acts.
 
         Args:
             s: State at the start of the tick.
@@ -131,17 +132,20 @@ class Simulation(eqx.Module):
         return Reports(past, self.fault(past, tick, key))
 
     def time(self, tick: Int[ArrayLike, ""], dtype: Any) -> Float[Array, ""]:
-        """Return the time since the start of the flight [s]; it is not a sum, which would drift in single precision."""
+        """Return the time since the start of the flight [s].
+
+        It is not accumulated, since a sum would drift in single precision.
+        """
         return jnp.asarray(tick, dtype) * self.model.dt
 
     def measured(self, s: SimState) -> State:
-        """Return the newest sample that has arrived, as reported by the measurement system."""
+        """Return the newest sample that has arrived, as the measurement system reports it."""
         if s.reports is not None:
             return s.reports.reported
         return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
 
     def inertial(self, s: SimState, tick: Int[ArrayLike, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]] | None:
-        """Return measured body rates [rad/s] and acceleration, world [m/s^2]; None if the model does not have rates.
+        """Return the measured body rates [rad/s] and acceleration, world [m/s^2]; None for a model without rates.
 
         Args:
             s: State at the end of a tick.
@@ -155,11 +159,11 @@ class Simulation(eqx.Module):
         return rates + gyro, s.a + self.sensors.accelerometer * random.normal(k_accelerometer, (3,), s.a.dtype)
 
     def true(self, s: SimState) -> State:
-        """Return the state of the vehicle."""
+        """Return the vehicle's true state."""
         return self.model.state(s.model)
 
     def within_limits(self, u: Command) -> Command:
-        """Return ``u``, clipped to the limits of the vehicle."""
+        """Return ``u`` clipped to the vehicle's limits."""
         return u if self.model.command_limits is None else u.within(*self.model.command_limits)
 
 
@@ -174,7 +178,7 @@ _inertial: Any = eqx.filter_jit(Simulation.inertial)
 
 
 class SimPlant(Plant):
-    """A model at 1 kHz as a :class:`retrim.Plant`."""
+    """A :class:`retrim.Plant` that simulates a model at 1 kHz."""
 
     def __init__(
         self,
@@ -186,15 +190,15 @@ class SimPlant(Plant):
         fault: AbstractMeasurementFault | None = None,
         seed: int = 0,
     ) -> None:
-        """Build a plant.
+        """Build a simulated plant.
 
         Args:
             model: The vehicle.
-            disturbance: External effects as a function of time since the reset and state.
+            disturbance: External effects, as a function of the time since the reset and the state.
             delay_s: Transport delay of commands [s].
             sensors: Sensor model; None for exact measurements.
             fault: Fault of the measurements; None for correct measurements.
-            seed: Seed of noise and dropouts of the sensors. They depend only on it and the tick, so that a flight is
+            seed: Seed of sensor noise and dropouts, which depend only on it and the tick, so that a flight is
                 reproducible.
 
         Raises:
@@ -213,7 +217,7 @@ class SimPlant(Plant):
         self._ticks = 0
 
     def reset(self, x0: State | None) -> Measurement:
-        """Hover at ``x0``; if it is None, 1 m above the ground."""
+        """Start hovering at ``x0``, or 1 m above the ground if it is None."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
         self._state = _launch(self.simulation.undisturbed(), start)  # one compilation for all disturbances
         self._ticks = 0
@@ -230,7 +234,7 @@ class SimPlant(Plant):
             self._state = _advance(self.simulation, self._state, accepted, np.int32(self._ticks))
             self._ticks += 1
             if fault is None or not fault.is_missing(self._ticks):
-                break  # in a gap of the measurements the vehicle continues with the last command
+                break  # in a measurement gap, the vehicle continues with the last command
         return self._measurement(), accepted
 
     def disturb(self, disturbance: Disturbance) -> None:
@@ -252,5 +256,5 @@ class SimPlant(Plant):
         return Measurement(t, simulation.measured(state), omega, a, speeds, age=simulation.age, truth=truth)
 
     def stop(self) -> None:
-        """Discard the state of the flight."""
+        """Discard the flight state."""
         self._state = None

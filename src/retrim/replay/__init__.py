@@ -1,4 +1,4 @@
-"""Replay of flight logs: error of the nominal model, prediction of that error, and identification of the vehicle."""
+"""Replay of flight logs: the nominal model's error, its prediction, and the identification of the vehicle."""
 
 from .identification import Identified as Identified
 from .identification import identify as identify

@@ -1,4 +1,4 @@
-"""Re-trains a policy in the model that is corrected by a log."""
+"""Re-trains a policy in a model that a log has corrected."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from ..runkit.reporter import Reporter
 from ..runkit.training import model_error
 from .predictors import refitted
 
-SETTLED = 5  # refused updates in a row after which no further improvement is expected
+SETTLED = 5  # consecutive refused updates after which no further improvement is expected
 ENOUGH = 0.5  # share of a window that must be valid
 
 
@@ -31,12 +31,12 @@ class Adapted(NamedTuple):
 
     state: LearnerState
     admitted: int
-    """Number of updates that the gate admitted."""
+    """Number of updates that the gate has admitted."""
     tried: int
     before: float
-    """Error of the policy before the adaptation, in the corrected model [m]."""
+    """The policy's error before the adaptation, in the corrected model [m]."""
     after: float
-    """Error of the policy after the adaptation, in the corrected model [m]."""
+    """The policy's error after the adaptation, in the corrected model [m]."""
 
 
 def adapt_to(
@@ -44,20 +44,20 @@ def adapt_to(
 ) -> Adapted:
     """Fit the residual to a log, window by window as in flight, and re-train the policy in the corrected model.
 
-    The updates start from states of the task, because the positions of a log are not those of the task. The gate admits
+    The updates start from the task's states, because the positions in a log are not those of the task. The gate admits
     or rejects each update.
 
     Args:
-        rows: Rows of the log, with the tick of the preset.
-        setup: Set-up of the policy.
+        rows: Rows of the log, with the preset's tick.
+        setup: The policy's set-up.
         policy: Policy to re-train.
-        method: Method that learns: ``full``, ``lora``, or another registered one.
+        method: A learning method: ``full``, ``lora``, or another registered one.
         updates: Maximum number of updates.
-        seed: Seed of the learners.
+        seed: Seed for the learners.
         reporter: Receives the progress.
 
     Raises:
-        LogError: No window of the log contains enough of a flight.
+        LogError: No window of the log contains enough flight data.
     """
     k_init, k_delta, k_starts, k_learn = random.split(random.key(seed), 4)
     learner, prepare = setup.learner, find_method(method).learns
@@ -97,7 +97,7 @@ def _fitted(rows: Targets, setup: Setup, state: Any) -> Any:
 
 
 def _starts(setup: Setup, key: Key[Array, ""]) -> Window:
-    """Return start states of the task, which replace the states of the flight."""
+    """Return start states of the task, which replace the states in the flight."""
     n = setup.preset.adapt.window
     starts = jax.vmap(setup.learner.env.task.reset)(random.split(key, n))
     hover = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), Command.hover(starts.x.p.dtype))

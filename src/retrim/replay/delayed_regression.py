@@ -1,4 +1,4 @@
-"""Linear least squares with delayed and lagged commands, for a grid of delays and lags, block by block."""
+"""Linear least squares with delayed and lagged commands, over a grid of delays and lags, block by block."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,7 +8,7 @@ import numpy as np
 DELAYS = np.arange(0.0, 0.1601, 0.005)  # grid of delays [s]
 LAGS = np.concatenate([[0.0], np.geomspace(0.005, 1.0, 33)])  # grid of lags [s]
 EXPLAINED = 0.6  # share that the commands must explain; see Channel.told
-POOLS = (1, 5)  # number of rows whose mean is explained
+POOLS = (1, 5)  # numbers of rows to average
 PIECES = 3.0  # minimum number of blocks that contribute to the explained share
 
 Features = Callable[[float, float], np.ndarray]
@@ -16,14 +16,14 @@ Features = Callable[[float, float], np.ndarray]
 
 
 class Sums(NamedTuple):
-    """Sums of squares of each block, for every pair of delay and lag."""
+    """Sums of squares in each block, for every pair of a delay and a lag."""
 
     xx: np.ndarray
-    """Sums of products of features, (delays, lags, blocks, k, k)."""
+    """Sums of feature products, (delays, lags, blocks, k, k)."""
     xy: np.ndarray
-    """Sums of products of features and outputs, (delays, lags, blocks, k)."""
+    """Sums of feature-output products, (delays, lags, blocks, k)."""
     yy: np.ndarray
-    """Sums of squares of outputs, (blocks,)."""
+    """Sums of squared outputs, (blocks,)."""
     n: np.ndarray
     """Numbers of output values, (blocks,)."""
 
@@ -31,7 +31,7 @@ class Sums(NamedTuple):
     def of(
         cls, features: Features, y: np.ndarray, blocks: np.ndarray, delays: np.ndarray, lags: np.ndarray, pool: int
     ) -> "Sums":
-        """Sum ``y`` (n, outputs) and its features over the rows of each block, in means of ``pool`` rows."""
+        """Sum over each block's rows, after averaging ``y`` (n, outputs) and its features over ``pool`` rows."""
 
         def pooled(rows: np.ndarray) -> np.ndarray:
             parts = rows[blocks.reshape(len(blocks), -1, pool)].mean(axis=2)
@@ -51,7 +51,11 @@ class Sums(NamedTuple):
         return cls(np.reshape(xx, (*shape, k, k)), np.reshape(xy, (*shape, k)), squares, count)
 
     def fit(self, draw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the misfit n log(mean square) and the parameters of each pair; ``draw`` counts the uses of blocks."""
+        """Return the misfit n log(mean square) and the parameters for each pair.
+
+        Args:
+            draw: How often each block is used, (blocks,).
+        """
         xx, xy = np.einsum("dlbij,b->dlij", self.xx, draw), np.einsum("dlbi,b->dli", self.xy, draw)
         size = np.sqrt(np.einsum("dlii->dli", xx) + 1e-12)
         scaled = xx / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(xx.shape[-1])
@@ -61,7 +65,7 @@ class Sums(NamedTuple):
         return count * np.log(left / count), theta
 
     def left(self) -> np.ndarray:
-        """Return the residual sum of squares of each block for the best pair."""
+        """Return the residual sum of squares in each block for the best pair."""
         misfit, theta = self.fit(np.ones(len(self.yy)))
         best = np.unravel_index(np.argmin(misfit), misfit.shape)
         t, xx, xy = theta[best], self.xx[best], self.xy[best]
@@ -69,11 +73,11 @@ class Sums(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """One output of a vehicle and the command that it follows."""
+    """One output of a vehicle, and the command that it follows."""
 
     sums: Sums
     still: Sums
-    """Sums with the command at its mean."""
+    """Sums for a command that is held at its mean."""
 
     @classmethod
     def of(
@@ -83,13 +87,13 @@ class Channel(NamedTuple):
         y: np.ndarray,
         blocks: np.ndarray,
     ) -> "Channel":
-        """Build a channel; if single rows are too noisy, use means of a few rows.
+        """Build a channel; if single rows are too noisy, average a few rows.
 
         Args:
             features: Maps the acting command to the features of each row.
             acting: Maps a delay and a lag to the acting command.
-            y: Explained output, (n, outputs).
-            blocks: Rows of each block, a multiple of ten.
+            y: The output to explain, (n, outputs).
+            blocks: Row indices of each block; their number is a multiple of ten.
         """
         rest, none = acting(0.0, 0.0), np.zeros(1)
         mean = np.broadcast_to(rest[blocks].mean(axis=(0, 1)), rest.shape)
@@ -103,11 +107,11 @@ class Channel(NamedTuple):
         return made
 
     def told(self) -> bool:
-        """Return whether changes of the command explain the changes of the output.
+        """Return whether changes in the command explain the changes in the output.
 
-        If a controller reacts to measurement noise, the noise of the next difference of measurements looks like an
-        immediate response to the command. This explains up to half of that noise. The threshold is therefore above
-        one half.
+        If a controller reacts to measurement noise, the noise in the next difference of measurements looks like an
+        immediate response to the command. This effect explains up to half of that noise. The threshold is therefore
+        above one half.
         """
         before, after = self.still.left(), self.sums.left()
         won = np.clip(before - after, 0.0, None)

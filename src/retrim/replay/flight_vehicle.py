@@ -1,4 +1,4 @@
-"""Writes the vehicle of a flight of retrim as a vehicle file."""
+"""Writes the vehicle of a retrim flight as a vehicle file."""
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +17,17 @@ LEAST = 1.0  # shortest flight [s]
 
 
 def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
-    """Return the vehicle of a flight as TOML, with identified delay, lags and damping; other values are the preset's.
+    """Return a flight's vehicle as TOML, with the identified delay, lags and damping.
+
+    All other values come from the preset.
 
     Args:
         log: The flight.
-        setup: Set-up of the policy of the flight.
+        setup: Set-up of the policy that flew.
         name: Name of the flight, for the comment.
 
     Raises:
-        LogError: The flight is too short, or does not move enough to identify its vehicle.
+        LogError: The flight is too short, or the vehicle moves too little to be identified.
     """
     ticks = len(log.t) - 1
     if ticks * log.dt < LEAST:

@@ -1,9 +1,9 @@
-"""Identifies the vehicle from a log: thrust map, drag, command delay, and the lags of thrust and body rates.
+"""Identifies the vehicle from a log: the thrust map, drag, command delay, and the lags of thrust and body rates.
 
-The mean acceleration over a tick is the difference of velocities, and the mean body rate is the difference of
-attitudes. Both are compared with delayed commands behind a first-order lag, for a grid of delays and lags. For a given
-delay and lag, the other parameters follow from linear least squares. The intervals come from a bootstrap over blocks of
-two seconds, because the errors of successive ticks are correlated.
+The mean acceleration over a tick comes from the difference between velocities, and the mean body rate from the
+difference between attitudes. Both are compared with delayed commands behind a first-order lag, over a grid of delays
+and lags. For a given delay and lag, the other parameters follow from linear least squares. The intervals come from a
+bootstrap over two-second blocks, because the errors of successive ticks are correlated.
 """
 
 from dataclasses import dataclass, replace
@@ -20,10 +20,10 @@ from .delayed_regression import DELAYS, LAGS, Channel, lowest
 from .path_of_log import path_of_log
 from .rows import acting_commands
 
-BLOCK, DRAWS = 2.0, 200  # length of a block [s], and number of samples of the bootstrap
-INSIDE = (5.0, 95.0)  # percentiles of an interval
-WARM = 0.3  # [s] at the beginning of a piece of flight in which a lag depends on commands before the piece
-SLOW = 0.3  # [m/s], root mean square of the velocity along an axis, below which drag is not observable
+BLOCK, DRAWS = 2.0, 200  # length of a block [s], and number of bootstrap samples
+INSIDE = (5.0, 95.0)  # percentiles at the ends of an interval
+WARM = 0.3  # [s], at the beginning of a piece of flight; here a lag depends on commands before the piece
+SLOW = 0.3  # [m/s], root-mean-square velocity along an axis below which drag is not observable
 
 
 class Estimate(NamedTuple):
@@ -41,36 +41,36 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Identified:
-    """Identified parameters of a vehicle; None if the log does not determine a parameter."""
+    """A vehicle's identified parameters; a parameter is None if the log does not determine it."""
 
     delay: Estimate | None
-    """Delay of commands [s]."""
+    """Command delay [s]."""
     thrust_gain: Estimate | None
     """Thrust per commanded thrust [-]."""
     thrust_offset: Estimate | None
     """Upward acceleration without a command [m/s^2]."""
     full_thrust: Estimate | None
-    """Acceleration at full thrust, if commanded thrust is a share of it [m/s^2]."""
+    """Acceleration at full thrust [m/s^2], if the commanded thrust is a share of it."""
     thrust_lag: Estimate | None
-    """Lag of the thrust [s]."""
+    """Thrust lag [s]."""
     rate_lag: Estimate | None
-    """Lag of roll and pitch rate, which share one value [s]."""
+    """Common lag of the roll and pitch rates [s]."""
     rate_gain: Estimate | None
     """Body rate per commanded body rate [-]."""
     yaw_lag: Estimate | None
-    """Lag of the yaw rate [s]."""
+    """Yaw-rate lag [s]."""
     yaw_gain: Estimate | None
     drag: tuple[Estimate | None, Estimate | None, Estimate | None]
     """Linear drag along the body axes [1/s]."""
     unexplained: float
-    """Root mean square of the unexplained acceleration, three axes [m/s^2]."""
+    """Root mean square of the unexplained acceleration over three axes [m/s^2]."""
 
     rate_damping: Estimate | None = None
-    """Damping ratio of roll and pitch rate; None if the rate loop is modelled as first order."""
+    """Damping ratio of the roll and pitch rates; None if the rate loop is modelled as first order."""
 
     @property
     def known(self) -> bool:
-        """Whether the log determines any parameter of the vehicle."""
+        """Whether the log determines at least one parameter of the vehicle."""
         return any(isinstance(value, Estimate) for value in (*vars(self).values(), *self.drag))
 
 
@@ -78,8 +78,8 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
     """Identify a vehicle from a flight.
 
     Args:
-        log: The flight; more movement and rotation determine more parameters.
-        seed: Seed of the bootstrap.
+        log: The flight. More movement and rotation determine more parameters.
+        seed: Seed for the bootstrap.
 
     Raises:
         LogError: The flight is too short.
@@ -116,11 +116,11 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
 
 
 def _with_path(found: Identified, path: PathEstimate) -> Identified:
-    """Return the identified vehicle, with delay and lags of the in-flight estimator where they are excited.
+    """Return the identified vehicle, with the in-flight estimator's delay and lags where they are excited.
 
-    The model of that estimator has a damping and the noise of differences. A vehicle file has a first-order lag.
-    Delay and lag are therefore those of the nearest first-order path. The thrust map and the drag remain those of the
-    regression, because they need the offset and the three drags at once.
+    That estimator models the damping and the noise of differences, but a vehicle file has a first-order lag. The delay
+    and the lag are therefore those of the nearest first-order path. The thrust map and the drag still come from the
+    regression, because they must be estimated together with the offset and all three drag coefficients.
     """
     if not (bool(path.delay.excited) and bool(path.rate_lag.excited)):
         return found
@@ -140,7 +140,7 @@ def _scaled(each: PathParameter, scale: float = 1.0) -> Estimate:
 
 
 def _solved(told: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:
-    """Return the common delay of all channels and each channel's lag and parameters, interpolated on the grid."""
+    """Return the common delay, and each channel's lag and parameters, interpolated on the grid."""
     fits = {name: channel.sums.fit(draw) for name, channel in told.items()}
     late = np.sum([misfit.min(axis=1) for misfit, _ in fits.values()], axis=0) if fits else np.zeros(len(DELAYS))
     d = int(np.argmin(late))
@@ -187,7 +187,7 @@ def _thrust(log: FlightLog, blocks: np.ndarray) -> Channel:
 
 
 def _rates(log: FlightLog, command: np.ndarray, blocks: np.ndarray, axes: list[int]) -> Channel:
-    """Return the channel of some axes: omega = k omega_cmd + bias, over each tick; the axes share lag and gain."""
+    """Return the channel for some axes: omega = k omega_cmd + bias, over each tick; the axes share the lag and gain."""
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     turned = Rotation.from_matrix(np.swapaxes(log.R[:-1], 1, 2) @ log.R[1:]).as_rotvec() / log.dt

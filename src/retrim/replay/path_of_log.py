@@ -10,20 +10,20 @@ from ..io.logs import FlightLog
 from ..physics.state import STANDARD_GRAVITY, Command, State
 
 MEMORY = 1e4  # [s]: the vehicle does not change during a log
-BATCH = 5  # ticks between two estimates: each estimate sets the noise level of the next measurements
+BATCH = 5  # ticks between two estimates; each estimate sets the noise level for the next measurements
 
 
 def path_of_log(log: FlightLog) -> PathEstimate:
     """Return the command path estimated from the attitudes and velocities of a log.
 
-    The body rates of a log are not used, because the attitude filter of the autopilot has often smoothed them.
+    The body rates in a log are not used, because the autopilot's attitude filter has often smoothed them.
 
     Args:
-        log: A flight. Without commanded body rates only the thrust is identified.
+        log: A flight. Without commanded body rates, only the thrust is identified.
     """
     n = BATCH * (len(log.t) // BATCH)
     omega = np.zeros_like(log.v) if log.command is None else log.command
-    # Ticks outside the flight receive a time that does not continue the previous one.
+    # At ticks outside the flight, the time is made discontinuous.
     t = np.where(log.valid, log.t, log.t + 0.5 * log.dt)
     columns = (t, log.p, log.R, log.v, np.nan_to_num(log.c, nan=STANDARD_GRAVITY), np.nan_to_num(omega))
     rows = tuple(jnp.asarray(x[:n].reshape(-1, BATCH, *x.shape[1:]), jnp.float32) for x in columns)

@@ -1,4 +1,4 @@
-"""Measures how well the last seconds of a log predict the next ones."""
+"""Measures how well the last few seconds of a log predict the next few."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from ..errors import LogError
 from ..learn.residuals.targets import Targets
 from .predictors import Predictor
 
-EVERY = 3.0  # [s] between fits, as in the paper
+EVERY = 3.0  # time between fits [s], as in the paper
 ENOUGH = 0.5  # share of a buffer or a horizon that must be valid
 
 
@@ -20,13 +20,13 @@ class PredictionScore:
 
     name: str
     rmse: float
-    """Root of the sum over axes of the mean over windows of the mean squared error [m/s^2]."""
+    """Root of the mean squared error, averaged over windows and summed over axes [m/s^2]."""
     per_axis: tuple[float, float, float]
     """Error along the world axes x, y, z [m/s^2]."""
     per_window: tuple[float, ...]
-    """Root of the sum over axes of the mean squared error of each window [m/s^2]."""
+    """Root of each window's mean squared error, summed over axes [m/s^2]."""
     times: tuple[float, ...]
-    """Time of each prediction since the beginning of the log [s]."""
+    """Time of each prediction, from the beginning of the log [s]."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Protocol:
     """Time between fits [s]."""
 
     def windows(self, valid: np.ndarray, dt: float) -> list[tuple[int, int, int]]:
-        """Return first tick, tick of the fit and last tick of each window that contains enough of a flight.
+        """Return the first tick, fit tick and end tick of each window that contains enough flight data.
 
         Raises:
             LogError: There is no such window.

@@ -1,4 +1,4 @@
-"""Predictors of the residual acceleration of the next seconds: baselines, and residual models by name."""
+"""Predictors of the residual acceleration over the next few seconds: baselines, and residual models by name."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,9 +20,9 @@ from ..physics.vehicle import Vehicle
 
 Predict = Callable[[Targets], np.ndarray]
 Predictor = Callable[[Targets], Predict]
-"""Fits to the rows of the last seconds, in order of time; returns the predictor of further rows [m/s^2]."""
+"""Fits to the rows of the last few seconds, in order of time; returns a predictor for further rows [m/s^2]."""
 RIDGE = 10.0  # penalty, added to the sums of squares
-STEEP = 3.0  # [m/s^2] of thrust that correspond to one unit of the regression input
+STEEP = 3.0  # thrust [m/s^2] that corresponds to one unit of the regression input
 
 
 def zero(rows: Targets) -> Predict:
@@ -39,7 +39,7 @@ def mean_of(rows: Targets, ticks: int | None = None) -> Predict:
 
 
 def ridge(rows: Targets) -> Predict:
-    """Predict by ridge regression on velocity, attitude, thrust and body rates of this window only."""
+    """Predict by ridge regression on the velocity, attitude, thrust and body rates in this window only."""
     valid = np.asarray(rows.valid)
     X, Y = _inputs(rows)[valid], np.asarray(rows.a_res, dtype=float)[valid]
     mean, level = X.mean(axis=0), Y.mean(axis=0)
@@ -62,7 +62,7 @@ class Learnt:
         self._model, self._state = model, model.init(random.key(seed))
 
     def __call__(self, rows: Targets) -> Predict:
-        """Fit to a window."""
+        """Fit to a window, and return its predictor."""
         state = refitted(self._model, self._state, rows)
         if bool(all_finite(eqx.filter(state, eqx.is_inexact_array))):  # in flight, a fit that is not finite is refused
             self._state = state
@@ -72,7 +72,7 @@ class Learnt:
 
 @eqx.filter_jit
 def refitted(model: ResidualModel, state: Any, rows: Targets) -> Any:
-    """Return the state of a residual model after a fit; models of one kind share the compiled program."""
+    """Return a residual model's state after a fit; models of the same kind share the compiled program."""
     return model.fit(state, rows)[0]
 
 
@@ -94,14 +94,14 @@ def yardsticks(dt: float) -> dict[str, Callable[[], Predictor]]:
 
 
 def learnt(name: str, preset: Preset, vehicle: Vehicle, seed: int, **adapt: Any) -> Callable[[], Predictor]:
-    """Return a factory of a residual model of a preset.
+    """Return a factory for one of a preset's residual models.
 
     Args:
         name: Name of the residual model, or module:name.
         preset: Settings of the model.
-        vehicle: Vehicle, whose limits apply.
-        seed: Seed of the initial networks.
-        **adapt: Values that override the preset's table ``adapt``.
+        vehicle: Vehicle whose limits apply.
+        seed: Seed for the initial networks.
+        **adapt: Values that override those in the preset's ``adapt`` table.
 
     Raises:
         ConfigError: There is no model of that name, or a value is invalid.

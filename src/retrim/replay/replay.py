@@ -1,4 +1,4 @@
-"""Implements `retrim replay`: reads a log, predicts, identifies and adapts, and writes files to the folder of a run."""
+"""Implements `retrim replay`: reads a log, predicts, identifies and adapts, and writes files to a run's folder."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -28,11 +28,11 @@ from .report import agreement_section, identified_section, picture, prediction_s
 from .rows import rows_of
 from .vehicle import vehicle_toml
 
-SHOWN = ("regression", "ensemble", "linear")  # residual models that are compared with the baselines
-ENSEMBLE_RATE = 1e-3  # learning rate: with that of hover/paper, an ensemble fits the noise of a real log
+SHOWN = ("regression", "ensemble", "linear")  # residual models to compare with the baselines
+ENSEMBLE_RATE = 1e-3  # learning rate; with that of hover/paper, an ensemble fits the noise in a real log
 DEFAULT = "hover/retrim"
-SAMPLES = (12, 100_000)  # samples that a residual model can be fitted to; the minimum is on top of the command delay
-SLOWEST = 0.1  # [s]: the longest tick of a preset; the tick of a log may differ slightly
+SAMPLES = (12, 100_000)  # limits for the number of samples in a fit; the command delay is added to the minimum
+SLOWEST = 0.1  # [s]: the longest tick of a preset; a log's tick may differ slightly
 LOST = 0.5  # [m]: above this error, the corrected model no longer describes the flight
 SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # limits [s]
 
@@ -42,39 +42,39 @@ class Replay:
     """Options of a replay."""
 
     map: str | None = None
-    """TOML file with name, unit and frame of each field; or a name: px4, px4-1.9, px4-dds,
+    """TOML file with the name, unit and frame of each field; or a name: px4, px4-1.9, px4-dds,
     px4-dds-1.13, mavros, mavros-pose, crazyflie, crazyflie-quaternion, crazyswarm, crazyswarm-quaternion,
-    crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap. Default: the first map of the format whose fields exist."""
+    crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap. Default: the format's first map whose fields exist."""
     buffer: float = 5.0
     """Duration of the data to which residual models are fitted [s]."""
     horizon: float = 5.0
-    """Duration of the following data that residual models predict [s]."""
+    """Duration of the following data, which residual models predict [s]."""
     residual: str | None = None
-    """Residual model of --adapt, or module:name; by default that of the policy. It is compared with regression,
+    """Residual model for --adapt, or module:name; by default the policy's. It is compared with regression,
     ensemble and linear."""
     delay: float = 0.0
-    """Delay of the thrust behind its command [s]; --identify estimates it."""
+    """Delay between a command and its thrust [s]; --identify estimates it."""
     lag: float = 0.0
     """Time constant of the thrust after the delay [s]."""
     identify: bool = False
-    """Identify thrust map, drag, command delay and lags, with intervals, and write a vehicle file."""
+    """Identify the thrust map, drag, command delay and lags, with intervals, and write a vehicle file."""
     vehicle: str | None = None
-    """Vehicle that provides the values that are not identified: small, large, kingfisher, a vehicle file or
-    module:name; by default that of the policy."""
+    """Vehicle for the values that are not identified: small, large, kingfisher, a vehicle file or
+    module:name; by default the policy's."""
     policy: Path | None = None
-    """Policy to adapt, or the folder that holds one."""
+    """Policy to adapt, or the folder that contains one."""
     trust: tuple[str, ...] = ()
     """Python names that the policy may refer to, for example mine:task; they are imported."""
     adapt: str = "none"
-    """Re-train the policy in the model that is corrected by the log: full (all weights), lora (low-rank), another
-    method that learns, or none."""
+    """Re-train the policy in the model that the log has corrected: full (all weights), lora (low-rank), another
+    learning method, or none."""
     updates: int = 60
     """Maximum number of updates."""
     seed: int = 0
-    """Seed of initial networks, of updates and of the bootstrap."""
+    """Seed for the initial networks, the updates and the bootstrap."""
 
     def __post_init__(self) -> None:
-        """Raise ``ConfigError`` if a value is out of range or options contradict each other."""
+        """Raise ``ConfigError`` if a value is out of range, or if options contradict each other."""
         for name, (least, most) in SPANS.items():
             if not least <= getattr(self, name) <= most:
                 raise ConfigError(f"--{name} {getattr(self, name):g}: must be {least:g} to {most:g} s")
@@ -91,13 +91,13 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
 
     Args:
         path: The log.
-        asked: Options.
+        asked: The options.
         run: Run whose folder receives the files.
         reporter: Receives the tables and the progress.
 
     Raises:
         LogError: The log cannot be used.
-        ConfigError: A name does not exist, or does not fit.
+        ConfigError: A name does not exist or does not fit.
     """
     policy, preset = load_policy(asked.policy, trust=asked.trust) if asked.policy else (None, load(DEFAULT))
     if asked.vehicle is not None:

@@ -1,4 +1,4 @@
-"""Builds the report on a log: tables and a picture."""
+"""Builds the report on a log: its tables and a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ WORDS = {
 
 
 def warning_of(log: FlightLog) -> str:
-    """Return the introductory warning for a doubtful log; an empty string for a consistent one."""
+    """Return the introductory warning for a doubtful log, or an empty string for a consistent one."""
     if not log.warnings:
         return ""
     said = "; ".join(log.warnings)
@@ -32,7 +32,7 @@ def warning_of(log: FlightLog) -> str:
 
 
 def agreement_section(log: FlightLog) -> TableSection:
-    """Return the table of agreement between the quantities of a log."""
+    """Return a table of the agreement between a log's quantities."""
     lines = tuple(
         (WORDS[name], f"{round(100 * score)} %", f"{round(100 * DOUBTFUL[name])} %")
         for name, score in log.agreement.items()
@@ -46,7 +46,7 @@ def agreement_section(log: FlightLog) -> TableSection:
 
 
 def residual_section(log: FlightLog, rows: Targets) -> TableSection:
-    """Return the table of the error of the nominal model, axis by axis."""
+    """Return a table of the nominal model's error, axis by axis."""
     missed = np.asarray(rows.a_res)[log.valid]
     slow = np.linalg.norm(log.v[log.valid], axis=1)
     parts = [("mean", missed.mean(axis=0)), ("standard deviation", missed.std(axis=0)),
@@ -61,7 +61,7 @@ def residual_section(log: FlightLog, rows: Targets) -> TableSection:
 
 
 def prediction_section(found: Sequence[PredictionScore], protocol: Protocol) -> TableSection:
-    """Return the table of prediction errors over the next seconds."""
+    """Return a table of the prediction errors over the next few seconds."""
     least = min(each.rmse for each in found)
     none = next((each.rmse for each in found if each.name == "zero"), None)
     lines = []
@@ -80,7 +80,7 @@ def prediction_section(found: Sequence[PredictionScore], protocol: Protocol) -> 
 
 
 def identified_section(found: Identified) -> TableSection:
-    """Return the table of identified parameters of the vehicle."""
+    """Return a table of the vehicle's identified parameters."""
 
     def line(name: str, what: Estimate | None, unit: str, scale: float = 1.0) -> tuple[str, str]:
         return name, "the log does not say" if what is None else what.text(unit, scale)
@@ -107,7 +107,7 @@ def identified_section(found: Identified) -> TableSection:
 def picture(
     log: FlightLog, rows: Targets, found: Sequence[PredictionScore], protocol: Protocol, folder: Path
 ) -> list[Path]:
-    """Draw the residual over time, and the errors of the predictions."""
+    """Draw the residual over time, and the prediction errors."""
     from ..viz.panels import Curve, Panel, panel_figure
     from ..viz.plots import save
 

@@ -1,4 +1,4 @@
-"""Computes the error of the nominal model at each tick of a log."""
+"""Computes the nominal model's error at each tick of a log."""
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,13 @@ from ..physics.state import Command, State
 
 
 def acting_commands(command: np.ndarray, dt: float, delay: float, lag: float) -> np.ndarray:
-    """Return the mean over each tick of a command as it acts: delayed, then behind a first-order lag.
+    """Return the mean of the acting command over each tick: delayed, then behind a first-order lag.
 
     Args:
         command: Command at each tick, (n,) or (n, columns).
         dt: Tick [s].
-        delay: Delay [s], not negative.
-        lag: Time constant [s]; zero for no lag.
+        delay: Delay [s]; it must not be negative.
+        lag: Time constant [s]; zero disables the lag.
     """
     late = int(np.ceil(delay / dt - 1e-6))
     share = max(0.0, late - delay / dt)  # share of a tick in which the newer command already acts
@@ -38,12 +38,12 @@ def acting_commands(command: np.ndarray, dt: float, delay: float, lag: float) ->
 
 
 def rows_of(log: FlightLog, *, delay: float = 0.0, lag: float = 0.0) -> Targets:
-    """Return the rows of a residual fit: a_res = a - (c R e3 - g e3), the acceleration error of the point mass.
+    """Return the rows for a residual fit: a_res = a - (c R e3 - g e3), the acceleration error of the point mass.
 
     Args:
-        log: A flight. Without commanded body rates the measured ones are used.
-        delay: Delay of the thrust behind its command [s].
-        lag: Time constant of the thrust after that [s].
+        log: A flight. Without commanded body rates, the measured ones are used.
+        delay: Delay between a command and its thrust [s].
+        lag: Time constant of the thrust after the delay [s].
 
     Returns:
         One row per tick.

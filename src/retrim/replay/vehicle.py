@@ -9,18 +9,18 @@ from ..config.vehicle_file import VehicleSpec
 from ..config.vehicles import name_of
 from .identification import Estimate, Identified
 
-SHORTEST, LONGEST = 0.002, 0.5  # limits of a lag in a vehicle file [s]
+SHORTEST, LONGEST = 0.002, 0.5  # limits for a lag in a vehicle file [s]
 SUFFIX = "-identified"
 MOST = 0.2  # longest delay in a vehicle file [s]
-DAMPINGS = (0.1, 10.0)  # limits of a damping ratio in a vehicle file
+DAMPINGS = (0.1, 10.0)  # limits for a damping ratio in a vehicle file
 
 
 def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
-    """Return a vehicle file: identified values, and those of the preset's vehicle for all others.
+    """Return a vehicle file with the identified values; all others come from the preset's vehicle.
 
     Args:
-        found: Identified parameters.
-        setup: Set-up of the preset.
+        found: The identified parameters.
+        setup: The preset's set-up.
         log: Name of the log.
     """
     base, spec = setup.vehicle, setup.preset.vehicle
@@ -61,7 +61,7 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
             lines.append(f"rate_damping = {_row([ratio] * 3)}  # identified: {damping.text('')}")
     elif known is not None:
         lines.append(f"rate_lag = {_row(known)}  # [s]")
-        if base.rate_damping is not None:  # an identified lag describes a first-order loop, without a damping
+        if base.rate_damping is not None:  # an identified lag describes a first-order loop, which has no damping
             lines.append(f"rate_damping = {_row(base.rate_damping.tolist())}")
     if (delay := found.delay) is not None:
         said = delay.text("ms", 1000.0)

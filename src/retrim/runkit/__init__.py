@@ -1,6 +1,6 @@
-"""Parts of every run: training, one flight, its record and its scores, result files, provenance, the compile cache.
+"""Parts of every run: training, a flight with its record and scores, result files, provenance, and the compile cache.
 
-Lockstep and live flights and the evaluation share them. This package never prints.
+Lockstep flights, live flights and the evaluation share these parts. This package never prints.
 """
 
 from .compile_cache import enable_compile_cache as enable_compile_cache

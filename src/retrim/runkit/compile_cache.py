@@ -14,7 +14,7 @@ ENOUGH = 30_000  # Linux allows a process 65,530 memory maps; at the limit the p
 def release_programs(above: int = ENOUGH) -> bool:
     """Release compiled programs if the process has more than ``above`` memory maps; they are reloaded when needed.
 
-    Each program holds several maps. A long table compiles thousands of programs, a set for each of its conditions.
+    Each program occupies several maps. A long table compiles thousands of programs, one set for each condition.
 
     Returns:
         Whether the programs were released.
@@ -32,8 +32,8 @@ def release_programs(above: int = ENOUGH) -> bool:
 def enable_compile_cache() -> Path | None:
     """Keep compiled programs in the user's cache folder, unless JAX already has a cache folder.
 
-    Each version of jax has its own folder. ``RETRIM_COMPILE_CACHE=0`` switches the cache off. An error of the cache
-    does not stop a program; it is compiled again.
+    Each version of jax has its own folder. ``RETRIM_COMPILE_CACHE=0`` switches the cache off. A cache error does not
+    stop a program; the program is compiled again.
 
     Returns:
         The folder; None if there is no cache.

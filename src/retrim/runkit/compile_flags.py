@@ -1,4 +1,4 @@
-"""Flags of JAX's compiler for a command; they must be set before JAX starts."""
+"""Flags for JAX's compiler, chosen by command; they must be set before JAX starts."""
 
 import os
 from importlib.metadata import entry_points, version
@@ -6,17 +6,17 @@ from importlib.metadata import entry_points, version
 from .compile_cache import enable_compile_cache
 
 LONG = ("reproduce", "sweep", "gauntlet", "bench")
-"""Commands that compute for minutes or hours. Workers of a cluster, which no command starts, compile like these."""
+"""Commands that compute for minutes or hours. Cluster workers, which no command starts, use the same flags."""
 QUICK = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
 KNOWN = ("0.8.", "0.9.", "0.10.")
-"""Tested releases of jaxlib; later ones abort the process because of the first of these flags."""
+"""Tested releases of jaxlib; in later ones, the first of these flags aborts the process."""
 
 
 def compile_for(command: str) -> None:
-    """Enable the compile cache, and set flags for quick compilation of short commands.
+    """Enable the compile cache; for short commands, also set flags for quick compilation.
 
-    Compilation then takes half the time, and the programs run up to a sixth slower; most commands finish in seconds.
-    Existing ``XLA_FLAGS`` have precedence. The flags are not set if JAX has an accelerator's plugin.
+    With these flags, compilation takes half the time, and the programs run up to a sixth slower. Most commands finish
+    in seconds. Existing ``XLA_FLAGS`` take precedence. The flags are not set if JAX has an accelerator plugin.
 
     Args:
         command: Name of the command.

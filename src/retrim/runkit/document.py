@@ -1,4 +1,4 @@
-"""One renderer for all tables: sections of text cells, written as Markdown and JSON after each section."""
+"""One renderer for all tables: sections of text cells, written as Markdown and JSON whenever a section is added."""
 
 import re
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from .provenance import describe_code, describe_hardware
 from .reporter import Reporter
 from .run import Run
 
-MOST = 2000  # largest number of characters of a text
+MOST = 2000  # largest number of characters in a text
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class TableSection:
     about: str = ""
     """Text above the table."""
     picture: Path | None = None
-    """Picture below the table, in the folder of the document."""
+    """Picture below the table, in the document's folder."""
 
     def markdown(self) -> list[str]:
         """Return the section as lines of Markdown."""
@@ -39,7 +39,7 @@ class TableSection:
 
 
 def as_text(text: str) -> str:
-    """Return a text on one line, escaped so that Markdown finds no links or HTML in untrusted text."""
+    """Return a text on one line, escaped so that untrusted text cannot contain Markdown links or HTML."""
     return _escaped(one_line(text, MOST))
 
 
@@ -48,7 +48,7 @@ def _escaped(text: str) -> str:
 
 
 class Link(str):
-    """A cell that links to a page of the run. It is Markdown, so both parts must be names of this package."""
+    """A cell that links to a page of the run; it is not escaped, so both parts must be names from this package."""
 
     @classmethod
     def to(cls, page: str, name: str) -> "Link":
@@ -64,7 +64,7 @@ def _cell(text: str) -> str:
 
 @dataclass
 class Document:
-    """``<name>.md`` and a JSON file in the folder of a run. Every section is written when it is added."""
+    """``<name>.md`` and a JSON file in a run's folder; each section is written when it is added."""
 
     run: Run
     name: str
@@ -75,20 +75,20 @@ class Document:
     more: dict[str, Any] = field(default_factory=dict)
     """Further values for the JSON file."""
     data: str | None = None
-    """Name of the JSON file; that of the document by default."""
+    """Name of the JSON file; by default the document's name."""
     sections: list[TableSection] = field(default_factory=list)
-    """Sections so far."""
+    """The sections so far."""
     _rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:
-        """Add a section and the rows of results behind it; write both files."""
+        """Add a section and its rows of results; write both files."""
         self.sections.append(section)
         self._rows += rows
         self.reporter.say("\n".join(line for line in section.markdown() if not line.startswith("![")))
         self.write()
 
     def write(self) -> Path:
-        """Write both files; return the path of the Markdown."""
+        """Write both files; return the path of the Markdown file."""
         seeds = ", ".join(map(str, self.seeds))
         remark = [self.run.remark, ""] if self.run.remark else []
         head = [f"# {as_text(self.title)}", "", self.intro, "", *remark]

@@ -15,7 +15,7 @@ from ..runtime.flight import Log
 SETTLED = 0.05  # [m]
 LONGEST_SHIFT = 3.0  # [s], half of the longest lap of the paper
 AS_GOOD, AS_GOOD_M = 0.02, 1e-3  # as a share, and [m]: shifts whose errors differ by less count as equally good
-LEARNER_TAG = 2**30 + 2  # folded into a seed, so that learners share no key with training, starts or disturbances
+LEARNER_TAG = 2**30 + 2  # folded into a seed, so that learners do not share keys with training, starts or disturbances
 
 
 @dataclass(frozen=True)
@@ -25,22 +25,22 @@ class FlightSpec:
     scenario: Scenario
     method: str
     start: int
-    """Number of the start; it also seeds the learners, the gusts and the noise of the flight."""
+    """Number of the start; it also seeds the learners, gusts and noise of the flight."""
     seed: int = 0
-    """Seed of the policy; together with ``start`` it also seeds the learners, the gusts and the noise."""
+    """The policy's seed; together with ``start``, it also seeds the learners, gusts and noise."""
 
     @property
     def group(self) -> tuple[Hashable, str]:
-        """Key of the flights that can share a program: they differ in numbers, start and seed only."""
+        """Key of the flights that can share a program: they differ only in numbers, start and seed."""
         return self.scenario.without_numbers(), self.method
 
     def key(self) -> Key[Array, ""]:
-        """Return the key of the flight's learners."""
+        """Return the random key for the flight's learners."""
         return random.fold_in(random.fold_in(random.key(self.seed), LEARNER_TAG), self.start)
 
     @property
     def plant_seed(self) -> int:
-        """Seed of the plant, which gives every method the same gusts and noise at the same start."""
+        """Seed of the plant, which gives all methods the same gusts and noise at the same start."""
         return 1000 * self.seed + self.start
 
 
@@ -53,21 +53,21 @@ class Flight:
     """Name of the vehicle."""
     log: Log
     error: np.ndarray
-    """Error of the task in each row of the log [m]."""
+    """The task's error in each row of the log [m]."""
     metric: str
     """Name of the error."""
     steady_seconds: float
     """Length of the scored interval at the end of the flight [s]."""
     cross: np.ndarray | None = None
-    """Distance from the nearest point of the reference in each row [m], if the task has one."""
+    """Distance from the nearest point on the reference in each row [m], if the task has a reference."""
     learnt: LearnerState | None = None
     """Learner state at the end of an adapting flight."""
     target: np.ndarray | None = None
-    """Target position of the vehicle in each row, world [m]."""
+    """The vehicle's target position in each row, world [m]."""
 
     @property
     def steady(self) -> float:
-        """Mean error over the last seconds [m]; NaN for a flight that was terminated."""
+        """Mean error over the last few seconds [m]; NaN for a flight that was terminated."""
         return self._last(self.error)
 
     @property
@@ -82,7 +82,7 @@ class Flight:
 
     @property
     def settle_s(self) -> float:
-        """Time after which the error stays below 5 cm [s]; infinite if it does not."""
+        """Time from which the error stays below 5 cm [s]; infinite if it does not."""
         outside = np.flatnonzero(self.error >= SETTLED)
         if self.log.terminated or (len(outside) and outside[-1] == len(self.error) - 1):
             return float("inf")
@@ -92,15 +92,15 @@ class Flight:
     def behind(self) -> tuple[float, float] | None:
         """Lag of the flight behind its reference [s], and its mean error without this lag [m].
 
-        The lag is the constant shift in time, of at most 3 s, with the smallest mean error over the last seconds. If
-        several shifts are equally good, as on a lap, it is the smallest. Both are absent (None) for a terminated flight
-        or a task without reference.
+        The lag is the constant time shift, of at most 3 s, with the smallest mean error over the last few seconds. If
+        several shifts are equally good, for example on a lap, the lag is the smallest of them. The result is None for a
+        terminated flight, or for a task without a reference.
         """
         if self.cross is None or self.target is None or self.log.terminated:
             return None
         rows = np.flatnonzero(self._late_rows())
         most = min(round(LONGEST_SHIFT / self.log.dt), int(rows[0]), len(rows) // 2)
-        rows = rows[rows + most < len(self.target)]  # the same rows for every shift, to make errors comparable
+        rows = rows[rows + most < len(self.target)]  # the same rows for every shift, so that errors are comparable
         shifts, errors = sorted(range(-most, most + 1), key=abs), list[float]()
         for k in shifts:
             errors.append(float(np.linalg.norm(self.log.p[rows] - self.target[rows - k], axis=1).mean()))
@@ -111,7 +111,7 @@ class Flight:
     def effort(self) -> tuple[float, float]:
         """Root mean squares of the commanded body rates and of their change per tick [rad/s].
 
-        They are taken after the first 5 s; NaN for a flight that was terminated.
+        They cover the time after the first 5 s, and are NaN for a flight that was terminated.
         """
         if self.log.terminated:
             return float("nan"), float("nan")
@@ -121,17 +121,17 @@ class Flight:
 
     @property
     def cross_track(self) -> float | None:
-        """Mean cross-track error over the last seconds [m]; None for a task without one."""
+        """Mean cross-track error over the last few seconds [m]; None for a task without one."""
         return None if self.cross is None else self._last(self.cross)
 
     @property
     def swaps(self) -> tuple[float, ...]:
-        """Times at which a new policy took over [s], except during the landing of a live flight, after the log."""
+        """Times at which a new policy took over [s]; those after the log, when a live flight lands, are left out."""
         return tuple(e.t for e in self.log.events if e.kind == "policy" and e.t <= self.log.t[-1])
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Events of the flight, such as those of adaptation."""
+        """Events in the flight, such as adaptation events."""
         return self.log.events
 
     def _after_start(self) -> np.ndarray:
@@ -140,7 +140,7 @@ class Flight:
         return rows
 
     def _late_rows(self) -> np.ndarray:
-        """Return the rows of the last seconds, selected by time, since a tick may be missed."""
+        """Return the rows of the last few seconds; they are selected by time, since a tick may be missed."""
         rows: np.ndarray = self.log.t > self.log.t[-1] - self.steady_seconds + 0.5 * self.log.dt
         return rows
 

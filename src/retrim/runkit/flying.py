@@ -1,4 +1,4 @@
-"""Flies the flights of a fleet, one by one or in batches, each of which is one program."""
+"""Flies the flights of a fleet, one by one, or in batches that run as one program each."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -24,11 +24,11 @@ from ..runtime.together import can_fly_together, fly_together
 from ..tasks.task import AbstractTask
 from .flights import Flight, FlightSpec
 
-FLOOR = -0.5  # [m]: a vehicle below this is terminated; starts may lie at z = 0, and a transient dips below them
+FLOOR = -0.5  # [m]: a flight below this is terminated; starts may lie at z = 0, and a transient dips below them
 
 
 def plant_of(setup: Setup, spec: FlightSpec) -> Plant:
-    """Return the plant of a flight, with the on-board controller of its method, if any.
+    """Return a flight's plant, with the method's on-board controller, if any.
 
     Raises:
         ConfigError: The method cannot fly the plant.
@@ -54,18 +54,18 @@ def fly_one(
     """Fly one flight.
 
     Args:
-        setup: Preset of the policy, on the scenario's reference.
+        setup: Set-up of the policy's preset, with the scenario's reference.
         policy: A policy, or the network of a method that has its own.
         spec: Scenario, method and seeds.
         x0: State at the start.
-        seconds: Length of the flight.
+        seconds: Length of the flight [s].
         latency: How learning is charged to flight time.
-        state: Learner state of an earlier flight, to resume from.
+        state: Learner state from an earlier flight, to resume from.
         observers: Observers of the flight.
         stop: A ``threading.Event`` that aborts the flight.
 
     Raises:
-        PlantError: The plant refused.
+        PlantError: The plant refused to fly.
         FlightStopped: ``stop`` was set.
     """
     preset, task = setup.preset, setup.flight_task
@@ -80,7 +80,7 @@ def fly_one(
 
 
 def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashable:
-    """Return a key that identifies the program of a batch of flights that differ in start and seed only.
+    """Return a key that identifies the program for a batch of flights that differ only in start and seed.
 
     Only the first two flights are checked.
 
@@ -113,15 +113,15 @@ def fly_batch(
     """Fly flights as a batch; see :func:`program_of`.
 
     Args:
-        setup: Preset of the policies, on the scenario's reference.
+        setup: Set-up of the policies' preset, with the scenario's reference.
         policies: Policies or baseline networks, one for each flight.
-        specs: Specifications with the same scenario and method, and different starts and seeds.
+        specs: Specifications with the same scenario and method, but different starts and seeds.
         starts: States at the start, one for each flight.
-        seconds: Length of the flights.
-        state: Learner state of an earlier flight, to resume from.
+        seconds: Length of the flights [s].
+        state: Learner state from an earlier flight, to resume from.
         progress: Called periodically with the completed share.
         stop: A ``threading.Event`` that aborts the flights.
-        cold: Whether this is the first such batch, so that its programs are not compiled yet.
+        cold: Whether this is the first such batch, so that its programs are not yet compiled.
 
     Raises:
         FlightStopped: ``stop`` was set.
@@ -129,7 +129,7 @@ def fly_batch(
     preset = setup.preset
     pilots = [setup.pilot(p, s.method, s.key(), state=state) for p, s in zip(policies, specs, strict=True)]
     plants = [plant_of(setup, spec) for spec in specs]
-    if not can_fly_together(plants, pilots):  # the first two are alike, but another one differs
+    if not can_fly_together(plants, pilots):  # the first two are alike, but a later one differs
         each = zip(policies, specs, starts, strict=True)
         return [fly_one(setup, policy, spec, x0, seconds, state=state, stop=stop) for policy, spec, x0 in each]
     simulated = [plant for plant in plants if isinstance(plant, SimPlant)]
@@ -155,12 +155,12 @@ def until_terminated(task: AbstractTask, log: Log) -> Log:
 
 
 def learnt_by(pilot: Pilot) -> LearnerState | None:
-    """Return the learner state of a pilot; None if it does not learn."""
+    """Return a pilot's learner state; None if the pilot does not learn."""
     return pilot.state if isinstance(pilot, AdaptivePilot) else None
 
 
 def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None = None) -> Flight:
-    """Return a flight with its errors, and the reason if it was terminated."""
+    """Return a flight with its errors and, if it was terminated, the reason."""
     task = setup.flight_task
     error, cross, target = _errors(task, log.t, log.true.as_state())
     if log.terminated:
@@ -180,7 +180,7 @@ def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None
 
 
 def _why(log: Log, error: float) -> str:
-    """Return the reason of a termination in words."""
+    """Return the reason for a termination in words."""
     x, y, z = log.p[-1]
     if not all(np.isfinite(part[-1]).all() for part in log.true):
         return "the state is not finite"

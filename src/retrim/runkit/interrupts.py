@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C, SIGTERM and a closed terminal while they must not raise."""
+"""Handles Ctrl-C, SIGTERM and a closed terminal while they must not raise."""
 
 import contextlib
 import threading

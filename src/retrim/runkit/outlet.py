@@ -1,4 +1,4 @@
-"""Output of a run, with temporary folders in case that its own folder cannot be written."""
+"""Output of a run, with temporary folders in case its own folder cannot be written."""
 
 import contextlib
 import copy
@@ -19,10 +19,10 @@ SHARED_MEMORY = Path("/dev/shm")
 
 
 def spare_folders(folder: Path) -> tuple[Path, ...]:
-    """Return temporary folders as substitutes for a folder, the first choice first. They are not created yet.
+    """Return temporary substitutes for a folder, in order of preference; they are not created yet.
 
     Args:
-        folder: Its name is part of theirs.
+        folder: The folder; its name is part of theirs.
     """
     bases = dict.fromkeys((Path(tempfile.gettempdir()), *([SHARED_MEMORY] if SHARED_MEMORY.is_dir() else [])))
     name = f"kept-{folder.resolve().name[:80]}-{secrets.token_hex(4)}"
@@ -30,19 +30,19 @@ def spare_folders(folder: Path) -> tuple[Path, ...]:
 
 
 class Outlet:
-    """Writes each file into the folder of its run, or into a temporary folder if that fails."""
+    """Writes each file into its run's folder, or into a temporary folder if that fails."""
 
     def __init__(self, folder: Path) -> None:
-        """Create the outlet of the folder of a run."""
+        """Create the outlet for a run's folder."""
         self.folder, self.spare = folder, spare_folders(folder)
         self.faults: list[str] = []
-        """One line for each file that is in another folder, or could not be written."""
+        """One line for each file that is in a different folder or could not be written."""
 
     def write(self, name: str, put: Callable[[Path], T]) -> T | None:
         """Write one output.
 
         Args:
-            name: Name of the output in a fault.
+            name: Name of the output, for messages.
             put: Function that writes the output into a given folder.
 
         Returns:
@@ -66,7 +66,7 @@ class Outlet:
         return None
 
     def write_results(self, run: Run, rows: Sequence[dict[str, Any]], **more: Any) -> Path | None:
-        """Write the results of a run, as :meth:`Run.write_results` does, with all faults so far; return their path."""
+        """Write a run's results like :meth:`Run.write_results`, with all faults so far; return their path."""
 
         def put(folder: Path) -> Path:
             elsewhere = copy.copy(run)
@@ -76,7 +76,7 @@ class Outlet:
         return self.write("results.json", put)
 
     def write_flights(self, flights: Sequence[Flight], preset: Preset) -> None:
-        """Write the learned parameters, events and logs of flights, and remove those of earlier flights."""
+        """Write the learned parameters, events and logs of flights; remove those of earlier flights."""
         with contextlib.suppress(OSError):
             clear_outputs(self.folder)
         self.write("what was learnt", partial(write_learner_state, flights, preset))

@@ -1,4 +1,4 @@
-"""Output files of a run: a trained policy, and the events, logs and learned parameters of flights."""
+"""Output files of a run: a trained policy, and the flights' events, logs and learned parameters."""
 
 import json
 from collections.abc import Sequence
@@ -25,14 +25,14 @@ from .run import Run
 def write_trained(
     run: Run, setup: Setup, policy: AbstractPolicy, losses: Sequence[float], *, seed: int, error_m: float | None = None
 ) -> Path:
-    """Write ``policy.safetensors`` with its ``results.json``; a Ctrl-C takes effect after both.
+    """Write ``policy.safetensors`` and its ``results.json``; Ctrl-C takes effect after both.
 
     Args:
         run: Run whose folder receives the files.
-        setup: Preset of the policy.
-        policy: Trained policy.
-        losses: Loss of each optimiser step.
-        seed: Seed of the training.
+        setup: Set-up of the policy's preset.
+        policy: The trained policy.
+        losses: Loss at each optimiser step.
+        seed: Training seed.
         error_m: Error in the policy's own model [m], once it is known.
 
     Returns:
@@ -52,7 +52,7 @@ def write_trained(
 
 
 def write_flights(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
-    """Write events, logs and learned parameters of flights, and remove those of earlier flights."""
+    """Write the events, logs and learned parameters of flights; remove those of earlier flights."""
     clear_outputs(folder)
     write_events(flights, folder)
     write_logs(flights, folder)
@@ -69,7 +69,7 @@ def clear_outputs(folder: Path) -> None:
 
 
 def write_events(flights: Sequence[Flight], folder: Path) -> None:
-    """Write ``events.jsonl``: the adaptation events and the reason of a termination, flight by flight."""
+    """Write ``events.jsonl``: the adaptation events and the reason for a termination, flight by flight."""
     lines = [
         json.dumps(
             {
@@ -89,7 +89,7 @@ def write_events(flights: Sequence[Flight], folder: Path) -> None:
 
 
 def write_logs(flights: Sequence[Flight], folder: Path) -> None:
-    """Write each flight under ``logs/``, as NPZ, and as MCAP if the MCAP writer is installed."""
+    """Write each flight to ``logs/`` as NPZ, and also as MCAP if the MCAP writer is installed."""
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     for flight in flights:
         spec, recording = flight.spec, recording_of(flight)
@@ -100,10 +100,10 @@ def write_logs(flights: Sequence[Flight], folder: Path) -> None:
 
 
 def recording_of(flight: Flight) -> Recording:
-    """Return the recording of a flight."""
+    """Return a flight's recording."""
     log = flight.log
     measured, true = (np.concatenate([x.p, x.R.reshape(-1, 9), x.v], axis=1) for x in (log.measured, log.true))
-    follows = np.concatenate([log.u[1:], log.u[-1:]])  # a log's row has the command of the tick that it ended
+    follows = np.concatenate([log.u[1:], log.u[-1:]])  # a log's row contains the command of the tick that it ends
     age = np.broadcast_to(log.age, log.t.shape)
     return Recording(
         log.t,
@@ -121,8 +121,8 @@ def recording_of(flight: Flight) -> Recording:
 def write_learner_state(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
     """Write the learner state of the first adapting flight that was not terminated.
 
-    ``learner_state.safetensors`` (to resume from), and ``adapted.safetensors`` (a policy) or ``delta.safetensors``
-    (for a low-rank policy).
+    The files are ``learner_state.safetensors``, to resume from, and ``adapted.safetensors`` (a policy) or
+    ``delta.safetensors`` (for a low-rank policy).
     """
     learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
     if learnt is not None:
@@ -130,7 +130,7 @@ def write_learner_state(flights: Sequence[Flight], preset: Preset, folder: Path)
 
 
 def write_state(learnt: LearnerState, preset: Preset, folder: Path) -> None:
-    """Write a learner state, to resume from, and its policy or low-rank delta."""
+    """Write a learner state to resume from, and its policy or low-rank delta."""
     save_learner_state(folder / "learner_state.safetensors", learnt, preset)
     policy = learnt.policy.policy
     if isinstance(policy, LoraPolicy):

@@ -1,4 +1,4 @@
-"""Provenance of results: commit, versions, hardware and command line."""
+"""Provenance of results: the commit, versions, hardware and command line."""
 
 import contextlib
 import functools
@@ -18,7 +18,7 @@ PACKAGES = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")
 EXTRAS = ("rotorpy", "mujoco", "crazyflow", "foundation-policy")
 """Optional packages that some flights use."""
 UNKNOWN = "unknown"
-"""Substitute for the commit if the package is not in a checkout."""
+"""Placeholder for the commit if the package is not in a checkout."""
 FOLDERS = ("retrim", "retrim_paper")
 """Folders of the distribution."""
 PACKAGE = ("src", "pyproject.toml")
@@ -29,7 +29,7 @@ PACKAGE = ("src", "pyproject.toml")
 def commit() -> str:
     """Return the commit of this package's checkout, with ``-dirty`` if the package has local changes, or ``unknown``.
 
-    Results and notes in the checkout do not count as changes of the package.
+    Results and notes in the checkout do not count as changes to the package.
     """
     here = Path(__file__).resolve().parent
 
@@ -49,7 +49,7 @@ def commit() -> str:
 
 @functools.cache
 def code() -> str:
-    """Return a digest of the files of this distribution; it does not depend on commits or installation."""
+    """Return a digest of this distribution's files; it does not depend on commits or the installation."""
     here, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
     for path in sorted(path for folder in FOLDERS for path in (here / folder).rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
@@ -58,18 +58,18 @@ def code() -> str:
 
 
 def describe_code() -> str:
-    """Return the commit in words; for an installed package, which has no commit, its version and code digest."""
+    """Return the commit in words; for an installed package, which has no commit, return its version and code digest."""
     return f"Commit {commit()}" if commit() != UNKNOWN else f"retrim {version('retrim')}, installed, code {code()}"
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of the numerical packages, and of the installed extras."""
+    """Return the versions of Python, the numerical packages and the installed extras."""
     return dict(_versions())
 
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    """Return the versions, cached: each look-up reads package files, and every flight of a sweep needs them."""
+    """Return the versions, cached: each look-up reads package files, and every flight in a sweep needs them."""
     result = {name: version(name) for name in PACKAGES}
     for name in EXTRAS:
         with contextlib.suppress(PackageNotFoundError):
@@ -81,7 +81,7 @@ def section_key(**what: Any) -> str:
     """Return a key that identifies a section: a digest of its inputs, the code and the versions.
 
     Args:
-        **what: Inputs of the section: numbers, texts, and lists and dictionaries of them.
+        **what: Inputs of the section: numbers, strings, and lists and dictionaries of them.
     """
     text = json.dumps({"code": code(), "versions": versions(), **what}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

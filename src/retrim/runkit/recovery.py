@@ -1,4 +1,4 @@
-"""Times at which a disturbance changes, and the recovery times of a flight."""
+"""Times at which a disturbance changes, and a flight's recovery times."""
 
 from collections.abc import Sequence
 
@@ -11,21 +11,21 @@ from ..physics.disturbance import effects_at
 from ..physics.effects import ExternalEffects
 from ..physics.state import State
 
-STEP = 0.1  # [s], between samples of a disturbance
-AT_ONCE = 0.5  # [s], changes within this time count as one
-FEW = 10  # a disturbance with more changes in a flight counts as changing all the time
+STEP = 0.1  # time between samples of a disturbance [s]
+AT_ONCE = 0.5  # changes within this time count as one [s]
+FEW = 10  # a disturbance with more changes per flight counts as changing all the time
 
 
 def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, ExternalEffects, list[int]]:
-    """Sample the effects of a disturbance at a position.
+    """Sample a disturbance's effects at a position.
 
     Args:
         name: Name of the disturbance.
         home: Position, world [m].
-        seconds: Length of the time line [s].
+        seconds: Length of the timeline [s].
 
     Returns:
-        Times [s], the effects at each (leading axis), and the samples at which they differ from the one before.
+        The times [s], the effects at each of them (leading axis), and the samples that differ from the previous one.
     """
     times = np.linspace(0.0, seconds, max(1, round(seconds / STEP)), endpoint=False)
     result = effects_at(times, State.at(home), disturbance(name))
@@ -35,7 +35,7 @@ def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, Extern
 
 
 def change_times(name: str, home: Array, seconds: float) -> list[float]:
-    """Return the times at which a disturbance changes in flight [s]; empty if it always changes, or never.
+    """Return the times at which a disturbance changes in flight [s]; empty if it changes all the time, or never.
 
     Changes within half a second count as one; a kick is one change, not two.
     """
@@ -52,15 +52,15 @@ def recoveries(
     """Return the recovery time after each change [s]; then the error stays below ``limit`` until the next change.
 
     Args:
-        t: Times of a flight [s].
+        t: Times in a flight [s].
         error: Error at each time [m].
         changes: Times at which the world changed [s].
         limit: Largest error after recovery [m].
-        terminated: Whether the flight was terminated, which counts as no recovery.
+        terminated: Whether the flight was terminated; all recovery times are then infinite.
 
     Returns:
-        One time for each change, infinite if the error is above the limit at the end; without changes, one time from
-        the start of the flight.
+        One time for each change; it is infinite if the error is above the limit just before the next change, or at the
+        end. Without changes, one time from the start of the flight.
     """
     starts = list(changes) or [0.0]
     result = list[float]()

@@ -1,4 +1,4 @@
-"""Interface for progress reports of long work; the library itself never prints."""
+"""Interface for progress reports on long tasks; the library itself never prints."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -10,19 +10,19 @@ Advance = Callable[[float, str], None]
 
 @runtime_checkable
 class Reporter(Protocol):
-    """Receives lines and progress."""
+    """Receives lines of text and progress."""
 
     def say(self, text: str) -> None:
         """Receive one line of plain text."""
         ...
 
     def progress(self, title: str) -> AbstractContextManager[Advance]:
-        """Return a context manager whose value receives the progress of one piece of work."""
+        """Return a context manager whose value receives the progress of one task."""
         ...
 
 
 class Silent:
-    """Reporter without output."""
+    """A reporter without output."""
 
     def say(self, text: str) -> None:
         """Ignore the line."""

@@ -16,14 +16,14 @@ from .stopwatch import Stopwatch
 
 SCHEMA = "retrim.results/2"
 PARTS = "sections"
-"""Folder of the finished parts of a run, which an interruption does not affect."""
+"""Folder for a run's finished parts, which an interruption does not affect."""
 INTERRUPTED = 130  # exit code
 
 
 class Run:
-    """Folder, stopwatch and stop token of one command.
+    """The folder, stopwatch and stop token of one command.
 
-    The first Ctrl-C sets ``stop``, even if the KeyboardInterrupt itself is lost; long computations poll it.
+    The first Ctrl-C sets ``stop``, even if the KeyboardInterrupt itself is lost; long computations poll ``stop``.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class Run:
         """Choose the folder and check that it can be written.
 
         Args:
-            command: Name of the command; if ``out`` is None, the folder is a new one under ``runs/`` with this name.
+            command: Name of the command; if ``out`` is None, a new folder under ``runs/`` has this name and the time.
             out: The folder.
             stop: Set when the run should end early.
-            remark: Remark for its documents on how they were made.
-            trained: Folder of trained networks, which several runs may share; the run's own folder by default.
+            remark: Remark in the documents on how they were made.
+            trained: Folder for trained networks, which several runs may share; by default the run's own folder.
             executor: Executor with other processes for training and flights; by default this process does both.
 
         Raises:
@@ -58,11 +58,11 @@ class Run:
         self.reused = 0
         """Number of parts and groups of flights that were taken from an earlier run."""
         self.stop = stop or threading.Event()
-        commit(), code()  # cached now, since the files may change during a run of hours
+        commit(), code()  # cached now, since the files may change during a run that takes hours
         check_writable(self.folder)
 
     def of_earlier(self) -> str:
-        """Return a line that reports if the run resumes or replaces earlier results; empty if the folder has none."""
+        """Return a line on whether the run resumes or replaces earlier results; empty if the folder has none."""
         if any((self.folder / PARTS).glob("*")):
             return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
         return f"results in {self.folder} are replaced" if any(self.folder.glob("*.json")) else ""
@@ -74,19 +74,19 @@ class Run:
 
     @property
     def exit_code(self) -> int:
-        """Exit code: 0, or 130 after an interruption, or 1 if a part failed."""
+        """Exit code: 0 for success, 130 after an interruption, 1 if a part failed."""
         return INTERRUPTED if self.interrupted else int(self.failed)
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
-        """Let a Ctrl-C end the block early and set ``stop``, instead of raising further."""
+        """Let Ctrl-C end the block early and set ``stop``, without propagating the exception."""
         try:
             yield
         except KeyboardInterrupt:
             self.stop.set()
 
     def write_text(self, name: str, text: str) -> Path:
-        """Write a file of the folder atomically; return its path."""
+        """Write a file in the folder atomically; return its path."""
         path = self.folder / name
         write_whole(path, text)
         return path
@@ -94,7 +94,7 @@ class Run:
     def write_results(
         self, rows: Sequence[dict[str, Any]], *, seeds: Sequence[int], name: str = "results", **more: Any
     ) -> Path:
-        """Write ``<name>.json`` with rows, provenance and times; return its path."""
+        """Write ``<name>.json`` with the rows, provenance and times; return its path."""
         compiling = self.watch.compile_s
         results = {
             "schema": SCHEMA,

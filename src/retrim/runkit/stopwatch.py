@@ -13,11 +13,11 @@ EVENTS = (
 
 
 class Stopwatch:
-    """Measures compile time (tracing, lowering, XLA, reading the compile cache) and run time since its creation."""
+    """Measures compile time (tracing, lowering, XLA and cache reads) and run time since its creation."""
 
     def __init__(self) -> None:
         self._began = time.perf_counter()
-        self._compiling = list[tuple[float, float]]()  # intervals without overlap, in order
+        self._compiling = list[tuple[float, float]]()  # intervals in order, without overlap
         self._lock = threading.Lock()
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
@@ -46,6 +46,6 @@ class Stopwatch:
         return time.perf_counter() - self._began
 
     def sentence(self) -> str:
-        """Return compile and run time in words."""
+        """Return the compile time and the run time in words."""
         compiling = self.compile_s
         return f"Compiling {compiling:.0f} s, all else {self.total_s - compiling:.0f} s."

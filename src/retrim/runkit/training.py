@@ -1,4 +1,4 @@
-"""Pretraining with progress, and the error of a policy in its own model."""
+"""Pretraining with progress reports, and a policy's error in its own model."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -23,11 +23,11 @@ from .reporter import Reporter, Silent
 
 
 class Trained(NamedTuple):
-    """Result of pretraining; after an interruption its last state."""
+    """Result of pretraining; after an interruption, its last state."""
 
     policy: AbstractPolicy
     losses: list[float]
-    """Loss of each optimiser step."""
+    """Loss at each optimiser step."""
 
 
 def train(
@@ -36,10 +36,10 @@ def train(
     """Pretrain a policy.
 
     Args:
-        setup: Setup of the preset to train.
-        seed: Seed of weights and starts.
+        setup: Set-up of the preset to train with.
+        seed: Seed for the weights and starts.
         reporter: Receives the progress.
-        stop: Ends training after the current steps; Ctrl-C does the same, and sets it.
+        stop: Ends training after the current steps when it is set. Ctrl-C sets it, too.
     """
     stop = stop or threading.Event()
     p, vision = setup.preset.pretrain, setup.preset.vision
@@ -73,17 +73,17 @@ def trained_elsewhere(
 
     Args:
         preset: Preset to train with.
-        seeds: Seeds of weights and starts.
+        seeds: Seeds for the weights and starts.
         executor: Executor with other processes, which trains one seed per job.
         reporter: Receives the progress.
-        stop: Aborts the unfinished trainings; Ctrl-C does the same, and sets it.
+        stop: Aborts the unfinished jobs when it is set. Ctrl-C sets it, too.
         on_result: Receives each policy when it is trained.
 
     Returns:
         Policies by seed; all of them, unless ``stop`` was set.
 
     Raises:
-        JobError: A training failed; raised after the others are completed.
+        JobError: A job failed; raised after the others are completed.
     """
     jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
     result, failed, waiting = dict[int, AbstractPolicy](), list[str](), set(jobs)
@@ -110,7 +110,7 @@ def trained_elsewhere(
 
 
 def train_job(preset: str, seed: int) -> AbstractPolicy:
-    """Pretrain a policy of a preset (JSON), in another process."""
+    """Pretrain a policy with a preset (JSON), in another process."""
     return train(Setup.from_preset(parse(preset, source="preset")), seed).policy
 
 
@@ -118,22 +118,22 @@ def nominal_error(setup: Setup, policy: AbstractPolicy, *, n: int = 64, seed: in
     """Return the mean error in the policy's own model [m], over the last half second of 6 s.
 
     Args:
-        setup: Preset of the policy.
+        setup: Set-up of the policy's preset.
         policy: The policy.
-        n: Number of roll-outs, from starts as in training.
-        seed: Seed of the starts.
+        n: Number of roll-outs; their starts are drawn as in training.
+        seed: Seed for the starts.
     """
     return _mean_error(setup, _long(setup).env, policy, n, seed)
 
 
 def model_error(setup: Setup, policy: AbstractPolicy, residual: FittedResidual, *, n: int = 64, seed: int = 1) -> float:
-    """Return the same error in the model with a residual, with the observation that the policy has in flight."""
+    """Return the error of :func:`nominal_error` in a model with a residual, with the policy's in-flight observation."""
     learner = _long(setup).learner
     return _mean_error(setup, learner.view(learner.env, residual), policy, n, seed)
 
 
 def _long(setup: Setup) -> Setup:
-    """Return the setup with roll-outs of 6 s."""
+    """Return the set-up with roll-outs of 6 s."""
     return Setup.from_preset(changed(setup.preset, pretrain={"horizon": round(6.0 / setup.preset.dt)}))
 
 

@@ -15,7 +15,7 @@ from .pilot import ControllerPilot, Pilot
 
 
 class Scheduled(NamedTuple):
-    """A learner and how often it is offered a window."""
+    """A learner, and the interval at which it is offered windows."""
 
     learner: Learner
     every_s: float
@@ -37,12 +37,12 @@ class AdaptivePilot(Pilot):
         """Build a pilot.
 
         Args:
-            controller: Returns the controller for a learner state; each new controller takes over the memory of the
-                last one.
+            controller: Function that returns the controller for a learner state; each new controller takes over the
+                memory of the previous one.
             state: Policy and residual at the start.
             learners: Learners, in the order in which they are offered windows.
             dt: Control tick [s].
-            window: Ticks of flight in the window for the learners.
+            window: Length of the learners' window [ticks].
         """
         self.controller_of = controller
         self.dt: float = dt
@@ -58,7 +58,7 @@ class AdaptivePilot(Pilot):
         self.events: list[Event] = []
 
     def reset(self, measurement: Measurement) -> None:
-        """Start a flight: keep the learner state; clear the buffer and cancel computations under way."""
+        """Start a flight: keep the learner state, clear the buffer and cancel computations in progress."""
         self._buffer.clear()
         self._start, self._ticks_offered = measurement.t, [0] * len(self.learners)
         for learner, _ in self.learners:
@@ -66,7 +66,7 @@ class AdaptivePilot(Pilot):
         self._pilot.reset(measurement)
 
     def warm_up(self, measurement: Measurement) -> None:
-        """Compile the programs of flight and of every learner; the updates from this one tick are dropped."""
+        """Compile the programs of the flight and of every learner; updates from this one tick are dropped."""
         super().warm_up(measurement)
         for learner, _ in self.learners:
             learner.submit(self._buffer.window(), 0)
@@ -90,12 +90,12 @@ class AdaptivePilot(Pilot):
         return u
 
     def accepted(self, u: Command) -> None:
-        """Remember the command that the plant accepted, in the buffer and in the observation."""
+        """Remember the accepted command in the buffer and in the observation."""
         self._buffer.accepted(u)
         self._pilot.accepted(u)
 
     def learn(self, state: LearnerState, t: float) -> None:
-        """Fly a learner state from another source from now on, and let the learners continue from it.
+        """Adopt a learner state from a different source, and let the learners continue from it.
 
         Args:
             state: Policy and residual.

@@ -33,7 +33,7 @@ class Ticks(eqx.Module):
     measured: State
     """Measured state at the end of the tick."""
     issued: Command
-    """Command of the controller."""
+    """Command that the controller issued."""
     accepted: Command
     """Command that the plant accepted for the tick."""
     condition: Condition | None
@@ -49,7 +49,7 @@ def take_off(simulation: Simulation, controller: AbstractController[Any], x0: St
 
 
 def in_flight(controller: AbstractController[Any], sim: SimState, measured: State) -> InFlight:
-    """Return a flight of a simulation that has been launched.
+    """Return a flight in a simulation that has already been launched.
 
     Args:
         controller: The controller.
@@ -67,17 +67,17 @@ def fly_ticks(
     *,
     room: int,
 ) -> tuple[InFlight, Ticks]:
-    """Continue the flight of one vehicle for some ticks.
+    """Continue one vehicle's flight for a number of ticks.
 
-    The controller may differ from the previous one if its memory has the same structure. The physics equals, tick for
-    tick, that of a :class:`retrim.SimPlant` with a :class:`retrim.ControllerPilot`. A flight never terminates.
+    The controller may differ from the previous one if its memory has the same structure. The physics matches, tick for
+    tick, that of a :class:`retrim.SimPlant` with a :class:`retrim.ControllerPilot`. A flight never terminates early.
 
     Args:
         simulation: The simulated plant.
         controller: The controller.
         flight: The flight so far.
         ticks: Number of ticks to fly; it may be traced.
-        room: Number of rows that are returned; rows beyond ``ticks`` are zero.
+        room: Number of rows to return; rows beyond ``ticks`` are zero.
 
     Returns:
         The flight after these ticks, and their record.
@@ -115,9 +115,9 @@ def batch_flight(simulation: Simulation, controller: AbstractController[Any], x0
     """Fly one vehicle from its start; apply ``jax.vmap`` or ``lax.map`` for many vehicles, starts or policies.
 
     Args:
-        simulation: The simulated plant; a :class:`retrim.SimPlant` has one.
+        simulation: The simulated plant, e.g. that of a :class:`retrim.SimPlant`.
         controller: The controller.
         x0: State at the start.
-        ticks: Length of the flight.
+        ticks: Length of the flight [ticks].
     """
     return fly_ticks(simulation, controller, take_off(simulation, controller, x0), ticks, room=ticks)[1]

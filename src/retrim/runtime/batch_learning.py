@@ -1,7 +1,7 @@
 """Learning for a batch of flights, on the virtual clock.
 
-Periods and latencies alone determine when learners are offered windows and when their updates become visible. So
-between two such instants all flights run as one program, and so do the fits and the updates of all flights.
+Only periods and latencies determine when learners are offered windows and when their updates become visible. Between
+two such instants, all flights therefore run as one program. So do the fits and the updates of all flights.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,15 +38,15 @@ LAYERS: tuple[Layer, Layer] = ("residual", "policy")
 
 
 class Offer(NamedTuple):
-    """A window that is offered to a learner, and the time of its update."""
+    """A window that is offered to a learner, and the time at which its update becomes visible."""
 
     tick: int
     visible: int | None
-    """Tick at which its update becomes visible; None for a learner that is busy."""
+    """Tick at which its update becomes visible; None if the learner is busy."""
 
 
 def offers(period: int, latency: int, ticks: int) -> list[Offer]:
-    """Return every offer to a learner in a flight.
+    """Return every offer to a learner during a flight.
 
     Args:
         period: Time between offers [ticks].
@@ -63,7 +63,7 @@ def offers(period: int, latency: int, ticks: int) -> list[Offer]:
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings of a pilot that learns on the virtual clock, as values."""
+    """Settings of a pilot that learns on the virtual clock, as plain values."""
 
     learner: OnlineLearner
     controller: Callable[[LearnerState], AbstractController[Any]]
@@ -76,10 +76,10 @@ class Plan:
 
     @classmethod
     def of(cls, pilot: AdaptivePilot) -> "Plan | None":
-        """Return the plan of a pilot; None if it has other learners, or if its latencies are measured by the clock."""
+        """Return a pilot's plan; None if the pilot has different learners, or if its latencies are measured."""
         learners = [each.learner for each in pilot.learners]
         if [type(getattr(each, "worker", None)) for each in learners] != [ResidualWorker, PolicyWorker]:
-            return None  # a worker of another class may compute something else
+            return None  # a worker of a different class may compute something else
         match learners:
             case [
                 LockstepLearner(worker=ResidualWorker(learner=other), latency_s=float(first)) as fit,
@@ -100,13 +100,14 @@ class Plan:
 def fly_and_learn(
     batch: Batch, plans: Sequence[Plan], state: LearnerState, *, cold: bool
 ) -> tuple[LearnerState, list[list[Event]]]:
-    """Fly a batch to its end, with learning.
+    """Fly a batch to its end, and learn during the flights.
 
     Args:
         batch: Flights that have not begun.
-        plans: One for each flight, equal except for their seeds.
+        plans: One plan for each flight; they are equal except for their seeds.
         state: Learner state of each flight at its start (leading axis flights).
-        cold: If true, the programs are not compiled yet: compile those of flight and of learning at the same time.
+        cold: Whether the programs are not compiled yet; if so, those for flight and for learning are compiled at the
+            same time.
 
     Returns:
         The learner state of each flight at its end, and the events of each flight.
@@ -146,17 +147,17 @@ def fly_and_learn(
 
 
 def _learn_from_nothing(learner: OnlineLearner, state: LearnerState, window: Window, keys: Key[Array, " n"]) -> None:
-    """Compile the programs of learning; their results are dropped."""
+    """Compile the learning programs, and drop their results."""
     _fitted(learner, state, window)
     _updated(learner, state, window, keys)
 
 
 class _Instant(NamedTuple):
-    """An offer or a publication during the flights; sorted instants are in the order of a pilot."""
+    """An offer or a publication during the flights; sorted instants follow the order in which a pilot handles them."""
 
     tick: int
     order: int
-    """0: an update is published, before the tick; 1: a window is offered, after the command."""
+    """0 if an update is published, before the tick; 1 if a window is offered, after the command."""
     layer: int
     offer: Offer
 
@@ -180,7 +181,7 @@ def _controllers(plan: Plan, state: LearnerState) -> Any:
 
 
 def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tuple[Any, list[Update]]:
-    """Fit the residual of every flight; return the states, and an update for each flight that holds all states."""
+    """Fit the residual of every flight; return the states and one update per flight, which holds all states."""
     states, reports = fit_all(learner, state.residual, window)
     reports, t = jax.device_get((reports, window.t[:, -1]))
     return states, [residual_update(float(t[i]), states, row(reports, i)) for i in range(len(t))]
@@ -189,7 +190,7 @@ def _fitted(learner: OnlineLearner, state: LearnerState, window: Window) -> tupl
 def _updated(
     learner: OnlineLearner, state: LearnerState, window: Window, keys: Key[Array, " n"]
 ) -> tuple[Key[Array, " n"], Any, list[Update]]:
-    """Re-train the policy of every flight; a flight keeps its old policy where the gate refused the new one."""
+    """Re-train the policy of every flight; a flight keeps its old policy if the gate refuses the new one."""
     keys, now = _next_keys(keys)
     trained, verdicts = update_all(learner, state, window, now)
     verdicts, t = jax.device_get((verdicts, window.t[:, -1]))
@@ -197,7 +198,7 @@ def _updated(
 
 
 def row(tree: Any, i: int) -> Any:
-    """Return the entry of one flight from NumPy arrays with a leading axis of flights."""
+    """Return one flight's entry from NumPy arrays with a leading axis of flights."""
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 
@@ -222,7 +223,7 @@ def update_all(
         flown: Policies in flight, if they differ from those of ``state``.
 
     Returns:
-        The trained policy, or the old one where the gate refused it, and the verdicts.
+        The trained policies, or the old ones where the gate refused them, and the verdicts.
     """
 
     def update(state: LearnerState, window: Window, key: Key[Array, ""], flown: Any) -> tuple[PolicyState, Verdict]:
@@ -232,7 +233,7 @@ def update_all(
     if jax.default_backend() != "cpu" or jax.device_count() > 1:
         updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys, flown)
         return updated
-    # A core is fastest with a few updates at once, whose activations stay in its cache; the last group is padded.
+    # A core is fastest with a few updates at once, since their activations stay in its cache. The last group is padded.
     arrays, rest = eqx.partition((state, windows, keys, flown), eqx.is_array)
     n = keys.shape[0]
     few = at_once(n, sum(leaf.nbytes for leaf in jax.tree.leaves(eqx.filter(state.policy.policy, eqx.is_array))) // n)
@@ -248,7 +249,7 @@ def update_all(
 
 
 def at_once(n: int, size: int) -> int:
-    """Return the number of updates that a core computes at once: it fits into the cache and needs little padding.
+    """Return the number of updates that a core computes at once: few enough for its cache, with little padding.
 
     Args:
         n: Number of updates.
@@ -260,6 +261,6 @@ def at_once(n: int, size: int) -> int:
 
 @jax.jit
 def _next_keys(keys: Key[Array, " n"]) -> tuple[Key[Array, " n"], Key[Array, " n"]]:
-    """Return the keys to continue with, and those of an update."""
+    """Return the keys with which to continue, and the keys of an update."""
     both = jax.vmap(random.split)(keys)
     return both[:, 0], both[:, 1]

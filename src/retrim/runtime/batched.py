@@ -1,4 +1,4 @@
-"""Flights that advance in step: arrays with a leading axis of flights, and their record."""
+"""Flights that advance in step, as arrays with a leading axis of flights, and their record."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from .flight import FlightStopped, Log, States
 
 T = TypeVar("T")
 
-ROOM = 50  # ticks of one call; the period of progress reports and of checks for a stop
+ROOM = 50  # ticks per call; the period of progress reports and stop checks
 
 
 class Batch:
@@ -37,10 +37,10 @@ class Batch:
     ) -> None:
         self.ticks, self.dt = ticks, dt
         self.controllers: Any = None
-        """Controllers of the flights; new ones take over the memory of the last ones."""
+        """Controllers of the flights; new ones take over the memory of the previous ones."""
         self._simulations, self._starts = stacked(simulations), stacked(starts)
         self._progress, self._stop = progress, stop
-        # Without disturbances, plants of one kind have the same structure: one program launches all of them.
+        # Without disturbances, plants of one kind have the same structure, so one program launches all of them.
         self._on_the_ground = stacked([simulation.undisturbed() for simulation in simulations])
         self._flights: InFlight | None = None
         self._flown = 0
@@ -51,7 +51,7 @@ class Batch:
         """Continue the flights up to a tick.
 
         Raises:
-            FlightStopped: The flights were given up.
+            FlightStopped: The flights were aborted.
         """
         while self._flown < tick:
             if self._stop is not None and self._stop.is_set():
@@ -68,7 +68,7 @@ class Batch:
             self._progress(self._flown / self.ticks)
 
     def blank_window(self, size: int) -> Window:
-        """Return windows with the shapes of those of a flight, for vehicles that hover at their starts."""
+        """Return windows shaped like those of a flight, for vehicles that hover at their starts."""
         n = self._starts.p.shape[0]
         x = jax.tree.map(lambda leaf: jax.device_put(np.repeat(np.asarray(leaf)[:, None], size, axis=1)), self._starts)
         hover = Command.hover(x.p.dtype)
@@ -125,13 +125,13 @@ def stacked(trees: Sequence[T]) -> T:
 
 
 def one(tree: T, i: int) -> T:
-    """Return one tree of those that :func:`stacked` has stacked."""
+    """Return one of the trees that :func:`stacked` has stacked."""
     result: T = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[i]), tree)
     return result
 
 
 def _stack(leaves: Sequence[Any]) -> Array:
-    """Stack arrays in NumPy, which does not compile a program for every shape."""
+    """Stack arrays in NumPy, to avoid compiling a program for every shape."""
     if jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key):
         return jnp.stack(leaves)
     stacked: Array = jax.device_put(np.stack([np.asarray(leaf) for leaf in leaves]))
@@ -139,7 +139,7 @@ def _stack(leaves: Sequence[Any]) -> Array:
 
 
 def _recorded(record: Any, flown: Any, at: int, size: int, *, rows: int) -> Any:
-    """Write the first rows of ``flown`` into a record of the whole flight, at a tick; the second axis is time."""
+    """Write the first rows of ``flown`` into a record of the flight, from tick ``at`` on; the second axis is time."""
     if record is None:
         record = jax.tree.map(lambda leaf: np.empty((leaf.shape[0], size, *leaf.shape[2:]), leaf.dtype), flown)
 

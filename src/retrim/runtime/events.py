@@ -24,9 +24,9 @@ class Event(NamedTuple):
     """Time at which the event became visible, since the start of the flight [s]."""
     kind: str
     """``residual``, ``policy``, ``rejected`` (a result that must not be used), ``skipped`` (the learner was busy),
-    ``stage`` (the controller stepped back, or returned), ``vehicle`` (the identified vehicle) or ``terminated``."""
+    ``stage`` (the controller stepped back or returned), ``vehicle`` (the identified vehicle) or ``terminated``."""
     note: str
-    """Description in one line."""
+    """One-line description."""
 
     @classmethod
     def of(cls, t: float, update: Update) -> "Event":
@@ -35,7 +35,7 @@ class Event(NamedTuple):
 
 
 def stage_events(conditions: Condition | None, t: Float[np.ndarray, " n"]) -> list[Event]:
-    """Return an event for each change of the stage of a controller.
+    """Return an event for each change of a controller's stage.
 
     Args:
         conditions: Condition at each tick (leading axis n); None for a controller that never steps back.
@@ -67,7 +67,7 @@ class Observer(Protocol):
     """Follows a flight. It must not block."""
 
     def measurement(self, measurement: Measurement, u: Command) -> None:
-        """Receive each measurement and the command accepted for the tick that it ends; hover for the first one."""
+        """Receive each measurement and the command accepted for the tick that it ends (hover for the first one)."""
         ...
 
     def event(self, event: Event) -> None:
@@ -76,10 +76,10 @@ class Observer(Protocol):
 
 
 class JsonlObserver:
-    """Writes each event at once, as a line of JSON."""
+    """Writes each event immediately, as one line of JSON."""
 
     def __init__(self, path: Path, **about: object) -> None:
-        """Open ``path`` to append; each line contains the fields of ``about``."""
+        """Open ``path`` for appending; each line contains the fields of ``about``."""
         self._file, self._about = path.open("a"), about
 
     def measurement(self, measurement: Measurement, u: Command) -> None:

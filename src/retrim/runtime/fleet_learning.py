@@ -31,12 +31,12 @@ def learn_together(
 ) -> list[Update]:
     """Learn from one window for each of several vehicles.
 
-    Custom workers learn one after the other. The result of each vehicle equals that of its worker alone, up to
-    rounding. Programs are compiled for powers of two; the batch is padded to the next one with copies whose results are
-    dropped, so that any number of vehicles may be due.
+    Custom workers learn one after another. Each vehicle's result equals that of its worker alone, up to rounding.
+    Programs are compiled for batch sizes that are powers of two. Copies pad the batch to the next power, and their
+    results are dropped, so any number of vehicles may be due.
 
     Args:
-        workers: One for each vehicle, of one layer and one learner, with states of one structure.
+        workers: One worker for each vehicle. All have the same layer and learner, and states of the same structure.
         windows: The window of each worker.
         base: The base to which low-rank policies add their deltas from now on; by default each keeps its own. The gate
             compares the result with the policy in flight.
@@ -63,7 +63,7 @@ def learn_together(
 
 
 def shared_base(learner: OnlineLearner, state: LearnerState) -> PolicyState:
-    """Return the base of a low-rank policy, for all vehicles that start from it, with a fresh optimiser."""
+    """Return a low-rank policy's base with a fresh optimiser, for all vehicles that start from it."""
     policy = state.policy.policy
     assert isinstance(policy, LoraPolicy)
     return PolicyState(policy.base, _optimiser(learner).init(policy.base.params))
@@ -72,19 +72,19 @@ def shared_base(learner: OnlineLearner, state: LearnerState) -> PolicyState:
 def learn_base(
     workers: Sequence[PolicyWorker], windows: Sequence[Window], base: PolicyState, key: Key[Array, ""]
 ) -> PolicyState:
-    """Take one optimiser step of a shared base, along the mean of the gradients of several vehicles.
+    """Take one optimiser step on a shared base, along the mean gradient of several vehicles.
 
-    The gradient of each vehicle is that of its own policy, base plus delta, in its own corrected model. Since the delta
-    is added to the base, this is also the gradient of the base.
+    Each vehicle contributes the gradient of its own policy (base plus delta) in its own corrected model. Since the
+    delta is added to the base, this is also the gradient with respect to the base.
 
     Args:
-        workers: One for each vehicle, with low-rank policies.
+        workers: One worker for each vehicle, with low-rank policies.
         windows: The window of each vehicle.
         base: The base, and its optimiser.
         key: Random key, consumed.
 
     Returns:
-        The base after the step; the base unchanged if the gradient is not finite.
+        The base after the step, or the unchanged base if the gradient is not finite.
     """
     n = len(workers)
     filled = [*range(n), *[0] * (room_for(n) - n)]
@@ -96,7 +96,7 @@ def learn_base(
 
 
 def refused_by_all(updates: Sequence[Update]) -> bool:
-    """Return whether every vehicle has refused its update; the step of the shared base is then undone."""
+    """Return whether every vehicle refused its update; the step of the shared base is then undone."""
     return not any(isinstance(update, PolicyUpdate) for update in updates)
 
 
@@ -120,13 +120,13 @@ def _base_step(
 
 
 def _optimiser(learner: OnlineLearner) -> optax.GradientTransformation:
-    """Return one Adam for the whole flight, with the rate of all weights: updates of the base do not reset it."""
+    """Return one Adam for the whole flight, at the rate for all weights; updates of the base do not reset it."""
     clip = optax.clip_by_global_norm(learner.optimiser.max_grad_norm)
     return optax.chain(clip, optax.scale_by_adam(), optax.scale_by_learning_rate(learner.optimiser.rate))
 
 
 def _on(state: Any, base: PolicyState | None) -> Any:
-    """Put the delta of a low-rank policy on another base."""
+    """Put a low-rank policy's delta on a different base."""
     if base is None or not isinstance(state, LearnerState) or not isinstance(state.policy.policy, LoraPolicy):
         return state
     assert isinstance(base.policy, Policy)

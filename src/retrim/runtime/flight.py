@@ -44,7 +44,7 @@ class Log(NamedTuple):
     true: States
     """True states if the plant provides them; otherwise the measured ones."""
     measured: States
-    """Measured states, the input of the pilot."""
+    """Measured states, which the pilot receives."""
     u: np.ndarray
     """Command accepted for the tick that ended in each row: c [m/s^2], omega [rad/s]; hover in row 0."""
     dt: float
@@ -72,18 +72,18 @@ class Log(NamedTuple):
 
     @property
     def missed_ticks(self) -> int:
-        """Number of ticks without a measurement, by the clock of the plant."""
+        """Number of ticks without a measurement, by the plant's clock."""
         return int(np.sum(np.maximum(np.round(np.diff(self.t) / self.dt).astype(int) - 1, 0)))
 
     def window(self, ticks: int, *, end: int | None = None) -> Window:
-        """Return the input of a learner: measured states, each with the command that *followed* it.
+        """Return a learner's input: measured states, each with the command that *followed* it.
 
         Args:
             ticks: Length of the window.
             end: Row after the last row of the window; by default the window ends with the flight.
 
         Raises:
-            ValueError: The flight does not have these rows.
+            ValueError: The flight does not contain these rows.
         """
         last = len(self.t) - 1 if end is None else end
         if not 0 < ticks <= last < len(self.t):
@@ -128,16 +128,16 @@ def fly(
     observers: Sequence[Observer] = (),
     stop: threading.Event | None = None,
 ) -> Log:
-    """Fly a plant with a pilot. The plant is always stopped at the end, also after an error.
+    """Fly a plant with a pilot. The plant is always stopped at the end, even after an error.
 
     Args:
         plant: The vehicle to fly; its clock may start at any time.
         pilot: Source of the commands.
-        x0: State at the start of the flight; None for the present state of the vehicle.
+        x0: State at the start of the flight; None for the vehicle's present state.
         ticks: Length of the flight in ticks of the plant's clock; a missed tick counts.
-        terminated: Function of the time since the start [s] and of the true state that returns whether to end the
-            flight early.
-        observers: They receive every measurement and event.
+        terminated: Function of the time since the start [s] and the true state that returns whether to end the flight
+            early.
+        observers: Observers, which receive every measurement and event.
         stop: Event that aborts the flight; set it from another thread.
 
     Returns:

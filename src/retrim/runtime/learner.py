@@ -15,7 +15,7 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def poll(self, tick: int) -> list[Update]:
-        """Return the updates that have become visible, each once; never block."""
+        """Return the updates that have become visible, each exactly once; never block."""
 
     @abc.abstractmethod
     def receive(self, update: Update) -> None:
@@ -23,4 +23,4 @@ class Learner(abc.ABC):
 
     @abc.abstractmethod
     def reset(self) -> None:
-        """Drop the computation under way, since a new flight starts."""
+        """Drop the computation in progress, since a new flight starts."""

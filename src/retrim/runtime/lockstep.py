@@ -1,4 +1,4 @@
-"""Learning on a virtual clock: equivalent to a live run, but repeatable bit for bit.
+"""Learning on a virtual clock, which is equivalent to a live run but repeatable bit for bit.
 
 Compute time is charged to flight time. The learner processes a window at the tick of its submission; the result becomes
 visible only after the latency of the computation, as if the learner had run in parallel with the flight.
@@ -14,14 +14,14 @@ from .learner import Learner
 
 
 class LockstepLearner(Learner):
-    """One worker on the virtual clock, with at most one window under way, whose update becomes visible later."""
+    """One worker on the virtual clock; at most one window is in progress, and its update becomes visible later."""
 
     def __init__(self, worker: Worker, latency_s: float | None, dt: float) -> None:
         """Build a learner.
 
         Args:
             worker: Worker that learns from the windows.
-            latency_s: Flight time from a window to its update [s]; None for the measured compute time of the worker.
+            latency_s: Flight time from a window to its update [s]; None for the worker's measured compute time.
             dt: Control tick [s]; latencies are rounded up to whole ticks.
         """
         self.worker, self.latency_s, self._dt = worker, latency_s, dt
@@ -39,7 +39,7 @@ class LockstepLearner(Learner):
         self._ready = (tick + self.ticks(seconds), update)
 
     def ticks(self, seconds: float) -> int:
-        """Return the number of ticks, at least one, until the update of a computation of ``seconds`` is visible."""
+        """Return the number of ticks, at least one, until the result of a computation of ``seconds`` is visible."""
         return max(1, math.ceil(seconds / self._dt - 1e-6))
 
     def poll(self, tick: int) -> list[Update]:
@@ -54,5 +54,5 @@ class LockstepLearner(Learner):
         self.worker.receive(update)
 
     def reset(self) -> None:
-        """Drop the update under way."""
+        """Drop the pending update."""
         self._ready, self._skipped = None, []

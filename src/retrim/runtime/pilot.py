@@ -1,4 +1,4 @@
-"""Pilots: they compute the command of a flight at each tick."""
+"""Pilots, which compute the command at each tick of a flight."""
 
 import abc
 from collections.abc import Callable
@@ -20,7 +20,7 @@ class Pilot(abc.ABC):
     """Flies one vehicle. A pilot may hold state."""
 
     dt: float | None = None
-    """Control period for which the pilot was built [s]; None for any."""
+    """Control period for which the pilot was built [s]; None for any period."""
 
     @abc.abstractmethod
     def reset(self, measurement: Measurement) -> None:
@@ -35,10 +35,10 @@ class Pilot(abc.ABC):
         """Return the command for the next tick."""
 
     def warm_up(self, measurement: Measurement) -> None:
-        """Compile every program of a flight before the first flight, by one tick whose command is not used.
+        """Compile every program before the first flight: run one tick and discard its command.
 
         Args:
-            measurement: Measurement of any state of the vehicle.
+            measurement: Measurement of the vehicle in any state.
         """
         self.reset(measurement)
         self.act(measurement)
@@ -59,7 +59,7 @@ class FunctionPilot(Pilot):
         self._function = function
 
     def reset(self, measurement: Measurement) -> None:
-        """Do not change anything, since a function has no memory."""
+        """Do nothing, since a function does not have a memory."""
 
     def act(self, measurement: Measurement) -> Command:
         """Call the function."""

@@ -1,4 +1,4 @@
-"""Many flights at once, as a batch in step. The flights equal those of each pilot alone."""
+"""Many flights at once, as a batch in step. Each flight equals that of its pilot alone."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -19,9 +19,9 @@ from .pilot import ControllerPilot, Pilot
 
 
 def can_fly_together(plants: Sequence[Plant], pilots: Sequence[Pilot]) -> bool:
-    """Return whether flights can be one batch: simulated plants of one structure, and pilots of one kind.
+    """Return whether flights can form one batch: simulated plants of one structure, and pilots of one kind.
 
-    Such pilots have controllers of one structure, or share one learner on the virtual clock, with fixed latencies.
+    Such pilots have controllers of the same structure, or share one learner on the virtual clock with fixed latencies.
     """
     simulations = [plant.simulation for plant in plants if type(plant) is SimPlant]
     interrupted = any(each.fault is not None and each.fault.interrupts for each in simulations)
@@ -49,13 +49,14 @@ def fly_together(
     """Fly a batch. Flights never terminate early; afterwards, adaptive pilots hold their new learner states.
 
     Args:
-        plants: One for each flight.
-        pilots: One for each flight; :func:`can_fly_together` must be true for them.
-        starts: States at the start.
-        ticks: Length of the flights.
-        progress: Called from time to time with the completed share of the flights.
+        plants: One plant for each flight.
+        pilots: One pilot for each flight; :func:`can_fly_together` must be true for them.
+        starts: State at the start of each flight.
+        ticks: Length of the flights [ticks].
+        progress: Function that is called from time to time with the completed share of the flights.
         stop: Event that aborts the flights; set it from another thread.
-        cold: If true, this is the first such batch: compile the programs of flight and of learning at the same time.
+        cold: Whether this is the first such batch; if so, the programs for flight and for learning are compiled at the
+            same time.
 
     Returns:
         A log for each flight, with one more row than ticks.

@@ -1,4 +1,4 @@
-"""Interface of a trajectory: a point at a time, the distance from it, and the trajectory in another frame."""
+"""Interface of a trajectory: the point at a given time, the distance to the path, and a change of frame."""
 
 import abc
 from typing import TYPE_CHECKING, NamedTuple
@@ -21,7 +21,7 @@ class Point(NamedTuple):
     v: Float[Array, "3"]
     """Velocity, world [m/s]."""
     u: Float[Array, "4"]
-    """Command for a point mass (differential flatness): c [m/s^2], body rates [rad/s]; hover at a jump."""
+    """Command that a point mass needs (differential flatness): c [m/s^2] and body rates [rad/s]; hover at a jump."""
     heading: Float[Array, ""]
     """Heading [rad]."""
     a: Float[Array, "3"]
@@ -29,7 +29,7 @@ class Point(NamedTuple):
     jerk: Float[Array, "3"]
     """Jerk, world [m/s^3]."""
     heading_rate: Float[Array, ""]
-    """Rate of the heading [rad/s]."""
+    """Heading rate [rad/s]."""
 
 
 class AbstractReference(eqx.Module):
@@ -39,11 +39,11 @@ class AbstractReference(eqx.Module):
 
         @property
         def lap(self) -> Float[Array, "2"]:
-            """Start and end of the lap that repeats [s]; two equal values if the end is held."""
+            """Start and end of the repeating lap [s]; equal if the end is held."""
 
         @property
         def joins(self) -> Float[Array, "m 2"]:
-            """Spans of time in which a roll-out may start [s]; each is equally likely."""
+            """Time spans in which a roll-out may start [s]; each is equally likely."""
     else:
         lap: eqx.AbstractVar[Array]
         joins: eqx.AbstractVar[Array]
@@ -54,7 +54,10 @@ class AbstractReference(eqx.Module):
 
     @abc.abstractmethod
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the cross-track error: from ``p`` to the nearest point of the lap, or of the whole trajectory [m]."""
+        """Return the cross-track error [m]: the distance from ``p`` to the nearest point of the lap.
+
+        Without a lap, it is the distance to the nearest point of the whole trajectory.
+        """
 
     @abc.abstractmethod
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractReference":
@@ -62,7 +65,7 @@ class AbstractReference(eqx.Module):
 
 
 class TurnedReference(AbstractReference):
-    """A reference in the frame of the effective gravity; its command follows from flatness in this frame."""
+    """A reference in the effective-gravity frame; its command follows from flatness in this frame."""
 
     reference: AbstractReference
     frame: EffectiveGravityFrame
@@ -74,11 +77,11 @@ class TurnedReference(AbstractReference):
 
     @property
     def joins(self) -> Float[Array, "m 2"]:
-        """Spans of the reference [s]; times are the same in the frame."""
+        """Time spans in which a roll-out may start [s]; times are the same in the frame."""
         return self.reference.joins
 
     def __call__(self, t: Float[Array, ""]) -> Point:
-        """Return the turned and scaled reference at ``t``; headings are about the vertical of the frame."""
+        """Return the rotated and scaled reference at ``t``; headings are about the frame's vertical."""
         here, vector = self.reference(t), self.frame.vector
         a, jerk = vector(here.a), vector(here.jerk)
         thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
@@ -90,5 +93,5 @@ class TurnedReference(AbstractReference):
         return self.frame.scale * self.reference.distance(so3.act(self.frame.Q.T, p) / self.frame.scale)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "TurnedReference":
-        """Return the reference in another frame on top of this one."""
+        """Return the reference in a further frame, applied after this one."""
         return TurnedReference(self, frame)

@@ -1,4 +1,4 @@
-"""Description of the parts of a trajectory that a vehicle cannot fly."""
+"""Descriptions of the parts of a trajectory that a vehicle cannot fly."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .flatness import JUMP
 
-REST = 0.3  # [m/s]; smaller velocities are within the noise at the start of flights
+REST = 0.3  # [m/s]; smaller velocities are within the noise at the start of a flight
 GAP = 0.02  # [m]; a lap whose ends are farther apart does not close
 
 
@@ -17,11 +17,11 @@ def unflyable(rows: np.ndarray, every: float, lap: tuple[float, float], vehicle:
         rows: Position [m], velocity [m/s], command [m/s^2, rad/s] and heading [rad] at each instant, as in
             :class:`retrim.tasks.Reference`.
         every: Time between rows [s].
-        lap: Start and end of the lap that repeats [s]; two equal values if the end is held.
-        vehicle: Vehicle that is to fly the table.
+        lap: Start and end of the lap that repeats [s]; equal if the end is held.
+        vehicle: Vehicle to fly the table.
 
     Returns:
-        One sentence without a full stop for each reason; empty if the vehicle can fly the whole table.
+        One sentence per reason, without a full stop; empty if the vehicle can fly the whole table.
     """
     return [
         *_not_at_rest(rows, lap),
@@ -43,7 +43,7 @@ def _not_at_rest(rows: np.ndarray, lap: tuple[float, float]) -> list[str]:
 
 
 def _standing_alone(rows: np.ndarray, every: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the accelerations between rows [m/s^2], and whether each is a jump of velocity."""
+    """Return the accelerations between rows [m/s^2], and whether each is a velocity jump."""
     accelerations = np.diff(rows[:, 3:6], axis=0) / every
     leaps = np.linalg.norm(accelerations, axis=1)
     k = np.arange(len(leaps))
@@ -74,7 +74,7 @@ def _open_lap(rows: np.ndarray, every: float, lap: tuple[float, float]) -> list[
 
 
 def beyond_limits(rows: np.ndarray, every: float, vehicle: Vehicle) -> list[str]:
-    """Return the reasons why a table exceeds thrust and rates of a vehicle; see :func:`unflyable`."""
+    """Return the reasons why a table exceeds a vehicle's thrust and rates; see :func:`unflyable`."""
     result = list[str]()
     accelerations, alone = _standing_alone(rows, every)
     lift = np.where(alone, np.inf, accelerations[:, 2] + STANDARD_GRAVITY)

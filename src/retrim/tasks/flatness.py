@@ -10,31 +10,31 @@ from jaxtyping import Array, Float
 from ..physics.state import STANDARD_GRAVITY
 
 Path3 = Callable[[float], Sequence[float] | np.ndarray]
-"""Time since take-off [s] -> position x, y, z [m], and heading [rad] as an optional fourth number."""
+"""Function from time since take-off [s] to position x, y, z [m] and, as an optional fourth number, heading [rad]."""
 
-JUMP = 30.0  # [m/s^2]; a larger acceleration is a jump of velocity, which cannot be flown
-STEP = 1e-3  # [s], step of the differences for velocity and acceleration
+JUMP = 30.0  # [m/s^2]; a larger acceleration is treated as a velocity jump, which cannot be flown
+STEP = 1e-3  # [s], step of the finite differences for velocity and acceleration
 NO_THRUST = 1e-3  # [m/s^2]; for a smaller thrust the attitude is undefined
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 FULL_TURN = 2.0 * math.pi  # [rad]; headings that differ by it are the same
 
 
 def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
-    """Differentiate a path at many instants, by central differences inside [0, ``last``].
+    """Differentiate a path at many instants, by central differences within [0, ``last``].
 
-    Where the velocity jumps, and where the attitude is undefined (free fall, or a nose that would point along the
-    thrust), the command is that of hover.
+    The command is hover where the velocity jumps or the attitude is undefined (in free fall, or if the nose would point
+    along the thrust).
 
     Args:
-        path: Position, world [m], and optionally heading [rad], by time [s]; a heading may jump by whole turns.
+        path: Function from time [s] to world position [m] and, optionally, heading [rad], which may jump by whole
+            turns.
         times: Instants [s], shape (n,).
-        last: End of the range in which the path is defined [s]; infinite for a path that repeats.
+        last: End of the range in which the path is defined [s]; infinite for a repeating path.
 
     Returns:
         Eighteen numbers for each instant, shape (n, 18): position [m] and velocity [m/s] in the world frame, collective
-        thrust [m/s^2], body rates [rad/s] in the body frame, heading [rad], unwrapped, acceleration [m/s^2] and jerk
-        [m/s^3] in the world frame, rate of the heading [rad/s]. The last seven are zero where the command is that of
-        hover.
+        thrust [m/s^2], body rates [rad/s] in the body frame, unwrapped heading [rad], acceleration [m/s^2] and jerk
+        [m/s^3] in the world frame, and heading rate [rad/s]. The last seven are zero where the command is hover.
 
     Raises:
         ValueError: The path does not return 3 or 4 finite numbers.
@@ -47,7 +47,7 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     v = (around[3] - around[1])[:, :3] / (2.0 * h)
     accelerations = [(around[k + 1] - 2.0 * around[k] + around[k - 1])[:, :3] / h**2 for k in (1, 2, 3)]
     closer = (near[0] - 2.0 * around[2] + near[1])[:, :3] / (0.1 * h) ** 2
-    # At a jump, the differences change with the step.
+    # At a jump, the finite differences depend on the step.
     jumps = np.max([np.linalg.norm(a - closer, axis=1) for a in accelerations], axis=0) > JUMP
     frames = [_attitudes(a, point[:, 3]) for a, point in zip(accelerations, around[1:4], strict=True)]
     (R_before, before), (R, now), (R_after, after) = frames
@@ -61,7 +61,7 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     turned = (around[3] - around[1])[:, 3:]
     heading_rate = (turned - FULL_TURN * np.round(turned / FULL_TURN)) / (2.0 * h)
     moving = np.where(defined, np.concatenate([accelerations[1], jerk, heading_rate], axis=1), 0.0)
-    # A table is interpolated, so a heading between two rows that differ by a turn would be arbitrary.
+    # Tables are interpolated, so the heading between two rows that differ by a turn would be arbitrary.
     return np.concatenate([here[:, :3], v, u, np.unwrap(here[:, 3:], axis=0), moving], axis=1)
 
 
@@ -71,10 +71,10 @@ def flat_command(
     """Return the command that a point mass needs at one instant.
 
     Args:
-        thrust: Mass-normalised thrust that it needs, a vector that is not zero and not horizontal [m/s^2].
-        jerk: Rate of the thrust [m/s^3].
+        thrust: Required mass-normalised thrust, a vector that is neither zero nor horizontal [m/s^2].
+        jerk: Rate of change of the thrust [m/s^3].
         heading: Direction of the nose [rad].
-        heading_rate: Rate of the heading [rad/s].
+        heading_rate: Heading rate [rad/s].
 
     Returns:
         Collective thrust [m/s^2] and body rates [rad/s].
@@ -93,7 +93,7 @@ def flat_command(
 
 
 def _points(path: Path3, times: np.ndarray) -> np.ndarray:
-    """Evaluate a path: x, y, z, heading for each instant."""
+    """Evaluate a path: x, y, z and heading at each instant."""
     rows = np.zeros((len(times), 4))
     for row, t in zip(rows, times.tolist(), strict=True):
         point = np.asarray(path(t), dtype=float)
@@ -104,7 +104,7 @@ def _points(path: Path3, times: np.ndarray) -> np.ndarray:
 
 
 def _attitudes(a: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return body axes as columns: z along the thrust for each acceleration, x towards the heading.
+    """Return the body axes for each acceleration as columns: z along the thrust, x towards the heading.
 
     The second array is true where they are defined.
     """

@@ -1,4 +1,4 @@
-"""Observation in axes that turn with the heading: a vehicle at another heading observes the same numbers."""
+"""Observation in axes that turn with the heading, so that it is the same for every heading."""
 
 import dataclasses
 from typing import Any, TypeVar
@@ -16,12 +16,12 @@ SMALLEST = 1e-6  # regularises the length of the heading, which is zero if the v
 
 
 class HeadingObs(AbstractObservation[M]):
-    """Turns the state about the vertical through ``origin``, so that the heading is zero.
+    """Observation of the state turned about the vertical through ``origin``, so that the heading is zero.
 
     Hover is the same for every heading: thrust and body rates are commands in body axes, and the reward does not depend
-    on the heading. A policy that observes headings must learn each of them, and it oscillates at some headings and
-    rests at others. The heading is the twist of the attitude about the vertical, which is smooth up to a tilt of
-    180 degrees.
+    on the heading. A policy that observes the heading must learn every heading, and it oscillates at some headings and
+    rests at others. The heading is the twist of the attitude about the vertical, which is smooth up to a tilt of 180
+    degrees.
     """
 
     inner: AbstractObservation[M]
@@ -30,11 +30,11 @@ class HeadingObs(AbstractObservation[M]):
 
     @property
     def size(self) -> int:
-        """Length of the observation inside."""
+        """Length of the inner observation."""
         return self.inner.size
 
     def init(self, x: State) -> M:
-        """Return the memory of the observation inside."""
+        """Return the memory of the inner observation."""
         return self.inner.init(self._turned(x))
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
@@ -42,7 +42,7 @@ class HeadingObs(AbstractObservation[M]):
         return self.inner(memory, t, self._turned(x), last)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "HeadingObs[M]":
-        """Return the observation about the vertical of another frame."""
+        """Return the observation about the vertical of ``frame``."""
         turned: AbstractObservation[Any] = self.inner.in_frame(frame)
         return dataclasses.replace(self, inner=turned, origin=frame.vector(self.origin))
 

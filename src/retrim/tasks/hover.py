@@ -17,14 +17,14 @@ from .observation import AbstractObservation
 from .task import TILT, AbstractTask, Start, huber, within
 
 RewardRule = Callable[[Float[Array, "3"], State, Command], Float[Array, ""]]
-"""Reward from goal [m], state and command, differentiable by JAX."""
+"""Function that returns the reward for a goal [m], a state and a command; differentiable by JAX."""
 
 
 class AbstractHover(AbstractTask):
-    """Fly to ``goal`` and stay. Subclasses differ in their reward.
+    """Fly to ``goal`` and stay there; subclasses differ in their reward.
 
-    A vehicle farther than ``box`` [m] from the goal along any axis is terminated. The box is wide, since in a tight one
-    a strong disturbance ends every flight before the learner has data.
+    The task terminates when the vehicle is farther than ``box`` [m] from the goal along any axis. The box is wide,
+    since in a narrow one a strong disturbance would end every flight before the learner has data.
     """
 
     goal: Float[Array, "3"]
@@ -33,11 +33,11 @@ class AbstractHover(AbstractTask):
     box: Float[Array, ""]
     """Half the side of the box [m]."""
     heading: Float[Array, ""]
-    """Largest angle between the heading of a start and the x axis [rad]; pi for any heading."""
+    """Largest angle between a start's heading and the x axis [rad]; pi for any heading."""
     dt: float = eqx.field(static=True, default=0.02)
     horizon: int = eqx.field(static=True, default=150)
     in_flight: AbstractObservation[Any] | None = None
-    """Observation in flight; None for that of training."""
+    """Observation used in flight; None for the training observation."""
 
     @property
     def observation_in_flight(self) -> AbstractObservation[Any]:
@@ -54,11 +54,18 @@ class AbstractHover(AbstractTask):
         return self.goal
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the goal, world [m]; a subclass may move it, and reward, bounds and error use the moved goal."""
+        """Return the goal, world [m].
+
+        A subclass may move the goal; reward, bounds and error then use the moved goal.
+        """
         return self.goal
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Draw a start: goal +- 1 m per axis, yaw within ``heading``, pitch and roll within 18 degrees, 0.1 m/s."""
+        """Draw a start near the goal.
+
+        Each coordinate is within 1 m of the goal, the yaw within ``heading``, and pitch and roll within 18 degrees. The
+        standard deviation of the velocity is 0.1 m/s per axis.
+        """
         kp, ka, kv = random.split(key, 3)
         p = self.goal + random.uniform(kp, (3,), minval=-1.0, maxval=1.0)
         roll, pitch, turn = random.uniform(ka, (3,), minval=-1.0, maxval=1.0)
@@ -66,7 +73,7 @@ class AbstractHover(AbstractTask):
         return Start(jnp.zeros_like(p[0]), State(p, R, 0.1 * random.normal(kv, (3,))))
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Return whether the vehicle is outside the box, or its state is not finite."""
+        """Return whether the vehicle is outside the box or its state is not finite."""
         return ~within(self.box, x, self.target(t))
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
@@ -74,7 +81,7 @@ class AbstractHover(AbstractTask):
         return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractHover":
-        """Return hover at the same goal.
+        """Return the task with the same goal in ``frame``.
 
         Raises:
             FrameError: A subclass overrides ``target``, or the observation does not support other frames.
@@ -98,29 +105,29 @@ class Hover(AbstractHover):
 
 
 class CustomHover(AbstractHover):
-    """Hover with any reward."""
+    """Hover with a user-defined reward."""
 
     rule: RewardRule = eqx.field(static=True, kw_only=True)
-    """Reward, from goal [m], state and command, in the frame of the policy."""
+    """Function that returns the reward for a goal [m], a state and a command, in the policy's frame."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return the reward."""
+        """Return the reward from ``rule``."""
         return self.rule(self.target(t), x, u)
 
 
 class L2Hover(AbstractHover):
-    """Hover with a tip of the reward at the goal; the paper's is flat there and leaves an error of centimetres."""
+    """Hover with a reward that has a tip at the goal; the paper's is flat there and leaves centimetres of error."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return the paper's reward - 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
+        """Return the paper's reward minus 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
         tip = jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2) + 0.01**2) - 0.01
         return _printed(self.target(t), x, u) - 3.0 * tip
 
 
 class StiffHover(AbstractHover):
-    """Hover with a reward for stiffness: the costs of commands and velocity are a tenth and a fifth of the paper's.
+    """Hover with a reward for stiffness: the command cost is a tenth of the paper's, and the velocity cost a fifth.
 
-    A stiff policy moves less under a push. It needs a model with the delay and the lag of the vehicle.
+    A stiff policy moves less when pushed. It needs a model with the vehicle's delay and lag.
     """
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:

@@ -18,13 +18,13 @@ from .motions import NEAR
 from .observation import AbstractObservation
 
 Statistics = tuple[Float[Array, "70"], Float[Array, "70 70"]]
-"""Mean and whitening matrix of pixels."""
+"""Mean and whitening matrix of the pixels."""
 PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
-"""Keypoints, relative to the point below the goal [m]: corners of a square and three mid-points of its sides."""
+"""Keypoints, relative to the point below the goal [m]: the corners of a square and three mid-points of its sides."""
 BELOW = 1.0  # [m], from the goal to the ground
 FRAMES, COMMANDS = 5, 3
 FRAME_TIME = 0.06  # [s] between frames, as published
-FAR = 2.5  # limit at which pixel coordinates (normalised) are clipped
+FAR = 2.5  # limit at which normalised pixel coordinates are clipped
 FEATURE_LIMIT = 5.0  # whitened features are clipped at this many standard deviations
 
 
@@ -32,15 +32,15 @@ class KeypointMemory(NamedTuple):
     """Memory of the observation."""
 
     frames: Float[Array, "depth 14"]
-    """Pixels of the last ticks, newest last."""
+    """Pixels at the last few ticks, newest last."""
     commands: Float[Array, "3 4"]
     key: Key[Array, ""]
 
 
 class Keypoints(AbstractObservation[KeypointMemory]):
-    """o = [whitened pixels of five frames, present visibility of the points, last three commands]: 89 numbers.
+    """o = [whitened pixels of five frames, current visibility of the points, last three commands]: 89 numbers.
 
-    Every point is observed at any position, as in the paper's code; :class:`retrim.tasks.OccludedKeypoints` uses only
+    Every point is observed wherever it is, as in the paper's code. :class:`retrim.tasks.OccludedKeypoints` uses only
     the points that a camera can see.
 
     ``noise`` is the standard deviation of a pixel coordinate [px]. It is drawn from a key that depends on the start, so
@@ -67,7 +67,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
 
     @property
     def depth(self) -> int:
-        """Number of ticks of pixels in the memory."""
+        """Number of ticks whose pixels are in the memory."""
         return (FRAMES - 1) * self.stride + 1
 
     @classmethod
@@ -80,7 +80,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         whitened: bool = True,
         dt: float = 0.02,
     ) -> "Keypoints":
-        """Return the observation, by default with pixels whitened over random short motions (always the same ones)."""
+        """Return the observation; by default, pixels are whitened over a fixed set of random short motions."""
         plain = cls(Camera.published(), goal, omega_max, jnp.array(noise), jnp.zeros(70), jnp.eye(70), dt)
         if not whitened:
             return plain
@@ -125,7 +125,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return frames[:: -self.stride].reshape(-1)
 
     def features(self, stacked: Float[Array, "70"]) -> Float[Array, "70"]:
-        """Return whitened frames, clipped where they do not fit any motion, such as when points come into sight."""
+        """Return the whitened frames, clipped where they do not fit any motion, such as when points come into sight."""
         return jnp.clip(self.whiten @ (stacked - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
 
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
@@ -142,7 +142,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         self, memory: KeypointMemory, t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], KeypointMemory]:
         """Return the observation after one more frame."""
-        key, k_noise, _ = random.split(memory.key, 3)  # three, for the noise of OccludedKeypoints
+        key, k_noise, _ = random.split(memory.key, 3)  # three keys, for the same noise as OccludedKeypoints
         true, visible = self.pixels(x)
         shown = true + lax.stop_gradient(self.deviation(k_noise, true.dtype))
         frames = jnp.concatenate([memory.frames, shown.reshape(1, 14)])[1:]
@@ -155,16 +155,16 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return (2.0 * self.noise / self.camera.size)[None] * random.normal(key, (7, 2), dtype)
 
     def command(self, scaled: Float[Array, "4"]) -> Command:
-        """Return the command of the scaled numbers ``scaled``."""
+        """Return the command for numbers as returned by :meth:`scaled`."""
         return Command((scaled[0] + 1.0) * STANDARD_GRAVITY, scaled[1:] * self.omega_max)
 
     def scaled(self, u: Command) -> Float[Array, "4"]:
-        """Return a command in units of gravity, relative to hover, and of the largest rates."""
+        """Return a command as numbers: thrust relative to hover, in units of g, and shares of the largest rates."""
         return jnp.concatenate([(u.c / STANDARD_GRAVITY - 1.0)[None], u.omega / self.omega_max])
 
 
 def key_of(x: State) -> Key[Array, ""]:
-    """Return the key of the noise of a flight that starts in ``x``."""
+    """Return the noise key for a flight that starts in ``x``."""
     return random.key(lax.bitcast_convert_type(jnp.sum(x.p + x.v).astype(jnp.float32), jnp.int32))
 
 
@@ -178,7 +178,7 @@ def _whitening_at(goal: tuple[float, float, float], dt: float, x64: bool) -> Sta
 
 @eqx.filter_jit
 def _whitening(plain: Keypoints) -> Statistics:
-    """Return mean and whitening matrix of the frames of random short motions, always the same ones."""
+    """Return the mean and whitening matrix of the frames of a fixed set of random short motions."""
     keys = random.split(random.key(0), 20000)
     frames = jax.vmap(lambda k: plain.stacked(plain.history(*NEAR.draw(k, plain.goal))))(keys)
     mean = jnp.mean(frames, axis=0)

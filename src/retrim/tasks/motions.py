@@ -1,4 +1,4 @@
-"""Random motions near a goal, without a roll-out: possible views of a camera before the first flight of a policy."""
+"""Random motions near a goal, drawn without a roll-out: possible camera views before a policy's first flight."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ class Motions(NamedTuple):
     tilt: float
     """Standard deviation of the attitude about each axis [rad]."""
     turn: float
-    """Standard deviation of an additional heading [rad]."""
+    """Standard deviation of an additional change of heading [rad]."""
     speed: float
     """Standard deviation of the velocity, per axis [m/s]."""
     rates: float
@@ -36,6 +36,6 @@ class Motions(NamedTuple):
 NEAR = Motions(box=1.2, tilt=0.2, turn=0.4, speed=0.7, rates=1.0)
 """Motions of a hovering policy."""
 WILD = Motions(box=1.5, tilt=0.5, turn=0.4, speed=2.0, rates=2.0)
-"""Motions about as wide as those of the random policy on whose flights the authors pretrain."""
+"""Motions about as wide as those of the authors' random policy, on whose flights they pretrain."""
 MOTIONS = {"near": NEAR, "wild": WILD}
-"""Motions by their names in presets."""
+"""Motions, by their names in presets."""

@@ -1,4 +1,4 @@
-"""Hover relative to a goal that moves."""
+"""Hover relative to a moving goal."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,11 +23,11 @@ from .task import AbstractTask, Start
 
 M = TypeVar("M")
 GoalPath = Callable[[Float[Array, ""]], Float[Array, "3"]]
-"""Position of a goal [m], world, at a time [s]; three times differentiable by JAX."""
+"""Function from time [s] to the goal's world position [m]; three times differentiable by JAX."""
 
 
 class GoalObs(AbstractObservation[M]):
-    """Observation of the position and velocity relative to a goal that moves."""
+    """Observation of the position and velocity relative to a moving goal."""
 
     inner: AbstractObservation[M]
     """Observation of a hover task at the origin."""
@@ -37,11 +37,11 @@ class GoalObs(AbstractObservation[M]):
 
     @property
     def size(self) -> int:
-        """Length of the observation inside."""
+        """Length of the inner observation."""
         return self.inner.size
 
     def init(self, x: State) -> M:
-        """Return the memory of the observation inside."""
+        """Return the memory of the inner observation."""
         return self.inner.init(x)
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
@@ -49,23 +49,23 @@ class GoalObs(AbstractObservation[M]):
         return self.inner(memory, t, relative_state(self.path, self.frame, t, x), last)
 
     def with_belief(self, belief: PathBelief) -> "GoalObs[M]":
-        """Return the same observation with another belief about the vehicle."""
+        """Return the same observation with a different belief about the vehicle."""
         return dataclasses.replace(self, inner=self.inner.with_belief(belief))
 
     def with_actuators(self, actuators: ActuatorState) -> "GoalObs[M]":
-        """Return the same observation with the present thrust and body rates."""
+        """Return the same observation with the current thrust and body rates."""
         return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "GoalObs[M]":
-        """Return the observation for states of ``frame``."""
+        """Return the observation for states in ``frame``."""
         return GoalObs(self.inner.in_frame(frame), self.path, _only(self.frame, frame))
 
 
 class MovingGoal(AbstractTask):
-    """A hover task around a goal that moves: its reward, bounds and error apply to the relative position and velocity.
+    """A hover task around a moving goal; reward, bounds and error apply to the relative position and velocity.
 
-    The policy does not observe the acceleration of the goal. For accurate tracking of a fast trajectory, use a
-    reference (:class:`~retrim.tasks.track.AbstractTrack`).
+    The policy does not observe the goal's acceleration. For accurate tracking of a fast trajectory, use a reference
+    (:class:`~retrim.tasks.track.AbstractTrack`).
     """
 
     inner: AbstractHover
@@ -76,12 +76,12 @@ class MovingGoal(AbstractTask):
 
     @property
     def dt(self) -> float:
-        """Control tick [s]."""
+        """Length of a control tick [s]."""
         return self.inner.dt
 
     @property
     def horizon(self) -> int:
-        """Number of ticks of one training roll-out."""
+        """Number of ticks in one training roll-out."""
         return self.inner.horizon
 
     @property
@@ -91,20 +91,20 @@ class MovingGoal(AbstractTask):
 
     @property
     def observation_in_flight(self) -> AbstractObservation[Any]:
-        """Observation of the relative state in flight."""
+        """Observation of the relative state, used in flight."""
         return GoalObs(self.inner.observation_in_flight, self.path, self.frame)
 
     def home(self) -> Float[Array, "3"]:
-        """Return the first position of the goal [m]."""
+        """Return the goal's initial position [m]."""
         return self.target(jnp.zeros_like(self.inner.goal[0]))
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the position of the goal at time ``t`` [s]."""
+        """Return the goal's position at time ``t`` [s]."""
         p = self.path(t)
         return p if self.frame is None else self.frame.vector(p)
 
     def setpoint(self, t: Float[Array, ""]) -> Point:
-        """Return position, derivatives and command of the goal at time ``t`` [s]; its heading is zero."""
+        """Return the goal's position, derivatives and command at time ``t`` [s]; its heading is zero."""
         one = jnp.ones_like(t)
 
         def velocity(t: Float[Array, ""]) -> Float[Array, "3"]:
@@ -121,7 +121,7 @@ class MovingGoal(AbstractTask):
         return Point(self.target(t), velocity(t), flat_command(thrust, jerk, none, none), none, a, jerk, none)
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Draw a time and a start of the hover task relative to the goal at that time."""
+        """Draw a time, and a start of the hover task relative to the goal at that time."""
         k_time, k_start = random.split(key)
         start = self.inner.reset(k_start)
         t = self.flight_seconds * random.uniform(k_time, (), start.t.dtype)
@@ -133,7 +133,7 @@ class MovingGoal(AbstractTask):
         return self.inner.reward(t, self._relative(t, x), u)
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Return whether the vehicle is outside the box around the goal, or its state is not finite."""
+        """Return whether the vehicle is outside the box around the goal or its state is not finite."""
         return self.inner.terminated(t, self._relative(t, x))
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
@@ -141,7 +141,7 @@ class MovingGoal(AbstractTask):
         return self.inner.error(t, self._relative(t, x))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "MovingGoal":
-        """Return the same task for states and commands of ``frame``."""
+        """Return the same task for states and commands in ``frame``."""
         return MovingGoal(self.inner.in_frame(frame), self.path, _only(self.frame, frame))
 
     def _relative(self, t: Float[Array, ""], x: State) -> State:

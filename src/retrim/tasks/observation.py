@@ -1,4 +1,4 @@
-"""Observations o = h(x). Roll-outs, evaluation and flight use the same function."""
+"""Observations o = h(x); roll-outs, evaluation and flight use the same function."""
 
 import abc
 from typing import Generic, TypeVar
@@ -15,12 +15,12 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 
 M = TypeVar("M")
 
-POSITION_SCALE = 1.5  # [m], half the side of the world box of the published training set-up
+POSITION_SCALE = 1.5  # [m], half the side of the world box in the published training set-up
 VELOCITY_SCALE = 5.0  # [m/s], the same
 
 
 class AbstractObservation(eqx.Module, Generic[M]):
-    """h(x) and its memory between ticks (``M``, of fixed shape)."""
+    """Observation h(x) with a memory between ticks (``M``, of fixed shape)."""
 
     @property
     @abc.abstractmethod
@@ -36,17 +36,17 @@ class AbstractObservation(eqx.Module, Generic[M]):
         """Return one observation; called at every tick.
 
         Args:
-            memory: Result of :meth:`init` or of the last call.
-            t: Time of the task [s].
+            memory: Memory from :meth:`init` or from the previous call.
+            t: Task time [s].
             x: State.
             last: Command issued one tick ago.
 
         Returns:
-            The observation, and the new memory of the same shapes.
+            The observation, and the new memory with the same shapes.
         """
 
     def at_rest(self, x: State) -> Float[Array, " o"]:
-        """Return the observation of a vehicle at rest in ``x``; observations with noise override it to omit noise."""
+        """Return the observation of a vehicle at rest in ``x``; noisy observations override it to omit the noise."""
         o, _ = self(self.init(x), jnp.zeros_like(x.p[0]), x, Command.hover(x.p.dtype))
         return o
 
@@ -60,16 +60,16 @@ class AbstractObservation(eqx.Module, Generic[M]):
         return self
 
     def with_actuators(self, actuators: ActuatorState) -> "AbstractObservation[M]":
-        """Return the same observation with the present thrust and rates; by default they are not observed.
+        """Return the same observation with the current thrust and rates; by default they are not observed.
 
         Args:
-            actuators: Present thrust and body rates.
+            actuators: Current thrust and body rates.
         """
         del actuators
         return self
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractObservation[M]":
-        """Return the same observation for states and commands of ``frame``.
+        """Return the same observation for states and commands in ``frame``.
 
         Raises:
             FrameError: The observation does not support other frames.
@@ -80,8 +80,9 @@ class AbstractObservation(eqx.Module, Generic[M]):
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p, R, v] and the last ``history`` commands, oldest first: 15 + 4 ``history`` numbers.
 
-    The paper has ``history=0`` (15 numbers); the authors' code 3 (27 numbers), which restores the Markov property
-    under a command delay of up to three ticks. Position is relative to ``origin``; every entry is scaled to order one.
+    The paper has ``history=0`` (15 numbers). The authors' code has ``history=3`` (27 numbers), which restores the
+    Markov property under a command delay of up to three ticks. The position is relative to ``origin``, and every entry
+    is scaled to order one.
     """
 
     origin: Float[Array, "3"]
@@ -107,5 +108,5 @@ class StateObs(AbstractObservation[Float[Array, "history 4"]]):
         return jnp.concatenate([state, memory.reshape(-1)]), memory
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "StateObs":
-        """Return the observation about the same origin."""
+        """Return the observation relative to the same origin, in ``frame``."""
         return StateObs(frame.vector(self.origin), self.omega_max, self.history)

@@ -1,4 +1,4 @@
-"""Observation in flight, from keypoints in a camera image: some are outside the image, noisy, or missed."""
+"""In-flight observation of keypoints in a camera image, some of which are outside the image, noisy or missed."""
 
 import dataclasses
 from typing import NamedTuple
@@ -19,36 +19,36 @@ LEAST_NOISE = 0.5  # [px], smallest noise that the filter assumes for a camera
 
 
 class OccludedMemory(NamedTuple):
-    """Memory of the observation."""
+    """Memory of :class:`OccludedKeypoints`."""
 
     commands: Float[Array, "3 4"]
     """Commands in the world frame, newest last."""
     pose: PoseFilter
     poses: State
-    """Present estimates of the poses of the last ticks, newest last."""
+    """Current estimates of the poses at the last few ticks, newest last."""
     key: Key[Array, ""]
 
 
 class OccludedKeypoints(AbstractObservation[OccludedMemory]):
-    """The observation of :class:`Keypoints`, reconstructed from the image of a camera.
+    """The observation of :class:`Keypoints`, reconstructed from a camera image.
 
-    A point outside the image is not observed, and one inside is missed with probability ``dropout``. A filter estimates
-    the pose from the other points and the commands. The policy receives the image that belongs to the estimated pose.
-    Each correction also changes the past images, so that a correction does not look like motion.
+    A point outside the image is not observed, and a point inside it is missed with probability ``dropout``. A filter
+    estimates the pose from the other points and the commands. The policy receives the image that corresponds to the
+    estimated pose. Each correction also changes the past images, so that it does not look like motion.
 
     Use it in flight only, since gradients do not pass through the filter.
     """
 
     full: Keypoints
-    """The observation of training; ``noise`` is that of the camera."""
+    """The training observation; its ``noise`` is the camera's noise."""
     dropout: Float[Array, ""]
     """Probability that a visible point is missed in a frame."""
     lag: Command | None = None
-    """Time constants of the actuators in the filter [s]; None for actuators without lag."""
+    """Actuator time constants in the filter [s]; None for actuators without lag."""
     frame: EffectiveGravityFrame | None = None
-    """Frame of the image of the observation; the filter and ``full`` remain in the world."""
+    """Frame of the observed image; the filter and ``full`` remain in the world frame."""
     delay_ticks: int = eqx.field(static=True, default=0)
-    """Declared command delay of the plant [ticks]; the filter predicts with the command that acted."""
+    """The plant's declared command delay [ticks]; the filter predicts with the command that acted."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the delay is longer than the memory."""
@@ -95,7 +95,7 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         return o, OccludedMemory(commands, pose, poses, key)
 
     def _shown(self, poses: State, commands: Float[Array, "3 4"]) -> Float[Array, " o"]:
-        """Return the observation of these poses and commands, in the frame."""
+        """Return the observation for these poses and commands, in the frame."""
         shown, frame = self.full, self.frame
         there = jax.tree.map(lambda leaf: leaf[:: -shown.stride], poses)  # newest first
         if frame is not None:
@@ -107,7 +107,7 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         return jnp.concatenate([features, visible[0].astype(features.dtype), commands.reshape(-1)])
 
     def _corrected(self, poses: State, prior: State, new: State) -> State:
-        """Return the past poses, moved by the correction from ``prior`` to ``new``, and ``new``."""
+        """Return the past poses, moved by the correction from ``prior`` to ``new``, followed by ``new``."""
         turn, dp, dv = new.R @ prior.R.T, new.p - prior.p, new.v - prior.v
 
         def moved(x: State, ago: Float[Array, ""]) -> State:

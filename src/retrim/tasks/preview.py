@@ -27,11 +27,11 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
     omega_max: Float[Array, "3"]
     history: int = eqx.field(static=True, default=2)
     accelerations: tuple[float, ...] = eqx.field(static=True, default=())
-    """Times ahead at which acceleration and jerk of the reference are also observed [s]."""
+    """Times ahead at which the reference's acceleration and jerk are also observed [s]."""
 
     @property
     def size(self) -> int:
-        """Length of the observation: 35 + 4 ``history``."""
+        """Length of the observation: 35 + 4 ``history``, plus 6 for each entry of ``accelerations``."""
         return 3 * len(POSITIONS) + 3 * len(VELOCITIES) + 6 * len(self.accelerations) + 9 + 3 + 2 + 4 * self.history
 
     def init(self, x: State) -> Float[Array, "history 4"]:

@@ -1,7 +1,7 @@
 """Trajectories to track: position, velocity, heading and the required command, as functions of time.
 
-Every reference is a table of one type, so that a policy takes it as data: another trajectory does not need another
-compilation, and a policy that was trained on a family can fly a member that was not in its training.
+Every reference is a table of the same type, which a policy takes as data. A new trajectory therefore does not need a
+new compilation, and a policy trained on a family can fly a member that it was not trained on.
 """
 
 import math
@@ -21,20 +21,20 @@ from .abstract_reference import AbstractReference, Point, TurnedReference
 from .feasibility import unflyable
 from .flatness import STEP, Path3, flat_rows
 
-POINTS = 1024  # number of rows of a table
+POINTS = 1024  # number of rows in a table
 
 
 class Reference(AbstractReference):
-    """A trajectory, sampled evenly; see :meth:`of`."""
+    """An evenly sampled trajectory; see :meth:`of`."""
 
     rows: Float[Array, "n 18"]
     """Rows with the fields of :class:`Point`."""
     every: Float[Array, ""]
     """Time between rows [s]."""
     lap: Float[Array, "2"]
-    """Start and end of the lap that repeats [s]; two equal values if the last row is held."""
+    """Start and end of the repeating lap [s]; equal if the last row is held."""
     joins: Float[Array, "m 2"]
-    """Spans of time in which a roll-out may start [s]; each is equally likely."""
+    """Time spans in which a roll-out may start [s]; each is equally likely."""
     since: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     """Time of the first row [s]."""
 
@@ -43,18 +43,19 @@ class Reference(AbstractReference):
         """Sample a path.
 
         Args:
-            path: Function of the time since take-off [s] that returns x, y, z, world [m], and the heading [rad] if it
-                is not 0, which may jump by whole turns. It is evaluated in [0, ``seconds``], and a few milliseconds
-                beyond if there is a lap.
+            path: Function of the time since take-off [s]. It returns the world coordinates x, y, z [m] and, if it is
+                not 0, the heading [rad], which may jump by whole turns. The function is evaluated in [0, ``seconds``],
+                and a few milliseconds beyond if there is a lap.
             seconds: End of the table [s].
-            lap: Start of the lap, which repeats from here to the end [s]; None if the end is held.
+            lap: Start of the repeating lap, which extends to the end [s]; None if the end is held.
             points: Number of rows. References with the same number of rows share one compiled program.
 
         Returns:
-            The table, with velocities and commands from differences of the path.
+            The table, with velocities and commands from finite differences of the path.
 
         Raises:
-            ValueError: The sizes are invalid; or the path does not return 3 or 4 finite numbers, with the time.
+            ValueError: The sizes are invalid, or the path does not return 3 or 4 finite numbers; the message then
+                contains the time.
         """
         if not (seconds > 0 and points >= 2 and (lap is None or 0 <= lap < seconds)):
             raise ValueError(f"Reference: seconds = {seconds}, lap = {lap}, points = {points} cannot be")
@@ -66,7 +67,7 @@ class Reference(AbstractReference):
         return cls(jnp.asarray(rows), jnp.array(times[1]), jnp.array(ends), jnp.array(joins))
 
     def __call__(self, t: Float[Array, ""]) -> Point:
-        """Return the reference at time ``t`` [s], interpolated linearly between rows; hover once the end is held."""
+        """Return the reference at time ``t`` [s], linearly interpolated between rows; hover once the end is held."""
         start, end = self.lap[0], self.lap[1]
         length = end - start
         folded = start + (t - start) % jnp.where(length > 0, length, 1.0)
@@ -83,7 +84,9 @@ class Reference(AbstractReference):
         return Point(row[:3], v, u, row[10], moving[:3], moving[3:6], moving[6])
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the cross-track error: from ``p`` to the polygon of rows of the lap, or of all rows without a lap [m].
+        """Return the cross-track error [m]: the distance from ``p`` to the polyline of the lap's rows.
+
+        Without a lap, the polyline contains all rows.
 
         Args:
             p: Position, world [m].
@@ -104,29 +107,29 @@ class Reference(AbstractReference):
     def infeasibility(self, vehicle: Vehicle) -> str | None:
         """Return the reasons why the vehicle cannot fly the reference, in words; None if it can fly all of it.
 
-        Reasons are: a start or end at speed, jumps of velocity, a lap that does not close, thrust, falling faster than
-        free fall, body rates, and positions below the ground.
+        Possible reasons are a start or end at speed, velocity jumps, a lap that does not close, excessive thrust, a
+        descent faster than free fall, excessive body rates, and positions below the ground.
 
         Args:
-            vehicle: Vehicle that is to fly the reference.
+            vehicle: Vehicle to fly the reference.
         """
         lap = (float(self.lap[0] - self.since), float(self.lap[1] - self.since))
         return "; ".join(unflyable(np.asarray(self.rows, dtype=float), float(self.every), lap, vehicle)) or None
 
 
 def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, every: float = 0.02) -> Reference:
-    """Join a family into one table, one member after another, for training.
+    """Join a family of references end to end into one table for training.
 
     Args:
         references: The members.
-        seconds: Time of each member [s]; roll-outs of up to 4 s stay within it.
+        seconds: Duration of each member [s]; roll-outs of up to 4 s stay within it.
         every: Time between rows [s].
 
     Returns:
-        A reference without a lap. A roll-out starts in any member, but not within 5 s of its end.
+        A reference without a lap. A roll-out may start in any member, but not within 5 s of its end.
 
     Raises:
-        ValueError: The family is empty, or the time is too short.
+        ValueError: The family is empty, or the duration is too short.
     """
     if not references or seconds < 6.0:
         raise ValueError(f"joined: {len(references)} references of {seconds} s; at least 1, of at least 6 s")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from .reference import Reference
 
 RAMP = 3.0  # [s], duration of a smooth start
-SIDEWAYS = 12.0  # [m/s^2], largest acceleration of shapes at a chosen speed, which are enlarged to satisfy it
+SIDEWAYS = 12.0  # [m/s^2], largest acceleration at a chosen speed; shapes are enlarged to satisfy it
 
 
 def smooth_start(t: float, ramp: float = RAMP) -> float:
@@ -14,7 +14,7 @@ def smooth_start(t: float, ramp: float = RAMP) -> float:
 
     Args:
         t: Time since take-off [s].
-        ramp: Time until the lap has its full speed [s].
+        ramp: Time until the full speed is reached [s].
 
     Returns:
         Time along the lap [s]; from ``ramp`` on it is ``t - ramp / 2``.
@@ -24,12 +24,12 @@ def smooth_start(t: float, ramp: float = RAMP) -> float:
 
 
 def circle(radius: float = 1.0, period: float = 3.0, ramp: float = RAMP) -> Reference:
-    """Return a horizontal circle through (0, 0, 1) about (radius, 0, 1), first towards -y (paper, Fig. 4: 1 m, 3 s).
+    """Return a horizontal circle about (radius, 0, 1) from (0, 0, 1), initially towards -y (paper, Fig. 4: 1 m, 3 s).
 
     Args:
         radius: Radius [m].
-        period: Time of a lap [s].
-        ramp: Time of the smooth start [s].
+        period: Duration of a lap [s].
+        ramp: Duration of the smooth start [s].
     """
 
     def path(t: float) -> list[float]:
@@ -45,8 +45,8 @@ def figure8(length: float = 3.0, width: float = 1.0, period: float = 5.0, ramp: 
     Args:
         length: Extent along x [m].
         width: Extent along y [m].
-        period: Time of a lap [s].
-        ramp: Time of the smooth start [s].
+        period: Duration of a lap [s].
+        ramp: Duration of the smooth start [s].
     """
 
     def path(t: float) -> list[float]:
@@ -61,8 +61,8 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Refere
 
     Args:
         radius: Circumradius [m].
-        period: Time of a lap [s].
-        ramp: Time of the smooth start [s].
+        period: Duration of a lap [s].
+        ramp: Duration of the smooth start [s].
     """
     corners = [math.pi + k * math.radians(216.0) for k in range(6)]
     vertices = [(radius + radius * math.cos(a), radius * math.sin(a)) for a in corners]
@@ -77,23 +77,23 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Refere
 
 
 def lissajous(period: float = 5.5, ramp: float = RAMP) -> Reference:
-    """Return a horizontal figure-8 of 2 m x 1 m from (0, 0, 1), the size in the flights of RAPTOR (5.5 s, 10 s).
+    """Return a horizontal 2 m x 1 m figure-8 from (0, 0, 1), the size in RAPTOR's flights (5.5 s, 10 s).
 
     Args:
-        period: Time of a lap [s].
-        ramp: Time of the smooth start [s].
+        period: Duration of a lap [s].
+        ramp: Duration of the smooth start [s].
     """
     return figure8(2.0, 1.0, period, ramp)
 
 
 def circle_at(speed: float) -> Reference:
-    """Return the circle at ``speed`` [m/s]; its radius grows to limit the acceleration of the vehicle."""
+    """Return the circle at ``speed`` [m/s]; its radius grows to limit the vehicle's acceleration."""
     radius = max(1.0, speed**2 / SIDEWAYS)
     return circle(radius, 2.0 * math.pi * radius / speed, ramp=max(RAMP, speed))
 
 
 def figure8_at(speed: float, length: float = 3.0, width: float = 1.0) -> Reference:
-    """Return a figure-8 with a top speed; its size grows to limit the acceleration of the vehicle.
+    """Return a figure-8 with a given top speed; its size grows to limit the vehicle's acceleration.
 
     Args:
         speed: Top speed [m/s].
@@ -114,7 +114,7 @@ def lissajous_at(speed: float) -> Reference:
 
 
 def star_at(speed: float) -> Reference:
-    """Return the star of 1 m at ``speed`` [m/s], also through its corners."""
+    """Return the star with a radius of 1 m at a constant ``speed`` [m/s], including the corners."""
     edge = 2.0 * math.sin(math.radians(72.0))
     return star(1.0, 5.0 * edge / speed)
 

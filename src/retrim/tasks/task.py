@@ -1,4 +1,4 @@
-"""A task: its starts, reward, termination and error."""
+"""Interface of a task: starts, reward, termination and error."""
 
 import abc
 import math
@@ -22,23 +22,25 @@ class Start(eqx.Module):
     """State and time at the start of a roll-out."""
 
     t: Float[Array, ""]
-    """Time of the task [s], since a roll-out may join a reference at any time."""
+    """Task time [s]; a roll-out may join a reference at any time."""
     x: State
     member: Member | None = None
-    """Vehicle of the roll-out, and the belief of its policy about it; None for the vehicle of the model."""
+    """Vehicle of the roll-out and the policy's belief about it; None for the model's vehicle."""
 
 
-NEAR = 1.0  # [m]: largest distance of a start from the target along an axis
-BOX = 5.0  # [m]: largest distance of a flight from the target along an axis
+NEAR = 1.0  # [m]: largest distance between a start and the target along an axis
+BOX = 5.0  # [m]: largest distance between the vehicle and the target along an axis
 TILT = 0.1 * math.pi  # [rad], 18 degrees
-SPEED = 0.1  # [m/s]: standard deviation of the velocity of a start, relative to the target
+SPEED = 0.1  # [m/s]: standard deviation of a start's velocity, relative to the target
 
 
 class AbstractTask(eqx.Module):
-    """One drone, one task. Times are seconds since the start; positions are world coordinates [m].
+    """Base class of tasks, each for one vehicle.
 
-    A custom task defines ``home``, ``reward``, ``observation``, ``dt`` and ``horizon``, and ``target`` if its target
-    moves; the other methods have defaults.
+    Times are in seconds since the start; positions are in world coordinates [m].
+
+    A custom task defines ``home``, ``reward``, ``observation``, ``dt`` and ``horizon``. If its target moves, it also
+    defines ``target``. The other methods have defaults.
 
     Example::
 
@@ -58,15 +60,15 @@ class AbstractTask(eqx.Module):
 
         @property
         def dt(self) -> float:
-            """Control tick [s]; static."""
+            """Length of a control tick [s]; static."""
 
         @property
         def horizon(self) -> int:
-            """Number of ticks of one training roll-out; static."""
+            """Number of ticks in one training roll-out; static."""
 
         @property
         def observation(self) -> AbstractObservation[Any]:
-            """Observation h(x) of training."""
+            """Observation h(x) used in training."""
     else:
         dt: eqx.AbstractVar[float]
         horizon: eqx.AbstractVar[int]
@@ -74,27 +76,27 @@ class AbstractTask(eqx.Module):
 
     @property
     def observation_in_flight(self) -> AbstractObservation[Any]:
-        """Observation used in flight; by default that of training."""
+        """Observation used in flight; by default the training observation."""
         return self.observation
 
     @property
     def rests(self) -> bool:
-        """Whether the vehicle comes to rest at home, so that ``adapt.trim`` applies; by default if no target moves."""
+        """Whether the vehicle comes to rest at home, so that ``adapt.trim`` applies; by default for fixed targets."""
         return type(self).target is AbstractTask.target
 
     @property
     def metric(self) -> str:
-        """Name of the error in results."""
+        """Name of the error metric in results."""
         return "steady_error_m"
 
     @property
     def flight_seconds(self) -> float:
-        """Default length of a flight [s]."""
+        """Default duration of a flight [s]."""
         return 30.0
 
     @property
     def steady_seconds(self) -> float:
-        """Length of the final part of a flight over which its error is averaged as its score [s]."""
+        """Duration of the final part of a flight, over which the error is averaged to give the score [s]."""
         return 2.0
 
     @abc.abstractmethod
@@ -102,21 +104,24 @@ class AbstractTask(eqx.Module):
         """Return the position around which flights start, world [m]."""
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the target position of the vehicle at time ``t`` [s], world [m]."""
+        """Return the vehicle's target position at time ``t`` [s], world [m]."""
         return self.home()
 
     def setpoint(self, t: Float[Array, ""]) -> Point:
-        """Return the reference at time ``t`` [s], for controllers that follow one; by default rest at the target."""
+        """Return the reference at time ``t`` [s], for controllers that follow one; by default, rest at the target."""
         p = self.target(t)
         rest, none = jnp.zeros_like(p), jnp.zeros_like(p[0])
         hover = jnp.zeros(4, dtype=p.dtype).at[0].set(STANDARD_GRAVITY)
         return Point(p, rest, hover, none, rest, rest, none)
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Draw a start; by default at any time of a flight, within 1 m, 18 degrees and 0.1 m/s of the moving target.
+        """Draw a start; by default, near the target at a random time of a flight.
+
+        The default position is within 1 m of the target and the attitude within 18 degrees of level, both per axis. The
+        standard deviation of the velocity relative to the target is 0.1 m/s per axis.
 
         Args:
-            key: Random key, consumed.
+            key: Random key; consumed.
         """
         k_time, kp, ka, kv = random.split(key, 4)
         t = self.flight_seconds * random.uniform(k_time)
@@ -127,30 +132,30 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return the reward r(x_t, u_t), differentiable in x and u.
+        """Return the reward r(x_t, u_t), which must be differentiable in x and u.
 
         Args:
-            t: Time of the task [s].
+            t: Task time [s].
             x: State at ``t``.
-            u: Command that acts from ``t`` on.
+            u: Command that acts from ``t`` onwards.
         """
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Return whether the vehicle has left the bounds, by default 5 m from the target along an axis.
+        """Return whether the vehicle has left the bounds; by default, more than 5 m from the target along any axis.
 
-        It must be true also for a state that is not finite.
+        It must also be true for a state that is not finite.
         """
         return ~within(jnp.array(BOX), x, self.target(t))
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Return the error of a state, by default the distance from the target position [m]."""
+        """Return the error of a state; by default, the distance from the target position [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractTask":
-        """Return the same task for states and commands of ``frame``.
+        """Return the same task for states and commands in ``frame``.
 
-        By default, reward, bounds and error are those of the state in the world and of the command in the frame, in
-        which hover is the hover command.
+        By default, reward, bounds and error are evaluated for the state in the world and the command in the frame. In
+        the frame, hovering requires the hover command.
 
         Raises:
             FrameError: The observation does not support other frames.
@@ -158,17 +163,17 @@ class AbstractTask(eqx.Module):
         return FramedTask(self, self.observation.in_frame(frame), frame, self.dt, self.horizon)
 
     def cross_track(self, x: State) -> Float[Array, ""] | None:
-        """Return the distance from the nearest point of the reference [m]; None for a task without a reference."""
+        """Return the distance to the nearest point on the reference [m]; None for a task without a reference."""
         return None
 
 
 class FramedTask(AbstractTask):
-    """A task for states and commands of a frame."""
+    """A task for states and commands in a frame."""
 
     task: AbstractTask
-    """Task in the world."""
+    """The task in the world frame."""
     observation: AbstractObservation[Any]
-    """Observation of states of the frame."""
+    """Observation of states in the frame."""
     frame: EffectiveGravityFrame
     dt: float = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
@@ -182,7 +187,7 @@ class FramedTask(AbstractTask):
         return self.frame.vector(self.task.target(t))
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return the reward of the state in the world and of the command in the frame."""
+        """Return the reward for the world state and the command in the frame."""
         return self.task.reward(t, self.frame.world_state(x), u)
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
@@ -190,22 +195,22 @@ class FramedTask(AbstractTask):
         return self.task.terminated(t, self.frame.world_state(x))
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Return the error of the state in the world."""
+        """Return the error of the world state."""
         return self.task.error(t, self.frame.world_state(x))
 
 
 def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Return whether ``x`` is finite, and at most ``box`` [m] from ``centre`` (world) along every axis."""
+    """Return whether ``x`` is finite and at most ``box`` [m] from ``centre`` (world) along every axis."""
     finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(x)])
     inside: Bool[Array, ""] = jnp.all(jnp.abs(x.p - centre) <= box) & jnp.all(finite)
     return inside
 
 
 def huber(y: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the Huber loss with threshold 1 of the 2-norm of ``y``: |y|^2 / 2 up to 1, |y| - 1/2 beyond.
+    """Return the Huber loss of the 2-norm of ``y``, with threshold 1: |y|^2 / 2 up to 1, and |y| - 1/2 beyond.
 
-    The paper uses "the Huber loss" of a vector and leaves open whether it applies to the norm or to each component; the
-    norm does not depend on the choice of axes. Value and gradient are exact at zero.
+    The paper uses "the Huber loss" of a vector and leaves open whether it applies to the norm or to each component. The
+    norm is used here because it does not depend on the choice of axes. The value and gradient are exact at zero.
     """
     squared = jnp.sum(y * y)
     inside = squared <= 1.0

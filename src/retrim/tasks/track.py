@@ -22,20 +22,24 @@ NOISE = 0.1 * math.pi  # [rad]
 class AbstractTrack(AbstractTask):
     """Follow a reference in space and time; subclasses differ in their reward.
 
-    A vehicle farther than ``box`` [m] from the reference along an axis is terminated.
+    The task terminates when the vehicle is farther than ``box`` [m] from the reference along any axis.
     """
 
     reference: AbstractReference
     observation: AbstractObservation[Any]
     spread: Float[Array, ""]
-    """Largest distance of starts from the reference along each axis [m]."""
+    """Largest distance between a start and the reference along each axis [m]."""
     box: Float[Array, ""]
     """Half the side of the box that moves with the reference [m]."""
     dt: float = eqx.field(static=True, default=0.02)
     horizon: int = eqx.field(static=True, default=150)
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Draw a start at any time of the reference, with a deviation of ``spread``, 0.3 m/s and 18 degrees."""
+        """Draw a start near the reference, at a random time in one of its spans.
+
+        The position deviates by at most ``spread`` and the attitude by at most 18 degrees, both per axis. The standard
+        deviation of the velocity is 0.3 m/s per axis.
+        """
         k_join, k_time, kp, ka, kv = random.split(key, 5)
         joins = self.reference.joins
         span = joins[random.randint(k_join, (), 0, joins.shape[0])]
@@ -47,18 +51,18 @@ class AbstractTrack(AbstractTask):
 
     @property
     def metric(self) -> str:
-        """Name of the error in results."""
+        """Name of the error metric in results."""
         return "tracking_error_m"
 
     @property
     def flight_seconds(self) -> float:
-        """Default length of a flight [s]: that of the paper, or less if the reference ends earlier without a lap."""
+        """Default duration of a flight [s]: the paper's value, or less if a reference without a lap ends earlier."""
         start, end = (round(float(t), 3) for t in self.reference.lap)
         return 60.0 if start < end else min(60.0, max(end, 3.0))
 
     @property
     def steady_seconds(self) -> float:
-        """Length of the final part of a flight over which its error is averaged as its score [s]."""
+        """Duration of the final part of a flight, over which the error is averaged to give the score [s]."""
         return 10.0
 
     def home(self) -> Float[Array, "3"]:
@@ -66,7 +70,7 @@ class AbstractTrack(AbstractTask):
         return _start(self.reference)
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the position of the reference at time ``t`` [s], world [m]."""
+        """Return the reference position at time ``t`` [s], world [m]."""
         return self.reference(t).p
 
     def setpoint(self, t: Float[Array, ""]) -> Point:
@@ -74,15 +78,15 @@ class AbstractTrack(AbstractTask):
         return self.reference(t)
 
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
-        """Return whether the vehicle is outside the box around the reference, or its state is not finite."""
+        """Return whether the vehicle is outside the box around the reference or its state is not finite."""
         return ~within(self.box, x, self.reference(t).p)
 
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
-        """Return the distance from the position of the reference at ``t`` [m]."""
+        """Return the distance from the reference position at ``t`` [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.reference(t).p) ** 2))
 
     def cross_track(self, x: State) -> Float[Array, ""]:
-        """Return the distance from the nearest point of the reference's lap [m]."""
+        """Return the distance to the nearest point on the reference's lap [m]."""
         return self.reference.distance(x.p)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractTrack":
@@ -106,9 +110,9 @@ class Track(AbstractTrack):
 
 
 class L2Track(AbstractTrack):
-    """Tracking with a reward five times as steep in position, around the reference's own command.
+    """Tracking with a reward that is five times as steep in position and centred on the reference's own command.
 
-    The paper's reward trades centimetres for tilt, even without a disturbance.
+    The paper's reward accepts centimetres of error for less tilt, even without a disturbance.
     """
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
@@ -125,7 +129,7 @@ class SharpTrack(L2Track):
     """Tracking with a reward that also has a tip at the reference, since a quadratic reward is flat near zero."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return the reward of :class:`L2Track` - 3 (sqrt(|p - p_ref|^2 + (1 cm)^2) - 1 cm)."""
+        """Return the reward of :class:`L2Track` minus 3 (sqrt(|p - p_ref|^2 + (1 cm)^2) - 1 cm)."""
         here = self.reference(t)
         tip = jnp.sqrt(jnp.sum((x.p - here.p) ** 2) + 0.01**2) - 0.01
         return self._reward(here, x, u) - 3.0 * tip

@@ -1,4 +1,4 @@
-"""References through the points of a file: laps that repeat, or a single path whose end is held."""
+"""References through the points of a file: repeating laps, or a single path whose end is held."""
 
 import math
 from collections.abc import Callable
@@ -14,33 +14,34 @@ from .reference import POINTS, Reference
 from .shapes import RAMP, smooth_start
 from .trajectory_table import read_table
 
-CLOSED = 0.01  # [m]; ends at a smaller distance coincide
+CLOSED = 0.01  # [m]; ends closer than this coincide
 CLOSED_YAW = 0.02  # [rad]
 SHORTEST_LAP = 0.5  # [s]
-ALONGSIDE = 0.1  # share of the speed by which two passes of one lap may differ
+ALONGSIDE = 0.1  # share of the speed by which the velocities of two passes of one lap may differ
 ROW = 0.02  # [s], largest time between rows
-AROUND = 12  # points beyond a lap's end in its spline, since the end of a spline affects about as many points
+AROUND = 12  # points added beyond a lap's end, since the end of a spline affects about that many points
 
 
 def from_csv(file: Path, laps: bool | None = None) -> Reference:
-    """Return a reference through the points of a file, by cubic splines.
+    """Return a cubic-spline reference through the points of a file.
 
-    A file is closed if its last point is within 1 cm of its first, and its yaw is the same except for whole turns; it
-    repeats as laps. A file that ends in motion at an earlier point of its path, in the same direction and at the same
-    speed, repeats from there. Laps that start in motion receive a smooth start of 3 s along the path, like the built-in
-    shapes. Any other file is flown once, from rest to rest, and its end is held. If the points at an end are too near
-    each other for a vehicle to come to rest between them, the reference remains in motion at that end, and
+    A file is closed if its last point is within 1 cm of its first and has the same yaw, up to whole turns. A closed
+    file repeats as laps. A file that ends in motion at an earlier point of its path, in the same direction and at the
+    same speed, repeats from that point. Laps that start in motion begin with a smooth start of 3 s along the path, like
+    the built-in shapes. Any other file is flown once, from rest to rest, and its end is held. If the points at an end
+    are too close together for a vehicle to stop between them, the reference remains in motion at that end, and
     :meth:`Reference.infeasibility` reports it.
 
     Args:
-        file: Times, positions and headings; for the format see :func:`retrim.tasks.trajectory_table.read_table`.
-        laps: True to require laps, False to fly any file once; None to decide by its ends.
+        file: Times, positions and headings; see :func:`retrim.tasks.trajectory_table.read_table` for the format.
+        laps: True requires laps, False flies any file once, and None decides by the ends of the file.
 
     Returns:
         The reference, with rows at most 20 ms apart. Its time 0 is that of the first point.
 
     Raises:
-        ConfigError: The file cannot be used, with the line; or ``laps`` is true and the file does not repeat.
+        ConfigError: The file cannot be used (the message contains the line), or ``laps`` is true and the file does not
+            repeat.
         OSError: The file cannot be opened.
     """
     table = read_table(Path(file))
@@ -59,7 +60,7 @@ def _once(table: np.ndarray) -> Reference:
 
 
 def _repeated(table: np.ndarray, start: float) -> Reference:
-    """Return a reference that repeats the part of the table from ``start`` [s] on, after the part before it."""
+    """Return a reference that follows the whole table once, and then repeats the part from ``start`` [s] on."""
     period = float(table[-1, 0]) - start
     spline, winding = _lap_spline(table, start)
     in_motion = float(np.linalg.norm((spline(1e-3) - spline(0.0))[:3])) / 1e-3 > REST
@@ -74,12 +75,12 @@ def _repeated(table: np.ndarray, start: float) -> Reference:
 
 
 def _lap_spline(table: np.ndarray, start: float) -> tuple[Callable[[float], np.ndarray], np.ndarray]:
-    """Return a spline that is smooth between laps, and the change of its values per lap: whole turns of yaw."""
+    """Return a spline that is smooth between laps, and its change per lap, which is whole turns of yaw."""
     table, period = table.copy(), float(table[-1, 0]) - start
     first = table[0, 1:] if start == 0.0 else _spline(table, (_end(table, 0), "not-a-knot"))(start)
     winding = np.array([0.0, 0.0, 0.0, 2.0 * math.pi * round((table[-1, 4] - first[3]) / (2.0 * math.pi))])
     along = np.clip((table[:, 0] - start) / period, 0.0, None)[:, None]
-    table[:, 1:] += along * (first + winding - table[-1, 1:])  # all points share the gap, to avoid a step at the seam
+    table[:, 1:] += along * (first + winding - table[-1, 1:])  # spread the gap over all points: no step at the seam
     if start == 0.0:
         turning = winding / period
         table[:, 1:] -= table[:, :1] * turning
@@ -100,7 +101,7 @@ def _lap_start(table: np.ndarray) -> float | None:
         return 0.0
     if _end(table, -1) == "clamped":
         return None
-    from scipy.optimize import minimize_scalar  # here, since its import takes as long as all of retrim
+    from scipy.optimize import minimize_scalar  # local, because it takes as long to import as all of retrim
 
     spline, end, last = _spline(table, (_end(table, 0), "not-a-knot")), float(table[-1, 0]), table[-1, 1:]
     times = np.linspace(0.0, end, 8 * len(table))
@@ -143,7 +144,7 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _end(table: np.ndarray, which: int) -> str:
-    """Return the boundary condition of a spline: at rest, or in motion if a vehicle could not stop between points."""
+    """Return the boundary condition at an end of a spline: rest, or motion if a vehicle cannot stop between points."""
     near = table[:4] if which == 0 else table[-4:]
     at, beside = near[which, 0], near[1 if which == 0 else -2, 0]
     speed = float(np.linalg.norm(_spline(near, "not-a-knot")(at, 1)[:3]))
@@ -151,11 +152,11 @@ def _end(table: np.ndarray, which: int) -> str:
 
 
 def _spline(table: np.ndarray, ends: str | tuple[str, str]) -> Any:
-    from scipy.interpolate import CubicSpline  # here, since its import takes as long as all of retrim
+    from scipy.interpolate import CubicSpline  # local, because it takes as long to import as all of retrim
 
     return CubicSpline(table[:, 0], table[:, 1:], bc_type=ends)
 
 
 def _points(seconds: float) -> int:
-    """Return a sufficient number of rows, as a multiple of that of the built-in shapes."""
+    """Return a sufficient number of rows, which is a multiple of the number in the built-in shapes."""
     return POINTS * math.ceil(seconds / (ROW * (POINTS - 1)))

@@ -1,4 +1,4 @@
-"""Text files of a trajectory: separators, comments, header, numbers; errors contain the line of the fault."""
+"""Reader of trajectory text files: separators, comments, header and numbers; errors contain the faulty line."""
 
 import csv
 import math
@@ -19,7 +19,7 @@ LEFT_OUT = re.compile(
     r"|(?:v|vel|velocity|a|acc|accel|acceleration|a_lin|a_rot|j|jerk|s|snap|w|omega|rates?|alpha|tau|torque)[_.]?[xyz]"
     r"|(?:q|quat|orientation)[_.]?[wxyz]|q[0-3]|u[_.]?\d|thrust|roll|pitch|yaw_?(?:rate|dot)|d?heading_?rate"
 )
-"""Usual names of columns that the positions and the yaw determine, and names that begin with _."""
+"""Usual names of columns that are determined by positions and yaw, and names that begin with _; these are not read."""
 UNITS = {
     "t": ("s", "sec", "second", "seconds"),
     **dict.fromkeys("xyz", ("m", "meter", "meters", "metre", "metres")),
@@ -30,28 +30,30 @@ FARTHEST = 1000.0  # [m]
 LARGEST_YAW = 2.0 * math.pi + 0.1  # [rad]; larger values look like degrees
 LONGEST = 600.0  # [s]
 FASTEST = 100.0  # [m/s] between points
-SAME_TIME, SAME_PLACE, SAME_YAW = 1e-6, 1e-3, 0.02  # [s], [m], [rad]; a point within these of the last repeats it
-SLOWEST = 0.02  # [m/s]; a vehicle of up to 20 m/s whose times are in ms seems to be slower
+SAME_TIME, SAME_PLACE, SAME_YAW = 1e-6, 1e-3, 0.02  # [s], [m], [rad]; a point this near the last one repeats it
+SLOWEST = 0.02  # [m/s]; a vehicle of up to 20 m/s appears slower than this if its times are in ms
 
 
 def read_table(file: Path) -> np.ndarray:
     """Read the points of a trajectory file.
 
     Args:
-        file: UTF-8 text with one point per line. Columns are separated by comma, semicolon, tab or spaces; ``#`` starts
-            a comment; blank lines, quotes and separators at the end of a line are ignored. A header names the columns,
-            in any order: t (time, timestamp), x, y, z (p_x, pos_x, position.x), yaw (heading, psi), with or without
-            units in brackets. Columns of velocities, accelerations, quaternions, rates and thrusts by their usual
-            names, and columns whose name begins with ``_``, are not read, since the positions determine them. Without a
-            header the order is t, x, y, z[, yaw]. A comment of column names before the first point is also a header. A
-            point that repeats the one before, for example where two segments meet, is left out.
+        file: UTF-8 text with one point per line. Commas, semicolons, tabs or spaces separate the columns, and ``#``
+            starts a comment. Blank lines, quotes and separators at the end of a line are ignored. A header names the
+            columns, in any order: t (time, timestamp), x, y, z (p_x, pos_x, position.x), yaw (heading, psi), with or
+            without units in brackets. Columns with the usual names of velocities, accelerations, quaternions, rates and
+            thrusts are not read, since the positions determine them. Columns whose name begins with ``_`` are not read
+            either. Without a header, the order is t, x, y, z[, yaw]. A comment before the first point that contains the
+            column names is also a header. A point that repeats the previous one, for example where two segments meet,
+            is left out.
 
     Returns:
-        One row per point: time since the first point [s], x, y, z, world [m], and unwrapped yaw [rad]; 0 without yaw.
+        One row per point: time since the first point [s], world position x, y, z [m], and unwrapped yaw [rad], which is
+        0 without a yaw column.
 
     Raises:
-        ConfigError: The file does not have this format, with the line; times do not increase; or values are not
-            plausible.
+        ConfigError: The file does not have this format (the message contains the line), times do not increase, or
+            values are implausible.
         OSError: The file cannot be opened.
     """
     if file.exists() and not file.is_file():
@@ -95,14 +97,14 @@ def read_table(file: Path) -> np.ndarray:
 
 
 def _repeats(point: list[float], last: list[float]) -> bool:
-    """Return whether a point has the time, the position and the heading of the last one."""
+    """Return whether a point has the same time, position and heading as the last one."""
     turned = math.remainder(point[4] - last[4], 2.0 * math.pi) if len(point) > 4 else 0.0
     near = math.dist(point[1:4], last[1:4]) <= SAME_PLACE and abs(turned) <= SAME_YAW
     return near and abs(point[0] - last[0]) <= SAME_TIME
 
 
 def _lines(text: str) -> Iterator[tuple[int, str, bool]]:
-    """Yield number and content of every line that is not blank, and whether the whole line is a comment."""
+    """Yield the number and content of every non-blank line, and whether the whole line is a comment."""
     for number, line in enumerate(text.splitlines(), start=1):
         content, _, comment = line.partition("#")
         if content.strip():
@@ -130,7 +132,7 @@ def _words(line: str) -> list[str]:
 
 
 def _header(words: list[str], *, comment: bool) -> list[str] | None:
-    """Return the columns that a header names; None if the line is not a header.
+    """Return the column names in a header; None if the line is not a header.
 
     Raises:
         ConfigError: The header contains an unexpected column, or lacks a required one.
@@ -141,7 +143,7 @@ def _header(words: list[str], *, comment: bool) -> list[str] | None:
     names = [part[1].lower() if part else word for part, word in zip(parts, words, strict=True)]
     names = [ALIASES.get(name, POSITION.sub(r"\1", name) if POSITION.fullmatch(name) else name) for name in names]
     if comment and not set(COLUMNS[:4]) <= set(names):
-        return None  # a remark
+        return None  # an ordinary comment
     for word, name, part in zip(words, names, parts, strict=True):
         if name not in COLUMNS:
             if LEFT_OUT.fullmatch(name):

@@ -1,4 +1,4 @@
-"""Transition from one reference to another in flight, without jumps of position, velocity, acceleration or jerk."""
+"""Transition from one reference to another in flight, without jumps in position, velocity, acceleration or jerk."""
 
 from collections.abc import Sequence
 
@@ -16,15 +16,15 @@ from .feasibility import beyond_limits
 from .flatness import FULL_TURN, flat_command
 from .reference import Reference
 
-BEFORE = 1.0  # [s], part of the old reference in the table of a transition
+BEFORE = 1.0  # [s], duration of the old reference in the table of a transition
 LASTING = (2.0, 3.0, 4.0, 6.0, 8.0)  # [s], possible durations; the first one that the vehicle can fly is used
 
 
 def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehicle) -> Reference:
-    """Return a reference that equals ``old`` until ``at``, then changes to ``new`` and remains there.
+    """Return a reference that follows ``old`` until ``at``, and then changes to ``new``.
 
-    ``new`` begins at ``at``, from rest, while its share grows by a 7th-order smooth step. The step is slow enough for
-    the vehicle to fly it, but lasts at most eight seconds.
+    ``new`` begins from rest at ``at``, and its share grows in a 7th-order smooth step. The step is slow enough for the
+    vehicle to fly, but lasts at most eight seconds.
 
     Args:
         old: Reference before the transition.
@@ -33,8 +33,8 @@ def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehic
         vehicle: Vehicle of the flight.
 
     Returns:
-        A table with the sizes of ``old``, so that it can replace it in a compiled program. It begins a second before
-        ``at``; a roll-out may start in the lap of ``new``.
+        A table with the same sizes as ``old``, so that it can replace ``old`` in a compiled program. It begins one
+        second before ``at``. A roll-out may start in the lap of ``new``.
     """
     for lasting in LASTING:
         table = _table(old, new, at, lasting)
@@ -44,10 +44,10 @@ def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehic
 
 
 class Spliced(AbstractReference):
-    """Successive references of a flight as one reference; see :func:`spliced`."""
+    """A flight's successive references, combined into one; see :func:`spliced`."""
 
     pieces: Reference
-    """Tables of one size; every leaf has a leading axis."""
+    """Tables of equal size; every leaf has a leading axis."""
     began: Float[Array, " k"]
     """Time from which each piece is followed [s], in order."""
 
@@ -58,7 +58,7 @@ class Spliced(AbstractReference):
 
     @property
     def joins(self) -> Float[Array, "m 2"]:
-        """Spans of the last piece [s]."""
+        """Time spans of the last piece in which a roll-out may start [s]."""
         return self.pieces.joins[-1]
 
     def __call__(self, t: Float[Array, ""]) -> Point:
@@ -68,7 +68,7 @@ class Spliced(AbstractReference):
         return piece(t)
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the distance from ``p`` to the nearest lap of all pieces [m]."""
+        """Return the distance from ``p`` to the nearest lap of any piece [m]."""
         return jnp.min(jax.vmap(lambda piece: piece.distance(p))(self.pieces))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> TurnedReference:
@@ -77,10 +77,10 @@ class Spliced(AbstractReference):
 
 
 def spliced(pieces: Sequence[tuple[float, Reference]]) -> Spliced:
-    """Return the successive references of a flight as one reference.
+    """Combine a flight's successive references into one reference.
 
     Args:
-        pieces: Time from which each reference was followed [s], in order, and the reference; tables of one size.
+        pieces: Time from which each reference was followed [s], and the reference, in order; tables of equal size.
     """
     began, tables = zip(*pieces, strict=True)
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)

@@ -1,4 +1,4 @@
-"""Observation of a policy for many vehicles: that of its task, the actuators, and the belief about the vehicle."""
+"""Observation of a policy for many vehicles: task observation, actuators, and the belief about the vehicle."""
 
 import dataclasses
 from typing import Any, TypeVar
@@ -16,28 +16,28 @@ M = TypeVar("M")
 
 
 class VehicleObs(AbstractObservation[M]):
-    """o = [o of the task, thrust, body rates and their slope, belief]: 15 more numbers than that of the task.
+    """o = [task observation, thrust, body rates and their slope, belief]: 15 more numbers than the task observation.
 
-    The observation of the task should contain as many past commands as the longest delay has ticks, since these may
-    still be under way. A slow vehicle continues to turn long after the last of them, so thrust and rates are also
-    observed. The belief is the centre and the half width of the interval of each coordinate of the command path; see
+    The task observation should contain as many past commands as the longest delay has ticks, since these may not have
+    acted yet. A slow vehicle continues to turn long after the last of them, so the thrust and rates are also observed.
+    The belief contains the centre and half-width of the interval for each coordinate of the command path; see
     :class:`~retrim.physics.path_family.PathBelief`.
     """
 
     inner: AbstractObservation[M]
-    """Observation of the task."""
+    """Task observation."""
     omega_max: Float[Array, "3"]
     """Scale of body rates [rad/s]."""
     belief: PathBelief
     actuators: ActuatorState
-    """Present thrust and body rates."""
+    """Current thrust and body rates."""
 
     @classmethod
     def of(cls, inner: AbstractObservation[M], omega_max: Float[Array, "3"], belief: PathBelief) -> "VehicleObs[M]":
-        """Return the observation of a vehicle that hovers.
+        """Return the observation of a hovering vehicle.
 
         Args:
-            inner: Observation of the task.
+            inner: Task observation.
             omega_max: Scale of body rates [rad/s].
             belief: Belief about the vehicle.
         """
@@ -45,7 +45,7 @@ class VehicleObs(AbstractObservation[M]):
 
     @property
     def size(self) -> int:
-        """Length of the observation: that of the task, plus 15."""
+        """Length of the observation: that of the task observation plus 15."""
         return self.inner.size + 7 + 2 * COORDINATES
 
     def init(self, x: State) -> M:
@@ -53,7 +53,7 @@ class VehicleObs(AbstractObservation[M]):
         return self.inner.init(x)
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
-        """Return the observation of the task, and the scaled actuators and belief."""
+        """Return the task observation with the scaled actuators and belief."""
         seen, memory = self.inner(memory, t, x, last)
         acting, slope = self.actuators.command, self.actuators.slope
         thrust = (acting.c / STANDARD_GRAVITY - 1.0)[None]
@@ -61,15 +61,15 @@ class VehicleObs(AbstractObservation[M]):
         return jnp.concatenate([seen, *(each.astype(seen.dtype) for each in scaled)]), memory
 
     def with_belief(self, belief: PathBelief) -> "VehicleObs[M]":
-        """Return the same observation with another belief."""
+        """Return the same observation with a different belief."""
         return dataclasses.replace(self, belief=belief)
 
     def with_actuators(self, actuators: ActuatorState) -> "VehicleObs[M]":
-        """Return the same observation with the present thrust and body rates."""
+        """Return the same observation with the current thrust and body rates."""
         return dataclasses.replace(self, actuators=actuators)
 
     def at_rest(self, x: State) -> Float[Array, " o"]:
-        """Return the observation of a vehicle that rests in ``x``."""
+        """Return the observation of a vehicle at rest in ``x``."""
         hover = Command.hover(x.p.dtype)
         still = self.with_actuators(ActuatorState.at(hover))
         return still(self.init(x), jnp.zeros_like(x.p[0]), x, hover)[0]

@@ -1,4 +1,4 @@
-"""Hover that keeps its keypoints in sight, since points outside the image can only be used from memory."""
+"""Hover that keeps the keypoints in sight, since points outside the image can be used only from memory."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from .hover import L2Hover
 from .keypoints import Keypoints
 
 EDGE = 0.9  # share of half an image within which points are kept
-FARTHEST = 4.0  # multiple of half an image at which the distance of a point is clipped
+FARTHEST = 4.0  # multiple of half an image at which a point's distance is clipped
 WEIGHT = 10.0  # weight of a point half an image outside, compared with 8 for a metre from the goal
 
 
@@ -18,7 +18,7 @@ class ViewHover(L2Hover):
     """Hover with a reward for keeping keypoints in the image; its observation is :class:`Keypoints`."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return the reward of :class:`L2Hover` - 10 times the mean distance of points outside the image."""
+        """Return the reward of :class:`L2Hover` minus 10 times the mean distance by which points leave the image."""
         seen: Keypoints = self.observation  # type: ignore[assignment]  # a field of the base class
         pixels = jax.vmap(seen.camera.project)(in_camera(x, seen.ground())).pixel
         outside = jax.nn.relu(jnp.abs(jnp.clip(pixels, -FARTHEST, FARTHEST)) - EDGE)

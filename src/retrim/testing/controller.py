@@ -1,4 +1,4 @@
-"""Conformance suite of controllers."""
+"""Conformance suite for controllers."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ def check_controller(controller: AbstractController[Any], *, x0: State | None = 
     """Check a controller.
 
     Args:
-        controller: The controller.
-        x0: Start state for the controller.
+        controller: Controller to check.
+        x0: Start state of the check.
 
     Raises:
         AssertionError: A law is broken.

@@ -1,9 +1,9 @@
-"""A peer that implements CRTP like a Crazyflie and simulates the plant ``bem``: for tests, and for trials of a link.
+"""A peer that implements CRTP like a Crazyflie and simulates the plant ``bem``, for tests and trials of a link.
 
 ``python -m retrim.testing.crazyflie_peer --disturbance large`` runs until Ctrl-C. It implements only the part of the
-firmware that :mod:`retrim` needs (versions, the log, arming, the commander of the firmware, the manual setpoint, the
-reaction to missing setpoints) and the requests that a client makes before that. The vehicle is one of retrim's: only
-the protocol is that of a Crazyflie.
+firmware that :mod:`retrim` needs (versions, the log, arming, the firmware's commander, the manual setpoint, and the
+reaction to missing setpoints), and the requests that a client makes first. The vehicle is one of retrim's; only the
+protocol is that of a Crazyflie.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from ..plants.bridges.crtp import Packet
 from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
 
 VERSION = 12  # version of the protocol
-LEVELS_S, STOPS_S = 0.5, 2.0  # times without a setpoint until it levels, and until it stops the motors [s]
+LEVELS_S, STOPS_S = 0.5, 2.0  # times without a setpoint until it levels, and until it stops its motors [s]
 READY_S = 0.5  # time after the start before arming is possible [s]
 FULL = 65_535.0  # full thrust
 VARIABLES = {**crtp.STATUS_LOG, "stateEstimate.x": "f", "stateEstimate.y": "f", **crtp.STATE_LOG}
@@ -46,7 +46,7 @@ class CrazyfliePeer:
         self.vehicle = PeerVehicle(scenario, heading=0.0, seed=seed)
         self._began = time.monotonic()
         self.armed = self.locked = self.cut = False
-        """State flags: armed; locked by its own supervisor; link cut, so that it neither receives nor sends."""
+        """Whether it is armed, whether its supervisor has locked it, and whether the link is cut in both directions."""
         self._place: np.ndarray | None = None
         self._yaw = 0.0
         self._lands = False
@@ -194,7 +194,7 @@ class CrazyfliePeer:
             self._send(packet._replace(body=body[:2].ljust(2, b"\0") + bytes([self._ordered(body)])))
 
     def _ordered(self, body: bytes) -> int:
-        """Execute a request about a log block; return its error code, 0 if it succeeded."""
+        """Execute a request about a log block; return its error code, which is 0 on success."""
         if body[0] == crtp.RESET:
             self._blocks, self._periods = {}, {}
         elif body[0] in (crtp.CREATE, crtp.APPEND):

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def shapes(tree: Any) -> Any:
-    """Return structure, shapes and types of a pytree."""
+    """Return the structure, the shapes and the types of a pytree."""
     return jax.tree.structure(tree), [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(tree)]
 
 
@@ -19,7 +19,7 @@ def require(holds: bool, law: str) -> None:
 
 
 def close(found: Any, expected: Any, tolerance: float, law: str) -> None:
-    """Raise ``AssertionError`` with the law if an error is larger than the tolerance, or not a number."""
+    """Raise ``AssertionError`` with the law if an error is NaN or larger than the tolerance."""
     away = float(np.max(np.abs(np.asarray(found) - np.asarray(expected))))
     if not away <= tolerance:
         raise AssertionError(f"broken law: {law}; found {np.asarray(found)}, expected {np.asarray(expected)}")

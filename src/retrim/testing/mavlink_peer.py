@@ -1,4 +1,4 @@
-"""A peer that implements MAVLink like PX4 and simulates the plant ``bem``: for tests, and for trials of a link.
+"""A peer that implements MAVLink like PX4 and simulates the plant ``bem``, for tests and trials of a link.
 
 ``python -m retrim.testing.mavlink_peer --disturbance large`` runs until Ctrl-C. It implements only the part of PX4 that
 :mod:`retrim` needs: arming, offboard mode, both kinds of setpoints, landing, and the failsafe for missing setpoints.
@@ -48,7 +48,7 @@ class MavlinkPeer:
         self._place, self._yaw = np.zeros(3), math.pi / 2
         self._told, self._tick, self._thrust = -math.inf, 0, 0.0
         self.failsafes = 0
-        """Number of times that setpoints stopped in offboard mode."""
+        """Number of times that setpoints have stopped in offboard mode."""
         self._takes: dict[str, Callable[[Any], None]] = {
             "SET_ATTITUDE_TARGET": self._take_rates, "SET_POSITION_TARGET_LOCAL_NED": self._take_place,
             "COMMAND_LONG": self._take_command, "TIMESYNC": self._answer_time,
@@ -80,7 +80,7 @@ class MavlinkPeer:
         self._socket.close()
 
     def _commanded(self) -> np.ndarray:
-        """Return the command that acts on the vehicle: the setpoint, or that of the autopilot's own controller."""
+        """Return the command that acts on the vehicle: the setpoint, or the output of its own controller."""
         stale = time.monotonic() - self._told > FAILSAFE_S
         if self.mode == OFFBOARD and stale:
             self.mode, self.failsafes, self._place, self._rates = HOLD, self.failsafes + 1, self.vehicle.p.copy(), None
@@ -133,7 +133,7 @@ class MavlinkPeer:
             self._send(self._out.timesync_encode(int(self._now() * 1e9), m.ts1))
 
     def _now(self) -> float:
-        """Return the time of its own clock, which has another origin and runs slowly."""
+        """Return the time of its own clock, which has a different origin and runs too slowly."""
         return 0.99 * (time.monotonic() % 1e5)
 
     def _say(self) -> None:
@@ -156,7 +156,7 @@ class MavlinkPeer:
         if not self.cut:
             try:
                 self._socket.sendto(data, self._to)
-            except OSError:  # the receiver does not listen yet, or no longer
+            except OSError:  # the receiver is not listening yet, or no longer listens
                 return
 
 

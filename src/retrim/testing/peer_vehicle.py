@@ -22,20 +22,20 @@ GROUND = 0.05  # height below which a vehicle touches the ground [m]
 
 
 class PeerVehicle:
-    """The vehicle; it is on the ground at the origin until it lifts off. :meth:`step` advances it by 0.01 s."""
+    """A vehicle on the ground at the origin, until it lifts off; :meth:`step` advances it by 0.01 s."""
 
     def __init__(self, scenario: Scenario, *, heading: float, seed: int = 0) -> None:
         """Build a vehicle.
 
         Args:
             scenario: Plant, vehicle and disturbance.
-            heading: Heading of the nose, from east counter-clockwise [rad].
+            heading: Heading of the nose, counter-clockwise from east [rad].
             seed: Seed of the disturbance.
         """
         vehicle = scenario.make_vehicle("small")
         self._plant = scenario.make("small", dt=DT, seed=seed)
         self.x, self.omega = _standing(0.0, 0.0, heading), np.zeros(3)
-        """State p, R, v, and body rates."""
+        """State [p, R, v], and body rates."""
         self.flies = False
         low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
         fence = np.full(3, 1e3)
@@ -74,7 +74,7 @@ class PeerVehicle:
         self.x = np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
 
     def stand(self) -> None:
-        """Put the vehicle on the ground at the current position, upright."""
+        """Put the vehicle upright on the ground at the current position."""
         self.flies, self.omega = False, np.zeros(3)
         self.x = _standing(self.p[0], self.p[1], frames.heading_of(self.R))
 
@@ -86,7 +86,7 @@ class PeerVehicle:
         return u
 
     def forget(self) -> None:
-        """Reset the integral of the position controller, which compensates the disturbance."""
+        """Reset the position controller's integral, which compensates the disturbance."""
         self._hover.integral[:] = 0.0
 
     def close(self) -> None:
@@ -109,10 +109,10 @@ def _standing(x: float, y: float, yaw: float) -> np.ndarray:
 
 
 def fly_until_interrupted(step: Callable[[], None], address: str) -> None:
-    """Call a step function every 0.01 s, until Ctrl-C.
+    """Call a step function every 0.01 s until Ctrl-C.
 
     Args:
-        step: The function.
+        step: Function to call.
         address: Description of the peer's address, for the printed message.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)

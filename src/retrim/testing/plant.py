@@ -1,4 +1,4 @@
-"""Conformance suite of plants."""
+"""Conformance suite for plants."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ def check_plant(make: Callable[[], Plant], *, x0: State | None = None, settle_s:
     Args:
         make: Builds a plant without disturbances.
         x0: Start state; by default 1.5 m above the ground.
-        settle_s: Time within which a body rate must be reached, to a factor of two [s].
+        settle_s: Time within which a body rate must be reached, within a factor of two [s].
 
     Raises:
         AssertionError: A law is broken.

@@ -1,7 +1,7 @@
-"""Runs PX4's own simulation and a simulated motion capture on this machine, for flights without a vehicle.
+"""Runs PX4's own simulation and simulated motion capture on this machine, for flights without a vehicle.
 
 ``python -m retrim.testing.px4 PACKAGE`` runs both until Ctrl-C. PACKAGE is a folder with ``bin/px4`` and ``etc``. PX4
-listens on every address of the machine; a network namespace isolates it.
+listens on every address of the machine; a network namespace can isolate it.
 """
 
 import os
@@ -17,31 +17,31 @@ from ..errors import PlantError
 from ..plants.bridges.endpoint import UdpEndpoint
 from ..plants.bridges.mavlink_link import MavlinkLink
 
-GROUND_STATION = 14550  # port to which PX4 sends in addition to the one for a companion computer
+GROUND_STATION = 14550  # port to which PX4 sends, in addition to the port for a companion computer
 PAYLOAD = 14030  # a further port to which PX4 sends
 SEEN = 50.0  # rate of the motion capture [Hz]
 MOCAP = {
     "EKF2_EV_CTRL": 15, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3, "EKF2_EV_DELAY": 8, "EKF2_EV_NOISE_MD": 1,
     "EKF2_EVP_NOISE": 0.02, "EKF2_EVV_NOISE": 0.05, "EKF2_EVA_NOISE": 0.05,
 }  # fmt: skip
-"""Parameters with which PX4 uses motion capture and no GPS."""
+"""Parameters with which PX4 uses motion capture instead of GPS."""
 TIMING = {"IMU_INTEG_RATE": 400, "COM_OBL_RC_ACT": 5}
 """Parameters for states every 10 ms, and for position hold when setpoints stop."""
 
 
 class Px4Simulation:
-    """A process of PX4 with its own physics. It is a context manager: leaving it ends the process."""
+    """A PX4 process with its own physics; leaving the context ends the process."""
 
     def __init__(self, package: Path, run: Path, **parameters: float) -> None:
         """Prepare the simulation without starting it.
 
         Args:
             package: Folder with ``bin/px4`` and ``etc``.
-            run: An empty folder for its files.
-            parameters: Parameters of PX4, in addition to those for motion capture.
+            run: Empty folder for the files of the process.
+            parameters: PX4 parameters, in addition to those for motion capture.
 
         Raises:
-            PlantError: There is no PX4 in the package.
+            PlantError: The package does not contain PX4.
         """
         self._package, self._run = package.resolve(), run.resolve()
         self._parameters = MOCAP | TIMING | parameters

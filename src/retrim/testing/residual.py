@@ -1,4 +1,4 @@
-"""Conformance suite of residual models."""
+"""Conformance suite for residual models."""
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ def check_residual(model: ResidualModel, *, fits: int = 5, tolerance: float = 0.
     """Check a residual model.
 
     Args:
-        model: The model.
+        model: Residual model to check.
         fits: Number of fits after which the model must have learned a constant acceleration.
         tolerance: Largest error of its prediction after the fits, as a share of the acceleration.
 

@@ -1,7 +1,7 @@
-"""A peer on ROS 1 that simulates the plant ``bem``: for tests, and for trials of a node without a vehicle.
+"""A peer on ROS 1 that simulates the plant ``bem``, for tests and trials of a node without a vehicle.
 
 ``python -m retrim.testing.ros_peer http://127.0.0.1:11311 --disturbance large`` runs until Ctrl-C. It flies to the
-start and publishes odometry, or poses only. It follows attitude targets while it receives them, and holds its position
+start and publishes odometry or only poses. It follows attitude targets while it receives them, and holds its position
 when they stop.
 """
 
@@ -30,8 +30,8 @@ class RosPeer:
         Args:
             master: URI of the rosmaster.
             scenario: Plant, vehicle and disturbance.
-            place: Position where it waits, world [m].
-            yaw: Heading where it waits [rad].
+            place: Position at which it waits, world [m].
+            yaw: Heading with which it waits [rad].
             poses: Whether it publishes poses instead of odometry.
         """
         rospy = join(master)

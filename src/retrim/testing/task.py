@@ -1,4 +1,4 @@
-"""Conformance suite of tasks."""
+"""Conformance suite for tasks."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def check_task(task: AbstractTask, *, starts: int = 16) -> None:
     """Check a task.
 
     Args:
-        task: The task.
+        task: Task to check.
         starts: Number of random starts to check.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Conformance suite of vehicle links. It arms and flies the vehicle, which must be a simulated one."""
+"""Conformance suite for vehicle links; it arms and flies the vehicle, which must be a simulated one."""
 
 import functools
 import time
@@ -29,7 +29,7 @@ def check_vehicle(
     Args:
         make: Builds a link to a vehicle on the ground.
         place: Position of the flight, world [m].
-        hover_s: Duration of hover by thrust and body rates [s].
+        hover_s: Duration of hovering by thrust and body rates [s].
 
     Raises:
         AssertionError: A law is broken.

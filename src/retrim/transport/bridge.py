@@ -30,15 +30,15 @@ class Bridge:
             there: Second bus.
             out: Topics from here to there.
             into: Topics from there to here.
-            slowly: Those topics that are published more often than necessary; at most one message in ``EVERY`` is
+            slowly: Topics that are published more often than necessary; at most one message per ``EVERY`` seconds is
                 carried.
-            known: Version of each topic up to which messages are not carried; None: every message is carried.
+            known: Version of each topic up to which messages are not carried; None to carry every message.
             clock: Monotonic clock [s].
         """
         self._routes = [(here, there, topic) for topic in out] + [(there, here, topic) for topic in into]
         self._slowly, self._clock = frozenset(slowly), clock
         self.known = {topic: 0 for _, _, topic in self._routes} | dict(known or {})
-        """Version of each topic up to which it is carried."""
+        """Version of each topic up to which messages have been carried."""
         self._carried = dict.fromkeys(self._slowly, float("-inf"))
         self.refused = 0
         """Number of messages that the other bus rejected."""

@@ -1,4 +1,4 @@
-"""The bus between the processes of a live flight: the last message of each topic."""
+"""The bus between the processes of a live flight, which holds the last message of each topic."""
 
 import abc
 from typing import NamedTuple
@@ -8,7 +8,7 @@ class Message(NamedTuple):
     """The last published message of a topic."""
 
     version: int
-    """Version; it increases with every message of the topic, from 1."""
+    """Version; it starts at 1 and increases with every message of the topic."""
     data: bytes
 
 
@@ -22,7 +22,7 @@ class Bus(abc.ABC):
 
     @property
     def fault(self) -> str:
-        """Reason why the other end is not received; empty if no fault is known."""
+        """Reason why the other end's messages are not received; empty if no fault is known."""
         return ""
 
     @abc.abstractmethod
@@ -38,11 +38,11 @@ class Bus(abc.ABC):
         """Return the last message of ``topic``, complete and unchanged.
 
         Args:
-            topic: Name.
+            topic: Name of the topic.
             after: Version that the caller already has.
 
         Returns:
-            None if there is no newer one.
+            The message; None if there is no newer one.
 
         Raises:
             MessageError: There is no such topic.

@@ -11,7 +11,7 @@ class InProcessBus(Bus):
     """A dictionary behind a lock."""
 
     def __init__(self, capacities: Mapping[str, int]) -> None:
-        """Build a bus; ``capacities`` are the maximum lengths of messages, by topic, in bytes."""
+        """Build a bus; ``capacities`` holds the maximum message length of each topic [bytes]."""
         self._capacities, self._lock = dict(capacities), threading.Lock()
         self._last = dict.fromkeys(capacities, Message(0, b""))
 

@@ -1,4 +1,4 @@
-"""Removes buses in shared memory that are no longer in use because all of their processes were killed.
+"""Removes buses in shared memory that are left over because all of their processes were killed.
 
 Each process that has joined a bus holds a lock on a file in the folder of the topics. The operating system releases it
 when the process ends for any reason. A bus without a held lock is left over.
@@ -14,7 +14,10 @@ LOCK = "lock"
 
 
 def begin(folder: Path) -> int:
-    """Create the lock of a new bus and hold it; return its descriptor. The lock file appears only once it is held."""
+    """Create and hold the lock of a new bus, and return its descriptor.
+
+    The lock file appears only once the lock is held.
+    """
     made = folder / f"{LOCK}.new"
     descriptor = os.open(made, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
     fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -38,11 +41,11 @@ def hold(folder: Path) -> int:
 
 
 def clear(base: Path, prefix: str) -> list[Path]:
-    """Remove the buses of this user that are left over; return their folders.
+    """Remove this user's leftover buses, and return their folders.
 
     Args:
         base: Parent folder of the buses.
-        prefix: Prefix of their names. A folder without a lock has another owner, or is just being created.
+        prefix: Prefix of their names. A folder without a lock has a different owner, or is just being created.
     """
     cleared = []
     for folder in base.glob(f"{prefix}*"):

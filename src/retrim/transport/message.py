@@ -32,12 +32,12 @@ class ArrayLike(Protocol):
 
     @property
     def dtype(self) -> Any:
-        """Type of its elements."""
+        """Type of the elements."""
         ...
 
 
 def pack_arrays(arrays: Mapping[str, Any], *, kind: str, about: Mapping[str, str]) -> bytes:
-    """Return the bytes of a message; the inverse of :func:`unpack_arrays`. Equal content has equal bytes.
+    """Return the bytes of a message, the inverse of :func:`unpack_arrays`; equal content gives equal bytes.
 
     Args:
         arrays: Arrays by name.
@@ -53,7 +53,7 @@ def describe(data: bytes, *, kind: str, source: str) -> dict[str, str]:
     """Return the header of a message.
 
     Raises:
-        MessageError: It is not a complete message of this format and ``kind``.
+        MessageError: The data is not a complete message of this format and ``kind``.
     """
     header = _header(data, source)
     if (result := header.get("kind", UNNAMED)) != kind:
@@ -65,7 +65,7 @@ def kind_of(data: bytes, *, source: str) -> str:
     """Return the kind of a message.
 
     Raises:
-        MessageError: It is not a complete message of this format.
+        MessageError: The data is not a complete message of this format.
     """
     return _header(data, source).get("kind", UNNAMED)
 
@@ -83,7 +83,7 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
         The arrays, in the order of ``expected``.
 
     Raises:
-        MessageError: The message is truncated, damaged, of another kind or shape, or has values that are not finite.
+        MessageError: The message is truncated, damaged, of a different kind or shape, or has non-finite values.
     """
     header = describe(data, kind=kind, source=source)
     try:

@@ -1,7 +1,7 @@
 """Common parts of the buses between machines: every listener keeps the last message of each topic.
 
-A message carries its version and the number of its writer. A restarted writer does not know the last version of its
-predecessor. Readers recognise it by its new number, and versions continue to increase for every reader. A message from
+A message carries its version and the number of its writer. A restarted writer does not have its predecessor's last
+version. Readers recognise it by its new number, and versions continue to increase for every reader. A message from
 the same writer that is not newer is dropped. Ends that share a key sign their messages
 (:mod:`retrim.transport.session`) and reject all others.
 """
@@ -20,7 +20,7 @@ from .session import MARK, MISSING, Session
 HEAD = struct.Struct("<QQ")
 """Writer and version, before each message."""
 OTHER = 0
-"""Writer of messages that a session has accepted; no writer has that number."""
+"""Writer number of messages that a session has accepted; no real writer has it."""
 DISTRUST = 5.0  # time within which an end with the key must be received, after a message from one without it [s]
 FAREWELL = 0.3  # time for a message to leave the machine before a bus is closed [s]
 
@@ -33,7 +33,7 @@ class NetworkBus(Bus):
 
         Args:
             capacities: Maximum length of a message, by topic [bytes].
-            session: Signs messages and decides which are accepted; None: all are accepted.
+            session: Signs messages and decides which are accepted; None to accept all.
         """
         self._refused, self._fault, self._talk = 0, "", session
         self._answering: threading.Thread | None = None
@@ -45,7 +45,7 @@ class NetworkBus(Bus):
 
     @abc.abstractmethod
     def _send(self, topic: str, frame: bytes) -> None:
-        """Send a message to the network. This may block, so that a process with deadlines must not hold such a bus."""
+        """Send a message to the network. This may block, so a process with deadlines must not use such a bus."""
 
     @property
     def refused(self) -> int:
@@ -54,7 +54,7 @@ class NetworkBus(Bus):
 
     @property
     def fault(self) -> str:
-        """Reason why the other end is not received; empty if no fault is known."""
+        """Reason why the other end's messages are not received; empty if no fault is known."""
         return self._fault if self._talk is None else self._talk.fault
 
     def publish(self, topic: str, data: bytes) -> None:
@@ -105,7 +105,7 @@ class NetworkBus(Bus):
             self._send(topic, self._talk.seal(topic, message.version, message.data))
 
     def _begin(self) -> None:
-        """Start a thread that answers greetings of the other end: the receiving thread must not wait for a send."""
+        """Start a thread that answers the other end's greetings, as the receiving thread must not wait for a send."""
         if self._talk is not None:
             self._answering = threading.Thread(target=self._answer, daemon=True)
             self._answering.start()
@@ -123,7 +123,7 @@ class NetworkBus(Bus):
             self._attend()
 
     def _attend(self) -> None:
-        """Send the pending messages of the session: a greeting, and the last messages of this end to a new end."""
+        """Send the pending messages of the session: a greeting, and this end's last messages to a new end."""
         if self._talk is None:
             return
         due = self._talk.due()

@@ -23,9 +23,9 @@ class Address:
     host: str
     port: int
     key: str = ""
-    """Key of one vehicle among several at the same address."""
+    """Key that selects one vehicle among several at the same address."""
     shared: SharedKey | None = field(default=None, repr=False, compare=False)
-    """Shared key of all ends that may publish there; None: any end may."""
+    """Shared key of all ends that may publish there; None if any end may."""
 
     def __str__(self) -> str:
         """Return the text that :meth:`of` reads."""
@@ -40,7 +40,7 @@ class Address:
             shared: Key of all ends that may publish there.
 
         Raises:
-            ConfigError: It is not an address.
+            ConfigError: The text is not an address.
         """
         result = ADDRESS.fullmatch(text)
         if not result or result["kind"] not in KINDS or not 1 <= int(result["port"]) <= 65_535:
@@ -69,11 +69,11 @@ class Address:
         Args:
             capacities: Maximum length of a message, by topic [bytes].
             listen: Wait there for other ends; for ROS 1, the master does so.
-            writes: Topics that this end writes. Readers are connected to them immediately. Otherwise they would be
-                connected with the first message, which may also be the last one.
+            writes: Topics that this end writes. Readers are connected to them immediately. Otherwise, they would be
+                connected only by the first message, which may also be the last one.
 
         Raises:
-            ConfigError: It cannot be joined.
+            ConfigError: The bus cannot be joined.
         """
         greeting, where = GREETINGS[0 if listen else 1], f"{self.host}:{self.port}"
         session = None if self.shared is None else Session(self.shared, self.key, greeting)
@@ -97,7 +97,7 @@ def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
 
     Args:
         texts: For example ``zenoh:192.168.1.5:7447``.
-        key: File with the key that the flights also have; None: the key of ``RETRIM_KEY``, if it is set.
+        key: File with the key that the flights also have; None for the key in ``RETRIM_KEY``, if it is set.
 
     Raises:
         ConfigError: There is no address, an address is invalid, or the key cannot be read.

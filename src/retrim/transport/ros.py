@@ -11,7 +11,7 @@ PREFIX = "/retrim"
 
 
 class RosBus(NetworkBus):
-    """One end of the bus. Ends in one process share its node, which exists as long as the process."""
+    """One end of the bus. Ends in one process share its node, which lives as long as the process."""
 
     def __init__(
         self,
@@ -27,9 +27,9 @@ class RosBus(NetworkBus):
         Args:
             capacities: Maximum length of a message, by topic [bytes].
             master: URI of the rosmaster, for example ``http://127.0.0.1:11311``.
-            key: Key of one vehicle among several.
+            key: Key that selects one vehicle among several.
             writes: Topics that are written here; others are declared with their first message.
-            session: Signs messages; None: messages are not signed.
+            session: Signs messages; None if messages are not signed.
 
         Raises:
             ConfigError: rospy is not installed, or there is no master.

@@ -1,11 +1,11 @@
 """Authenticates the messages between two ends that share a key.
 
 Each end draws a random number when it starts. A message contains the number of its sender, the number of its receiver,
-and a count. HMAC-SHA256 covers all of them, the topic, the vehicle and the payload. An end accepts a message only if it
-contains this end's own number and is newer than the previous ones. Messages of an earlier session and repeated messages
-are therefore rejected, even by an end that has just been started, and clocks need not be synchronised. An end that
-receives from another end for the first time sends it a greeting with its own number. The last message of each topic is
-then sent once more, to the new end.
+and a count. HMAC-SHA256 covers these, the topic, the vehicle and the payload. An end accepts a message only if the
+message contains that end's own number and is newer than all previous ones. Messages from an earlier session and
+repeated messages are therefore rejected, even by an end that has just been started, and clocks need not be
+synchronised. When an end receives a message from another end for the first time, it sends that end a greeting with its
+own number. The last message of each topic is then sent once more, to the new end.
 """
 
 import hmac
@@ -50,7 +50,7 @@ class Session:
         """
         self.greeting = greeting
         self.fault = ""
-        """Reason why messages are refused before the other end is accepted; empty afterwards."""
+        """Reason why messages are refused until the other end is accepted; empty afterwards."""
         self.refused = 0
         """Number of refused messages: forged or repeated."""
         self.pending = threading.Event()
@@ -65,11 +65,11 @@ class Session:
         self._lock = threading.RLock()
 
     def seal(self, topic: str, count: int, data: bytes) -> bytes:
-        """Return a signed message for the other end; counts of a topic must increase."""
+        """Return a signed message for the other end; the counts of a topic must increase."""
         return self._sealed(topic, self._peer, count, data)
 
     def open(self, topic: str, frame: bytes) -> tuple[int, bytes] | None:
-        """Return count and payload of a message if it is new, from the other end, and addressed to this end."""
+        """Return the count and payload of a message if it is new, from the other end, and addressed to this end."""
         if not frame.startswith(MARK) or len(frame) < HEAD.size:
             self._refuse(UNSIGNED)
             return None

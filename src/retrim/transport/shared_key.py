@@ -29,7 +29,7 @@ class SharedKey:
 
 
 def read_key(file: Path | None) -> SharedKey | None:
-    """Return the key of a file, or that of the variable ``RETRIM_KEY``; None if there is neither.
+    """Return the key from a file or from the variable ``RETRIM_KEY``; None if there is neither.
 
     The variable is removed from the environment, so that processes that are started later do not inherit it.
 

@@ -1,9 +1,9 @@
-"""A bus in shared memory, for processes of one machine: without a broker and without blocking.
+"""A bus in shared memory for the processes of one machine, without a broker and without blocking.
 
 Each topic is a file that is mapped into memory, with two slots. A writer fills the slot that does not hold the last
-message, and then publishes its version. If the writer is killed before that, the last message remains intact. A reader
-copies a message and compares its version and its checksum. If the writer has published twice in that time, the reader
-tries again.
+message, and then publishes its version. If the writer is killed before publishing, the last message remains intact. A
+reader copies a message and compares its version and its checksum. If the writer has published twice in that time, the
+reader tries again.
 """
 
 import json
@@ -55,7 +55,7 @@ class SharedMemoryBus(Bus):
     def create(cls, capacities: Mapping[str, int]) -> "SharedMemoryBus":
         """Create a bus in a new folder that only this user can read; :meth:`remove` removes it.
 
-        Buses that are left over from processes that were killed are removed.
+        Leftover buses of killed processes are removed.
 
         Args:
             capacities: Maximum length of a message, by topic [bytes].
@@ -84,10 +84,10 @@ class SharedMemoryBus(Bus):
             os.close(lock)
 
     def take_in(self, file: Path) -> Path:
-        """Copy a file to the folder of the topics, where it exists as long as they do; return the copy.
+        """Copy a file to the folder of the topics, where it exists as long as they do, and return the copy.
 
         Raises:
-            OSError: It cannot be read, or there is not enough space; the bus is then removed.
+            OSError: The file cannot be read, or there is not enough space; the bus is then removed.
         """
         try:
             return Path(shutil.copy(file, self.folder / file.name))

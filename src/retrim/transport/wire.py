@@ -14,13 +14,13 @@ T = TypeVar("T")
 
 
 def names(tree: Any) -> dict[str, Any]:
-    """Return leaves by their dotted path, for example ``layers.0.weight``."""
+    """Return the leaves by their dotted paths, for example ``layers.0.weight``."""
     paths = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in paths}
 
 
 def pack(tree: Any, *, kind: str, about: Mapping[str, str]) -> bytes:
-    """Return the bytes of a message; the inverse of :func:`unpack`.
+    """Return the bytes of a message, the inverse of :func:`unpack`.
 
     Args:
         tree: A pytree of arrays.
@@ -43,7 +43,7 @@ def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
         The pytree.
 
     Raises:
-        MessageError: The message is truncated, damaged, of another kind or shape, or has values that are not finite.
+        MessageError: The message is truncated, damaged, of a different kind or shape, or has non-finite values.
     """
     arrays = unpack_arrays(data, names(like), kind=kind, source=source)
     tree: T = jax.tree.unflatten(jax.tree.structure(like), jax.device_put(list(arrays.values())))

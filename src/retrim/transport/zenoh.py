@@ -1,4 +1,4 @@
-"""A bus between machines over zenoh: peers without a broker or discovery. One end listens, others connect.
+"""A bus between machines over zenoh: peers without a broker or discovery; one end listens, the others connect.
 
 Needs the extra ``zenoh``.
 """
@@ -34,9 +34,9 @@ class ZenohBus(NetworkBus):
             capacities: Maximum length of a message, by topic [bytes].
             endpoint: For example ``tcp/192.168.1.5:7447``.
             listen: Wait there for other ends; otherwise, try to connect to a listening end without a time limit.
-            key: Key of one vehicle among several.
+            key: Key that selects one vehicle among several.
             writes: Topics that are written here; others are declared with their first message.
-            session: Signs messages; None: messages are not signed.
+            session: Signs messages; None if messages are not signed.
 
         Raises:
             ConfigError: zenoh is not installed, or it is not possible to listen there.
@@ -57,7 +57,7 @@ class ZenohBus(NetworkBus):
             "connect/endpoints": [] if listen else [endpoint],
             "connect/timeout_ms": -1,
             "connect/exit_on_failure": False,
-            # These times reconnect a returning peer quickly.
+            # With these times, a returning peer is reconnected quickly.
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         }.items():
             config.insert_json5(name, json.dumps(value))

@@ -18,7 +18,7 @@ COLORS = (ADAPTED, BASE, UPDATE, PUSH, "#CC79A7", "#56B4E9")
 
 @dataclass(frozen=True)
 class Curve:
-    """One line, or points only with ``marks``."""
+    """One line, or only points if ``marks`` is true."""
 
     x: np.ndarray
     y: np.ndarray
@@ -26,7 +26,7 @@ class Curve:
     dashed: bool = False
     marks: bool = False
     color: int | None = None
-    """Index of the colour; the next one by default."""
+    """Index of the colour; by default the next one."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,13 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> "ma
 def heat_map(
     titles: Sequence[str], rows: Sequence[str], columns: Sequence[str], values: np.ndarray
 ) -> "matplotlib.figure.Figure":
-    """Draw tables of figures as colours, next to each other; dark is large, each on its own logarithmic scale.
+    """Draw tables of numbers as colours, side by side; darker is larger, on a logarithmic scale for each table.
 
     Args:
         titles: Title of each table.
         rows: Labels of the rows.
         columns: Labels of the columns.
-        values: Tables x rows x columns, not negative; infinity is written as such, NaN is left white.
+        values: Tables x rows x columns, not negative; infinity is written as such, and NaN is left white.
     """
     size = (2.6 + len(titles) * (0.6 + 0.75 * len(columns)), 1.2 + 0.3 * len(rows))
     with sheet(size, 9.0, boxed=True) as figure:
@@ -103,7 +103,7 @@ def heat_map(
 def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> "matplotlib.figure.Figure":
     """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight.
 
-    An infinite value is a crashed flight; the number of crashes is written at the bar's position.
+    An infinite value means a crashed flight; the number of crashes is written at the bar's position.
     """
     methods = list(dict.fromkeys(method for group in groups.values() for method in group))
     with sheet((max(6.0, 1.1 * len(groups) * len(methods)), 4.5), 10.0) as figure:

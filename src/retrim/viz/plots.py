@@ -18,7 +18,7 @@ T = TypeVar("T")
 # Okabe and Ito's colours, distinguishable with any colour vision.
 BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
 GROUPS = (BASE, ADAPTED, "#CC79A7", "#56B4E9")
-LAPS_S = 10.0  # time at the end of a flight for which its path is drawn from above [s]
+LAPS_S = 10.0  # duration at the end of a flight for which its path is drawn from above [s]
 MOST_WORDS = 8  # maximum number of marks with text
 ASPECT = 720 / 1280  # aspect ratio of a camera's image, whose axes both run from -1 to 1
 
@@ -39,7 +39,7 @@ class Track:
     last_s: float = 2.0
     """Duration at the end of the flight over which it is scored [s]."""
     marks: tuple[tuple[float, str], ...] = ()
-    """Time [s] and text of each action of a person."""
+    """Time [s] and text of each user action."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def flight_figure(
     spans: Sequence[Span],
     beside: Callable[["matplotlib.axes.Axes"], None],
 ) -> "matplotlib.figure.Figure":
-    """Draw the error over time of all groups, with a thick line for the mean; ``beside`` draws the right panel."""
+    """Draw the errors of all groups over time, with thick lines for the means; ``beside`` draws the right panel."""
     with sheet((13.0, 5.4), 11.0) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.9, 1))
         figure.suptitle(title, fontsize=14, fontweight="bold", color=INK)
@@ -91,7 +91,7 @@ def flight_figure(
 
 
 def save(figure: "matplotlib.figure.Figure", folder: Path, name: str) -> list[Path]:
-    """Write PNG and SVG; return their paths."""
+    """Write a PNG and an SVG file; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{kind}" for kind in ("png", "svg")]
     for path in paths:
@@ -101,14 +101,14 @@ def save(figure: "matplotlib.figure.Figure", folder: Path, name: str) -> list[Pa
 
 
 def _coloured(groups: Sequence[Group[T]]) -> Iterator[tuple[Sequence[T], str, str]]:
-    """Return tracks, colour and name of each group."""
+    """Yield the tracks, the colour and the name of each group."""
     for group in groups:
         yield group.tracks, GROUPS[group.colour % len(GROUPS)], group.name
 
 
 def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans: Sequence[Span]) -> None:
     every = [track for group in groups for track in group.tracks]
-    finite = [track.error[np.isfinite(track.error)] for track in every]  # a flight may end with errors that are NaN
+    finite = [track.error[np.isfinite(track.error)] for track in every]  # errors at the end of a flight may be NaN
     top = 1.15 * max((float(error.max()) for error in finite if len(error)), default=1.0)
     for span in spans:
         axes.axvspan(span.start, span.end, color=PUSH, alpha=0.28 if span.strong else 0.13, linewidth=0)
@@ -118,7 +118,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
         )  # fmt: skip
     swaps = sorted({round(t, 2) for track in every for t in track.swaps})
-    few = len(swaps) <= 12  # many lines would hide the flights: they are then marked along the time axis
+    few = len(swaps) <= 12  # many lines would hide the flights, so that only ticks on the time axis are drawn
     for i, t in enumerate(swaps):
         axes.axvline(
             t, ymax=1.0 if few else 0.03, color=UPDATE, linestyle="--" if few else "-", linewidth=1.2,
@@ -147,7 +147,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
 
 
 def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top: float) -> None:
-    """Draw the actions of a person: a line for each, with text if there are few."""
+    """Draw the user's actions: a line for each, with text if there are few."""
     for i, (t, words) in enumerate(marks):
         axes.axvline(t, color=INK, linestyle=":", linewidth=1.2, label=None if i else "somebody acts")
         if len(marks) <= MOST_WORDS:
@@ -156,7 +156,7 @@ def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top
 
 
 def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tuple[float, float, float]) -> None:
-    """Draw the paths from above, to the goal."""
+    """Draw the paths to the goal, seen from above."""
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(tracks):
             axes.plot(track.p[:, 0], track.p[:, 1], color=color, alpha=0.35, linewidth=0.9)
@@ -178,7 +178,7 @@ def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tu
 
 
 def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
-    """Draw the paths of the last ten seconds from above, on top of the lap (points x 3)."""
+    """Draw the paths of the last ten seconds, seen from above, on top of the lap (points x 3)."""
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(track for track in tracks if not track.crashed):
@@ -192,7 +192,7 @@ def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.n
 
 
 def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], wanted: np.ndarray) -> None:
-    """Draw image points in the first flight of each group; ``wanted`` (7 x 2): their positions at the goal."""
+    """Draw image points in the first flight of each group; ``wanted`` (7 x 2) holds their positions at the goal."""
     for sightings, color, name in _coloured(groups):
         for sighting in sightings[:1]:
             seen = np.where(sighting.visible[:, :, None], sighting.pixel, np.nan)

@@ -1,5 +1,7 @@
-"""A blank figure, without the global state of pyplot. matplotlib is imported only when the first figure is drawn, so
-that commands start faster."""
+"""A blank figure, without the global state of pyplot.
+
+matplotlib is imported only when the first figure is drawn, so that commands start faster.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +18,7 @@ def sheet(size: tuple[float, float], font_size: float, *, boxed: bool = False) -
     Args:
         size: Width and height [inch].
         font_size: Size of the font [pt].
-        boxed: Whether axes have a line on all four sides, or only below and on the left.
+        boxed: Whether axes have lines on all four sides; otherwise only below and on the left.
     """
     import matplotlib
     from matplotlib.figure import Figure

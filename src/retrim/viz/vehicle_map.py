@@ -1,4 +1,4 @@
-"""Draws maps of vehicles: lag across, delay up, and the error of each vehicle in colour."""
+"""Draws maps of vehicles: lag on the x axis, delay on the y axis, and the error of each vehicle in colour."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING

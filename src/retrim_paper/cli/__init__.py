@@ -1,1 +1,1 @@
-"""Commands of the command line."""
+"""Command-line commands."""

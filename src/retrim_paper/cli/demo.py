@@ -1,4 +1,4 @@
-"""``retrim demo``: pretraining, flight and adaptation in a minute."""
+"""The command ``retrim demo``: pretraining, flight and adaptation in a minute."""
 
 import sys
 import threading
@@ -21,16 +21,16 @@ def demo(
     slow: bool = True,
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Pretrain a hover policy, push it, re-train it in flight, and fly a second quadrotor that is not known.
+    """Pretrain a hover policy, push it, re-train it in flight, and fly a second, unknown quadrotor.
 
     Args:
         preset: hover/retrim and hover/fast train in seconds; hover/paper and hover/released take about a minute.
-        plant: simple: rotors with linear drag, the fastest; bem: blade-element rotors; the others are extras.
+        plant: simple has rotors with linear drag and is the fastest; bem has blade-element rotors; others are extras.
         seconds: Length of a flight.
-        starts: Flights per disturbance and method, each from another start.
-        seed: Seed of training and flights.
-        slow: Whether the second quadrotor, with a slow rate loop, is flown.
-        out: Folder for the policy, results.json and the pictures; a new one under runs/ by default.
+        starts: Flights per disturbance and method, each from a different start.
+        seed: Seed for training and flights.
+        slow: Whether to fly the second quadrotor, which has a slow rate loop.
+        out: Folder for the policy, results.json and the pictures; by default a new folder under runs/.
     """
 
     def ordered(stop: threading.Event) -> int:

@@ -1,4 +1,4 @@
-"""``retrim gauntlet``."""
+"""The command ``retrim gauntlet``."""
 
 from .. import tables
 from .reproduce import command_of

@@ -1,4 +1,4 @@
-"""``retrim reproduce``: one command per table, with the options of the function that makes the table."""
+"""The command ``retrim reproduce``: one subcommand per table, with the options of the function that makes it."""
 
 import inspect
 import sys
@@ -18,11 +18,11 @@ Ordered = Callable[[threading.Event], int]
 
 
 def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable[..., Ordered]:
-    """Return a command with the options of a table, and with ``out`` and ``on``.
+    """Return a command with a table's options, and with ``out`` and ``on``.
 
     Args:
         make: Function that makes a document from a run and a reporter.
-        called: Name of the command, for the folder of its runs.
+        called: Name of the command, used for the folder of its runs.
     """
     name, options = make.__name__, options_of(make)
 

@@ -1,1 +1,1 @@
-"""DATT, a learned baseline: a network that is trained by reinforcement learning, with an L1 estimator."""
+"""DATT, a learned baseline: a network trained by reinforcement learning, with an L1 estimator."""

@@ -1,4 +1,4 @@
-"""Samples of PPO, and their generalised advantage estimates."""
+"""PPO samples and their generalised advantage estimates."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from retrim.learn.problem import Outcome
 
 
 class Seen(NamedTuple):
-    """Samples, with leading axes of steps and environments."""
+    """Samples, with leading axes for steps and environments."""
 
     o: Float[Array, "... o"]
     action: Float[Array, "... a"]
@@ -24,10 +24,10 @@ def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: 
     """Return the generalised advantage estimates (Schulman et al. 2016, Eq. 16).
 
     Args:
-        seen: Samples; an episode that ends in one step does not continue in the next.
-        last: Value of the states after the last step.
-        discount: gamma.
-        trace: lambda.
+        seen: Samples; an episode that ends at a step does not continue at the next one.
+        last: Values of the states after the last step.
+        discount: The discount gamma.
+        trace: The parameter lambda.
     """
     over = seen.outcome.terminated | seen.outcome.truncated
 

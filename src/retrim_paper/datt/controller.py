@@ -1,8 +1,8 @@
 """DATT (Huang et al. 2023): a policy that looks ahead along its reference and receives the disturbance.
 
-The implementation follows the description in the paper, with changes that improve it here: positions are relative to
-the reference, vectors are in the body frame, and the observation contains the state in which the command begins to act
-and the command that acts until then.
+The implementation follows the description in the paper, with three changes that improve the results here. Positions are
+relative to the reference. Vectors are in the body frame. The observation contains the state in which the command begins
+to act, and the command that acts until then.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from retrim.physics.state import STANDARD_GRAVITY, Command, State
 from retrim.tasks.task import AbstractTask
 
 AHEAD, APART = 10, 0.06  # number of reference points in the observation, and the time between them [s]
-OWN = 22  # numbers of the state: error, velocity, attitude, disturbance, acting command
+OWN = 22  # size of the state part: error, velocity, attitude, disturbance, acting command
 SIZE = OWN + 3 * AHEAD
-SCALE = (5.0, 3.0, 3.0, 1.0)  # scale of actions: [m/s^2], [rad/s]
+SCALE = (5.0, 3.0, 3.0, 1.0)  # scales of the actions: [m/s^2], [rad/s]
 
 
 class DattNet(eqx.Module):
-    """Actor and critic with a shared encoder of the look-ahead: two convolutions along it, then three layers each."""
+    """Actor and critic: two shared convolutions along the look-ahead, then separate networks of three layers."""
 
     first: Float[Array, "3 3 8"]
     """Kernel: three points, three coordinates, eight channels."""
@@ -63,7 +63,7 @@ class DattNet(eqx.Module):
 
 
 def _along(points: Float[Array, "n i"], kernel: Float[Array, "k i c"], bias: Float[Array, " c"]) -> Float[Array, "m c"]:
-    """Return a convolution along the points, as one product with a banded matrix, which is large for many samples."""
+    """Return a convolution along the points, computed as one product with a banded matrix."""
     n, i = points.shape
     k, _, c = kernel.shape
     m = n - k + 1
@@ -74,13 +74,13 @@ def _along(points: Float[Array, "n i"], kernel: Float[Array, "k i c"], bias: Flo
 
 
 def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Float[Array, "n 3"]) -> Float[Array, " o"]:
-    """Return the observation of the policy.
+    """Return the policy's observation.
 
     Args:
         x: State.
         acting: Command at the actuators.
-        d: Disturbance, world [m/s^2].
-        ahead: Reference now and at the times ahead, world [m].
+        d: Disturbance, world frame [m/s^2].
+        ahead: Reference positions now and at the times ahead, world frame [m].
     """
     seen = (x.p[None] - ahead) @ x.R
     acts = (acting.vector() - Command.hover().vector().astype(x.p.dtype)) / jnp.array(SCALE, dtype=x.p.dtype)
@@ -88,7 +88,7 @@ def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Flo
 
 
 def datt_command(action: Float[Array, "4"], low: Command, high: Command) -> Command:
-    """Return the command of an action, within the limits; an action of zero is hover."""
+    """Return the command for an action, clipped to the limits; a zero action is hover."""
     hover = jnp.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0], dtype=action.dtype)
     wanted = hover + jnp.array(SCALE, dtype=action.dtype) * action
     return Command.of(wanted).within(low, high)
@@ -104,11 +104,11 @@ class DattState(eqx.Module):
 
 
 class DattController(AbstractController[DattState]):
-    """The trained policy in flight, with the disturbance from an L1 estimator."""
+    """The trained policy in flight, which receives the disturbance from an L1 estimator."""
 
     net: DattNet
     task: AbstractTask
-    """Task, which provides the reference."""
+    """Task that provides the reference."""
     prediction: Prediction
     estimator: L1Estimator
     known: Float[Array, ""]
@@ -117,7 +117,7 @@ class DattController(AbstractController[DattState]):
     high: Command
 
     def with_age(self, age: float | Float[Array, ""]) -> "DattController":
-        """Return the same for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` old [s]."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> DattState:
@@ -125,7 +125,7 @@ class DattController(AbstractController[DattState]):
         return DattState(self.prediction.init(x), L1State.start(x), x)
 
     def __call__(self, memory: DattState, t: Float[Array, ""], x: State) -> tuple[Command, DattState]:
-        """Evaluate the network once, for the state in which the command begins to act."""
+        """Evaluate the network once, in the state in which the command begins to act."""
         thrust = self.prediction.thrust(memory.underway, memory.last.R, x.R)
         estimate = self.estimator(memory.estimate, t, x, thrust)
         d = jnp.clip(estimate.d_hat, -self.known, self.known)

@@ -12,11 +12,11 @@ from retrim.runtime.pilot import ControllerPilot, Pilot
 from .controller import DattController, DattNet
 from .problem import KNOWN
 
-ESTIMATOR = 0.5  # [s]: time constant of the filter; the DATT authors use 2 s
+ESTIMATOR = 0.5  # [s], time constant of the filter; the DATT authors use 2 s
 
 
 def datt_of(setup: Setup, net: DattNet) -> DattController:
-    """Return the controller of a trained DATT network."""
+    """Return the controller for a trained DATT network."""
     dt, vehicle = setup.preset.dt, setup.vehicle
     estimator = L1Estimator(jnp.array(L1_POLE), jnp.exp(jnp.array(-dt / ESTIMATOR)), dt)
     return DattController(

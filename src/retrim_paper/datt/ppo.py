@@ -1,9 +1,9 @@
 """Proximal policy optimisation (Schulman et al. 2017): learning from rewards alone, for problems without gradients.
 
-Many environments are stepped at once; advantages are estimated as in Schulman et al. 2016; a few passes over the
-samples, in minibatches, maximise the clipped objective. If the time limit cuts an episode off, and not the behaviour of
-the vehicle, the estimate continues with the value of the state at the cut. Values are sums of rewards scaled by
-1 - gamma, so that they have the size of a reward for every discount.
+Many environments are stepped at once. Advantages are estimated as in Schulman et al. 2016. A few passes over the
+samples, in minibatches, maximise the clipped objective. If an episode is cut off by the time limit and not by the
+vehicle's behaviour, the estimate continues with the value of the state at the cut. Values are sums of rewards scaled
+by 1 - gamma, so that they have the magnitude of a reward for every discount.
 """
 
 import functools
@@ -25,10 +25,10 @@ from .advantages import Seen, advantages
 
 @runtime_checkable
 class ActorCritic(Protocol):
-    """A policy, its exploration, and its value of a state; an :class:`equinox.Module`."""
+    """A policy with its exploration noise and its value function; an :class:`equinox.Module`."""
 
     log_std: Float[Array, " a"]
-    """Logarithm of the standard deviation of actions."""
+    """Logarithm of the actions' standard deviation."""
 
     def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, " a"], Float[Array, ""]]:
         """Return the mean action and the value of an observation."""
@@ -37,7 +37,7 @@ class ActorCritic(Protocol):
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """Sizes and rates of the learning."""
+    """Sizes and rates for learning."""
 
     envs: int = 256
     steps: int = 64
@@ -49,7 +49,7 @@ class PpoSettings:
     """Initial learning rate; it decays to zero with a cosine schedule."""
     discount: float = 0.99
     trace: float = 0.95
-    """Parameter lambda of the generalised advantage estimate."""
+    """Parameter lambda of the generalised advantage estimates."""
     clip: float = 0.2
     value_cost: float = 0.5
     entropy_gain: float = 0.0
@@ -61,12 +61,12 @@ class PpoSettings:
             raise ValueError(f"PPO: {self.envs} x {self.steps} samples cannot be split into {self.minibatches} batches")
 
     def updates(self, steps: int) -> int:
-        """Return the number of updates that take at least ``steps`` steps."""
+        """Return the smallest number of updates that take at least ``steps`` steps."""
         return -(-steps // (self.envs * self.steps))
 
 
 class PpoState(eqx.Module):
-    """State of the learning."""
+    """State of the learning process."""
 
     net: Any
     """The :class:`ActorCritic`."""
@@ -79,7 +79,7 @@ class PpoState(eqx.Module):
 
     @classmethod
     def of(cls, problem: Problem[Any], net: Any, key: Key[Array, ""], settings: PpoSettings) -> "PpoState":
-        """Return the state before the first update, from a network and a key, which is consumed."""
+        """Return the state before the first update; the key is consumed."""
         k_reset, k_learn = random.split(key)
         envs = jax.jit(jax.vmap(problem.reset))(random.split(k_reset, settings.envs))
         moments = _optimiser(settings, 1).init(eqx.filter(net, eqx.is_inexact_array))  # the same for any number
@@ -95,10 +95,11 @@ def ppo(
         problem: The environment.
         state: State from which learning starts or resumes; a resumed run equals an uninterrupted one bit for bit.
         settings: Sizes and rates.
-        steps: Steps of all environments together, from the first update on.
+        steps: Total steps of all environments, counted from the first update.
 
     Yields:
-        The state after each update, and statistics: mean reward of a step, loss, and the share of clipped samples.
+        The state after each update, and statistics, such as the mean reward per step, the loss and the share of
+        clipped samples.
     """
     updates = settings.updates(steps)
     optimiser = _optimiser(settings, updates)
@@ -109,7 +110,7 @@ def ppo(
 
 @functools.lru_cache(maxsize=32)
 def _optimiser(settings: PpoSettings, updates: int) -> optax.GradientTransformation:
-    """Return gradient clipping, then Adam with a cosine schedule.
+    """Return gradient clipping followed by Adam with a cosine schedule.
 
     The same arguments return the same object, so that compiled programs are shared.
     """
@@ -121,7 +122,7 @@ def _optimiser(settings: PpoSettings, updates: int) -> optax.GradientTransformat
 def update(
     problem: Problem[Any], state: PpoState, optimiser: optax.GradientTransformation, settings: PpoSettings
 ) -> tuple[PpoState, dict[str, Float[Array, ""]]]:
-    """Step the environments, and make one update from the samples."""
+    """Step the environments and make one update from the samples."""
     k_next, k_roll, k_epochs = random.split(state.key, 3)
     envs, seen, last, reward = _rolled(problem, state.net, state.envs, k_roll, settings)
     advantage = advantages(seen, last, settings.discount, settings.trace)
@@ -149,7 +150,7 @@ def update(
 
 
 def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Float[Array, " a"]) -> Float[Array, ""]:
-    """Return the logarithm of the density of an action that is normally distributed around ``mean``."""
+    """Return the log-density of an action that is normally distributed around ``mean``."""
     scaled = (action - mean) * jnp.exp(-log_std)
     return jnp.sum(-0.5 * scaled * scaled - log_std) - 0.5 * action.shape[0] * jnp.log(2.0 * jnp.pi)
 
@@ -157,7 +158,7 @@ def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Floa
 def _rolled(
     problem: Problem[Any], net: Any, envs: Any, key: Key[Array, ""], settings: PpoSettings
 ) -> tuple[Any, Seen, Float[Array, " envs"], Float[Array, ""]]:
-    """Step all environments; an environment whose episode ends begins the next one."""
+    """Step all environments; when an episode ends, its environment begins a new one."""
 
     def one(s: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Seen, Array]]:
         k_see, k_act, k_step, k_new, k_after = random.split(key, 5)
@@ -183,7 +184,7 @@ def _rolled(
 
 
 def _loss(arrays: Any, fixed: Any, batch: Any, settings: PpoSettings) -> tuple[Array, dict[str, Array]]:
-    """Return minus the clipped objective, and statistics."""
+    """Return the loss, which contains the negative clipped objective, and statistics."""
     net, (seen, advantage, target) = eqx.combine(arrays, fixed), batch
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
     mean, value = jax.vmap(net)(seen.o)

@@ -1,4 +1,4 @@
-"""Training of DATT: tracking of random references under a random disturbance, in the nominal model with lag."""
+"""DATT's training problem: random references under a random disturbance, in the nominal model with actuator lag."""
 
 from typing import NamedTuple
 
@@ -17,8 +17,8 @@ from retrim.physics.state import Command, State
 from .controller import AHEAD, APART, datt_command, datt_observation
 
 EPISODE = 10.0  # [s]
-TICK = 0.02  # [s], tick of WALK and DISCOUNT; for another tick they are scaled to the same effect per second
-WALK = 0.02  # [m/s^2], standard deviation of a step of the disturbance, per axis
+TICK = 0.02  # [s], tick for WALK and DISCOUNT; for a different tick they are scaled to the same effect per second
+WALK = 0.02  # [m/s^2], standard deviation of a disturbance step, per axis
 DISCOUNT = 0.99
 KNOWN = 1.0  # [m/s^2], largest disturbance per axis
 
@@ -28,9 +28,9 @@ class DattEnv(NamedTuple):
 
     x: State
     acting: Command
-    """Command that acts now, after the lag of the actuators."""
+    """Command that acts now, after the actuator lag."""
     d: Float[Array, "3"]
-    """Disturbance, world [m/s^2]."""
+    """Disturbance, world frame [m/s^2]."""
     reference: Int[Array, ""]
     """Index of the reference in the bank."""
     tick: Int[Array, ""]
@@ -40,9 +40,9 @@ class DattProblem(eqx.Module):
     """The environment; see :class:`retrim.learn.problem.Problem`."""
 
     bank: Float[Array, "n ticks 3"]
-    """References, around the origin [m]."""
+    """Reference positions, around the origin [m]."""
     tau: Float[Array, ""]
-    """Time constant of the actuators [s]."""
+    """Actuator time constant [s]."""
     low: Command
     high: Command
     dt: float = eqx.field(static=True, default=0.02)
@@ -59,14 +59,14 @@ class DattProblem(eqx.Module):
         return DattEnv(x, Command.hover(p.dtype), d, number, jnp.array(0))
 
     def observe(self, s: DattEnv, key: Key[Array, ""]) -> Float[Array, " o"]:
-        """Return the observation of the policy, with 5 mm of noise on the position, as in DATT."""
+        """Return the policy's observation, with 5 mm of position noise, as in DATT."""
         every = round(APART / self.dt)
         at = jnp.minimum(s.tick + every * jnp.arange(AHEAD), self.bank.shape[1] - 1)
         x = State(s.x.p + 0.005 * random.normal(key, (3,), s.x.p.dtype), s.x.R, s.x.v)
         return datt_observation(x, s.acting, s.d, self.bank[s.reference, at])
 
     def step(self, s: DattEnv, action: Float[Array, "4"], key: Key[Array, ""]) -> tuple[DattEnv, Outcome]:
-        """Fly one tick; the reward is that of DATT: minus distance, half the heading, and a tenth of the speed."""
+        """Fly one tick; as in DATT, the reward is minus the distance, half the heading and a tenth of the speed."""
         mean, acting = lagged(s.acting, datt_command(action, self.low, self.high), self.dt, self.tau)
         x = PointMass(self.dt).step(s.x, mean, s.d)
         walk = WALK * (self.dt / TICK) ** 0.5
@@ -82,7 +82,7 @@ class DattProblem(eqx.Module):
 
 
 def discount(dt: float) -> float:
-    """Return the discount of a tick of ``dt`` [s]."""
+    """Return the discount for a tick of ``dt`` [s]."""
     return float(DISCOUNT ** (dt / TICK))
 
 
@@ -95,7 +95,7 @@ def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
     """Return random references: points, zigzags, chains of polynomials and Lissajous figures, a quarter each.
 
     Args:
-        seed: Seed of all references.
+        seed: Seed for all references.
         n: Number of references.
         dt: Time between rows [s].
 
@@ -112,7 +112,7 @@ def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
 
 
 def _zigzag(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """Return straight lines between way-points on alternating sides, of 0.6 to 1.5 s each."""
+    """Return straight lines of 0.6 to 1.5 s each between way-points on alternating sides."""
     knots = np.concatenate([[0.0], np.cumsum(draw.uniform(0.6, 1.5, 30))])
     sides = np.where(np.arange(len(knots)) % 2, 1.0, -1.0)[:, None]
     points = sides * draw.uniform(0.0, 1.0, (len(knots), 3)) * np.array([1.0, 1.0, 0.3])
@@ -121,7 +121,7 @@ def _zigzag(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
 
 
 def _chain(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """Return cubics through the origin, per axis, of 1.2 to 4 s each, with continuous speeds at the knots."""
+    """Return chains of cubics of 1.2 to 4 s each, per axis, through the origin, with continuous speeds at the knots."""
     path = np.zeros((len(t), 3))
     for axis, share in enumerate((1.0, 1.0, 0.3)):
         knots = np.concatenate([[0.0], np.cumsum(draw.uniform(1.2, 4.0, 12))])
@@ -135,7 +135,7 @@ def _chain(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
 
 
 def _lissajous(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """Return a sine along each axis, of 2.5 to 6 s and up to 1.5 m, whose speed rises within the first two seconds."""
+    """Return a sine along each axis, up to 1.5 m and with a period of 2.5 to 6 s, which speeds up for two seconds."""
     period, phase = draw.uniform(2.5, 6.0), draw.uniform(0.0, 2.0 * np.pi, 3)
     size = draw.uniform(0.2, 1.0, 3) * np.array([1.5, 1.5, 0.3])
     beats = np.array([1.0, draw.integers(1, 3), 1.0])

@@ -1,4 +1,4 @@
-"""Baselines that need training before a flight: DATT, by reinforcement learning."""
+"""Baselines that need training before a flight: DATT, which is trained by reinforcement learning."""
 
 import time
 from collections.abc import Sequence
@@ -24,18 +24,18 @@ from .problem import DattProblem, discount, reference_bank
 
 DATT_STEPS = 20_000_000  # as in the paper
 DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
-DATT_TAG = 2**30 + 5  # folded into a seed: DATT shares no key with the policies
+DATT_TAG = 2**30 + 5  # folded into a seed, so that DATT does not share keys with the policies
 PARTLY = ".partly"
 """File name suffix of the state of an interrupted training."""
 KEEP_EVERY = 30.0
-"""Time between two saved states of a training [s]."""
+"""Time between two saved states during training [s]."""
 
 
 def check_steps(steps: int) -> None:
     """Check the number of training steps.
 
     Raises:
-        ConfigError: It is below one, or more than a computer can do in a day.
+        ConfigError: It is below one or above 10,000,000,000.
     """
     if not 1 <= steps <= 10**10:
         raise ConfigError(f"--datt-steps {steps} must be between 1 and 10,000,000,000")
@@ -45,7 +45,7 @@ def check_period(preset: Preset) -> None:
     """Check that the control period of a preset divides DATT's look-ahead step and is at most 20 ms.
 
     Raises:
-        ConfigError: It does not, or is longer; the message names the preset.
+        ConfigError: The period does not meet these conditions; the message names the preset.
     """
     apart = APART / preset.dt
     if abs(apart - round(apart)) > 1e-6 or preset.dt > 0.02:
@@ -64,13 +64,13 @@ def rounded_steps(steps: int) -> int:
 def train_datt(
     preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter, *, steps: int = DATT_STEPS
 ) -> dict[int, DattNet]:
-    """Return a network for each seed; those that ``run.trained`` has are not trained again.
+    """Return a network for each seed; networks that are already in ``run.trained`` are not trained again.
 
     Args:
         preset: Vehicle, control period and declared lag.
-        seeds: Seeds of networks, references and episodes.
-        run: Its ``trained`` stores the networks, and the state of an interrupted training, which resumes from there.
-            After an interruption the incomplete seeds are missing in the result.
+        seeds: Seeds for networks, references and episodes.
+        run: Its ``trained`` stores the networks, and the state from which an interrupted training resumes. After an
+            interruption, the incomplete seeds are missing from the result.
         reporter: Receives progress.
         steps: Number of training steps.
     """
@@ -103,9 +103,9 @@ def train_datt(
 def _trained(
     problem: DattProblem, state: PpoState, settings: PpoSettings, steps: int, path: Path, run: Run, reporter: Reporter
 ) -> PpoState | None:
-    """Train, from the saved state of an earlier run if there is one.
+    """Train, and resume from the saved state of an earlier run if there is one.
 
-    Return None if this run is interrupted, too; its state is then saved next to ``path``.
+    Return None if this run is interrupted; its state is then saved next to ``path``.
     """
     partly, updates = path.with_suffix(PARTLY), settings.updates(steps)
     title = f"DATT, seed {path.stem.rpartition('_seed')[2]}"
@@ -129,4 +129,4 @@ def _trained(
 
 
 RIVALS = {"datt": train_datt}
-"""Training functions by method: they return the networks for a preset and seeds, which replace the policies."""
+"""Training functions by method; for a preset and seeds, each returns networks that replace the policies."""

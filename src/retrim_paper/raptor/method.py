@@ -1,4 +1,4 @@
-"""RAPTOR as a flight method: it commands the motors of the plant ``bem``, instead of its rate controller."""
+"""RAPTOR as a flight method: it replaces the rate controller of the plant ``bem`` and commands the motors."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ from .plant import RaptorNet, RaptorQuadrotor
 
 
 def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
-    """Return a plant whose vehicle is controlled by RAPTOR, along the reference of a set-up.
+    """Return a plant whose vehicle is controlled by RAPTOR along a set-up's reference.
 
     Raises:
         ConfigError: The plant does not support motor commands, or has sensors, which RAPTOR does not use.

@@ -1,4 +1,4 @@
-"""The controller of a vehicle that flies itself."""
+"""The outer controller for a vehicle with its own controller on board."""
 
 from jaxtyping import Array, Float
 
@@ -8,14 +8,14 @@ from retrim.physics.state import Command, State
 
 
 class HoverController(AbstractController[tuple[()]]):
-    """Commands hover for every state, since the vehicle has its own controller on board."""
+    """A controller that commands hover in every state, since the vehicle has its own controller on board."""
 
     def init(self, x: State) -> tuple[()]:
         """Return an empty memory."""
         return ()
 
     def __call__(self, memory: tuple[()], t: Float[Array, ""], x: State) -> tuple[Command, tuple[()]]:
-        """Return u_hover."""
+        """Return the hover command and the empty memory."""
         return Command.hover(x.p.dtype), memory
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "HoverController":

@@ -1,8 +1,9 @@
-"""A vehicle whose motors RAPTOR commands: the foundation policy, 2,084 weights, without a rate controller.
+"""A vehicle without a rate controller, whose motors are commanded by RAPTOR.
 
-It was distilled from a thousand teachers, each for a different vehicle, and adapts through its hidden state (Eschmann,
-Albani and Loianno 2025). It runs on board at 100 Hz and observes its vehicle without delay; only the reference comes
-from outside. Differences from the reference are clipped as in the flight firmware that contains it.
+RAPTOR is a foundation policy with 2,084 weights. It was distilled from a thousand teachers, each for a different
+vehicle, and adapts through its hidden state (Eschmann, Albani and Loianno 2025). It runs on board at 100 Hz and
+observes its vehicle without delay; only the reference comes from outside. Differences from the reference are clipped as
+in the flight firmware that contains RAPTOR.
 """
 
 import functools
@@ -23,9 +24,9 @@ from retrim.physics.state import Command, State
 from retrim.physics.substep import SUBSTEP, AbstractSubstepDynamics, RotorState
 from retrim.plants.extras import import_extra
 
-PERIOD = 10  # [ms]
-FARTHEST, FASTEST = 0.5, 1.0  # [m], [m/s]: largest differences in its observation
-ORDER = (0, 2, 1, 3)  # its rotor for each of ours; its order is front-right, back-right, back-left, front-left
+PERIOD = 10  # [ms], time between two decisions
+FARTHEST, FASTEST = 0.5, 1.0  # [m], [m/s]: largest differences from the reference in the observation
+ORDER = (0, 2, 1, 3)  # RAPTOR's rotor for each of ours; its order is front-right, back-right, back-left, front-left
 
 
 class RaptorNet(eqx.Module):
@@ -39,7 +40,7 @@ class RaptorNet(eqx.Module):
 
     @classmethod
     def load(cls) -> "RaptorNet":
-        """Return the network of the package ``foundation-policy``.
+        """Return the network from the package ``foundation-policy``.
 
         Raises:
             PlantError: The package is not installed.
@@ -72,7 +73,7 @@ class RaptorNet(eqx.Module):
 
 @functools.cache
 def _layers() -> tuple[Any, ...]:
-    """Return the package's layers as NumPy arrays; the file is read and its example checked once, not per flight."""
+    """Return the package's layers as NumPy arrays; cached, so that the file is read and checked only once."""
     return tuple(
         import_extra("foundation_policy", "raptor", package="foundation-policy", kind="method").Raptor().layers
     )
@@ -87,12 +88,12 @@ def _linear(layer: Any) -> eqx.nn.Linear:
 
 
 class RaptorState(eqx.Module):
-    """State of a vehicle that RAPTOR flies."""
+    """State of a vehicle flown by RAPTOR."""
 
     body: BemState
     hidden: Float[Array, " hidden"]
     action: Float[Array, "4"]
-    """Last commands, as the network returned them; motors accept -1 to 1."""
+    """Last commands, as returned by the network; the motors accept -1 to 1."""
     ms: Int[Array, ""]
     """Time since the start of the flight [ms]."""
 
@@ -103,7 +104,7 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
     base: BemQuadrotor
     net: RaptorNet
     setpoint: Any
-    """The reference: a function of the time since the start of the flight [s], whose values have p, v and heading."""
+    """Reference: a function of the time since the start of the flight [s], which returns p, v and the heading."""
 
     @property
     def dt(self) -> float:
@@ -124,11 +125,11 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
         return RaptorState(self.base.with_state(s.body, x), s.hidden, s.action, s.ms)
 
     def rotor_state(self, s: RaptorState) -> RotorState:
-        """Return body rates and rotor speeds."""
+        """Return the body rates and the rotor speeds."""
         return self.base.rotor_state(s.body)
 
     def substep(self, s: RaptorState, u: Command, effects: ExternalEffects) -> RaptorState:
-        """Advance one millisecond; every tenth begins with a decision."""
+        """Advance by one millisecond; every tenth one begins with a decision."""
         action, hidden = lax.cond(s.ms % PERIOD == 0, lambda: self._decided(s), lambda: (s.action, s.hidden))
         vehicle = self.base.vehicle
         throttle = 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)[jnp.array(ORDER)]

@@ -1,4 +1,4 @@
-"""Ablation: each component removed from our preset and added to the paper's, next to control without learning."""
+"""Ablation: each component removed from our preset and added to the paper's, compared with no learning."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,14 +41,14 @@ def ablation(
     seconds: float = 24.0,
     starts: int = 8,
 ) -> None:
-    """Effect of each component: removed from our preset, added to the paper's, next to control without learning.
+    """Effect of each component: removed from our preset, added to the paper's, and compared with no learning.
 
     Args:
-        run: Folder of ablation_hover.md or ablation_track.md, and of its JSON file. The same command resumes after a
+        run: Folder for ablation_hover.md or ablation_track.md, and its JSON file. The same command resumes after a
             kill.
         reporter: Receives progress and the sections.
-        task: hover or track.
-        seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
+        task: Either hover or track.
+        seeds: Training seeds; each also seeds the starts, gusts and learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, component and seed.
     """
@@ -96,7 +96,7 @@ def _flown(
     starts: int,
     seconds: float,
 ) -> tuple[TableSection, list[dict[str, Any]]]:
-    """Fly one component under all disturbances; return its line of the table, and the rows behind it."""
+    """Fly one component under all disturbances; return its table line and the rows of results behind it."""
     run, reporter = document.run, document.reporter
     cells, result = list[str](), list[dict[str, Any]]()
     for reference in REFERENCES[task]:
@@ -113,14 +113,14 @@ def _flown(
 
 
 def _follows(preset: Preset, reference: str | None) -> Preset:
-    """Return the preset of a policy for ``reference``; a policy without preview is trained on this reference."""
+    """Return the preset to fly ``reference``; a policy without preview is trained on this reference alone."""
     if reference is None or preset.track is None or preset.track.looks_ahead:
         return preset
     return changed(preset, track={"reference": reference})
 
 
 def _study(preset: Preset, studies: dict[str, Study], seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
-    """Return the policies of a preset; presets with the same training share them."""
+    """Return the policies for a preset; presets with the same training share them."""
     key = dump(replace(preset, adapt=Adapt()))
     if key not in studies:
         studies[key] = train_all(preset, seeds, run, reporter)

@@ -1,4 +1,4 @@
-"""Latency of messages over each bus."""
+"""Message latency on each bus."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -26,10 +26,10 @@ COLUMNS = ("bus", "message", "p50 [ms]", "p99 [ms]", "max [ms]", "arrived")
 
 
 def buses(run: Run, reporter: Reporter) -> None:
-    """Latency of messages over shared memory, zenoh (also between two network namespaces) and ROS 1.
+    """Message latency over shared memory, zenoh (also between two network namespaces) and ROS 1.
 
     Args:
-        run: Folder of buses.md and buses.json.
+        run: Folder for buses.md and buses.json.
         reporter: Receives progress and the table.
     """
     rows: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""The paper's design study (Sec. IV-C): training time and final error of ways to simulate and differentiate."""
+"""The paper's design study (Sec. IV-C): training time and final error for each way to simulate and differentiate."""
 
 from typing import Any
 
@@ -44,15 +44,15 @@ def design(
     starts: int = 8,
     epochs: int = POLICY_EPOCHS,
 ) -> None:
-    """The design study: time and error by model, by source of the gradient, and with or without residual gradients.
+    """The design study: time and error by model, by gradient source, and with or without residual gradients.
 
     Args:
-        run: Folder of design.md and design.json.
+        run: Folder for design.md and design.json.
         reporter: Receives progress and the section.
-        preset: A preset for hover, to train the base policies with.
+        preset: Preset for hover, with which the base policies are trained.
         seeds: Training seeds.
         starts: Scored flights per seed.
-        epochs: Epochs of re-training; a multiple of ten.
+        epochs: Re-training epochs; a multiple of ten.
     """
     (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=SCORED_S)
     if epochs < CHUNK or epochs % CHUNK:

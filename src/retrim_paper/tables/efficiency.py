@@ -1,4 +1,4 @@
-"""Cost of each method: the paper's figures of compute and of samples, compared with ours."""
+"""Cost of each method: the paper's compute and sample figures, compared with ours."""
 
 import tempfile
 from pathlib import Path
@@ -44,13 +44,13 @@ def efficiency(
     presets: tuple[str, ...] = ("hover/retrim", "hover/fast", "hover/paper"),
     datt_steps: int = DATT_STEPS,
 ) -> None:
-    """Cost of each method: steps and time of training, of an update in flight, and of one decision.
+    """Cost of each method: the steps and time for training, for an update in flight, and for one decision.
 
     Args:
-        run: Folder of efficiency.md and efficiency.json.
+        run: Folder for efficiency.md and efficiency.json.
         reporter: Receives progress and the section.
-        presets: Presets for hover.
-        datt_steps: Training steps of DATT.
+        presets: Presets for hover, to train and time.
+        datt_steps: Number of training steps for DATT.
     """
     loaded = table_presets(presets, "hover", seeds=(0,), starts=1, seconds=1.0)
     if not loaded:

@@ -41,20 +41,20 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
     (raptor, "beside RAPTOR", {}),
     (track, "Table II", {"methods": WITH_DATT}),
 )
-"""Table, its place in the paper, and its options. Timed tables come first, when the machine is least busy."""
+"""Each table, its place in the paper, and its options. Timed tables come first, when the machine is least busy."""
 QUICK_LEAVES_OUT = (phase, plants)
 AT_LEAST = "at least "
-"""Prefix of a time that lacks the time of a killed run; the time of an interrupted run is recorded and counted."""
+"""Prefix for a time that excludes a killed run; the time of an interrupted run is recorded and counted."""
 
 
 def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
-    """All tables of the paper: an overview, and a folder for each. The same command resumes after a kill.
+    """All tables of the paper: an overview, and a folder for each; the same command resumes after a kill.
 
     Args:
-        run: Folder of everything.md or everything_quick.md, and of a folder for each table.
+        run: Folder for everything.md or everything_quick.md, with a subfolder for each table.
         reporter: Receives progress and the sections.
-        quick: One seed, two starts and short flights, in a folder quick/; other plants and the paper's
-            formulation of tracking are left out.
+        quick: Use one seed, two starts and short flights, in a folder quick/; leave out the other plants and the
+            paper's formulation of tracking.
     """
     run.remark = REMARK if quick else ""
     intro = f"Made by `retrim reproduce all{' --quick' if quick else ''}`."
@@ -97,7 +97,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
                 _write(run, begun, took)
             else:
                 (run.folder / begun).unlink()
-                if page.is_file():  # the digest shows whether other code or options have overwritten the page
+                if page.is_file():  # the digest shows whether different code or options have overwritten the page
                     _write(run, done, took | {"page": digest_of(page)})
         rows.append(row)
     lines = [
@@ -111,7 +111,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
 
 
 def _minutes(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the total time of tables [min]."""
+    """Return the total time of the tables [min]."""
     at_least = any(row["at_least"] for row in rows)
     return f"{AT_LEAST * at_least}{sum(row['s'] for row in rows) / 60:.1f}"
 

@@ -1,4 +1,4 @@
-"""Fast flight: references at the limits of a vehicle, in wind."""
+"""Fast flight: references at a vehicle's limits, in wind."""
 
 import re
 
@@ -33,18 +33,18 @@ def fast(
     starts: int = 8,
     plant: str = "bem",
 ) -> None:
-    """References at the limits of the vehicle, undisturbed, in wind and under a large push.
+    """References at the vehicle's limits: undisturbed, in wind and under a large push.
 
     Args:
-        run: Folder of fast.md, fast.json and the pictures.
+        run: Folder for fast.md, fast.json and the pictures.
         reporter: Receives progress and the sections.
         preset: Preset to train and fly, on its own vehicle.
-        references: Shapes with a top speed [m/s], and CSV files.
-        methods: Methods of the flights.
+        references: References to fly: shapes with a top speed [m/s], and CSV files.
+        methods: Methods to fly.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Plant of the flights.
+        plant: Plant for the flights.
     """
     (loaded,) = table_presets([preset], "track", seeds=seeds, starts=starts, seconds=seconds)
     sections = [_section(loaded, reference, plant, methods) for reference in references]

@@ -1,4 +1,4 @@
-"""Supplement of a table of errors: intervals, recovery, worst error, phase and effort."""
+"""Supplement to a table of errors: intervals, recovery, worst error, phase and effort."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from retrim.runkit.document import TableSection
 
 
 def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[str, str]) -> TableSection:
-    """Return the supplementary figures of a section at its last level, a row per method.
+    """Return a section's supplementary figures at its last level, with a row per method.
 
     Args:
         found: Rows of results.

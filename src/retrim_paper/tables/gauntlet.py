@@ -1,4 +1,4 @@
-"""The gauntlet: one policy under many changes of the world."""
+"""The gauntlet: one policy under many changes in the world."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -33,7 +33,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "vision": ("base", "base-do", "full"),  # methods that every preset supports
 }
 FAULT_METHODS = ("base", "base-do", "geometric-i", "indi", "full", "lora")
-CORES = 2  # that one condition uses; only its adapting flights, from a few starts, take long
+CORES = 2  # cores used by one condition; only its adapting flights, from a few starts, take long
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
 Made by `retrim gauntlet`. The preset's own vehicle on plant `bem`, with {sensors} sensors, unless the row names
@@ -68,26 +68,26 @@ def gauntlet(
     count: int = 200,
     draw: int = 0,
 ) -> None:
-    """A policy under many changes of the world: recovery, steady and worst error, as one heat map.
+    """A policy under many changes in the world: recovery, steady error and worst error, as one heat map.
 
     Args:
-        run: Folder of gauntlet.md, results.json and the pictures.
+        run: Folder for gauntlet.md, results.json and the pictures.
         reporter: Receives progress and the table.
-        preset: A preset for hover, tracking or vision, to train with.
+        preset: Preset for hover, tracking or vision, with which the policy is trained.
         only: Conditions to fly; all by default. A condition whose plant is not installed is left out and reported.
-        methods: Methods of the flights; by default base, base-i, base-do, geometric-i, indi and full, and for vision
-            base, base-do and full.
-        seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
-        seconds: Length of a flight [s]; those of hidden vehicles last 10 s, or 25 s on figure-8s.
+        methods: Methods to fly; by default base, base-i, base-do, geometric-i, indi and full, and for vision base,
+            base-do and full.
+        seeds: Training seeds; each also seeds the starts, gusts and learners of its flights.
+        seconds: Length of a flight [s]; flights of hidden vehicles last 10 s, or 25 s on figure-8s.
         starts: Flights per condition, method and seed.
         sensors: Sensors of the conditions that do not name their own: ideal, mocap, onboard or rough.
-        faults: Fly faults of measurements and vehicle at hover instead, and check that adapting is never worse than not
-            adapting; by default with base, base-do, geometric-i, indi, full and lora.
-        vehicles: own: the vehicle of the preset under all conditions; hidden: many vehicles that are unknown to every
-            method, at hover under a push, or on figure-8s with a preset for tracking. Without --methods, the page
-            compares hover/any or track/any with methods for a known vehicle.
+        faults: Instead, fly measurement and vehicle faults at hover, and check that adapting is never worse than not
+            adapting; the default methods are then base, base-do, geometric-i, indi, full and lora.
+        vehicles: own flies the preset's vehicle under all conditions; hidden flies many vehicles that are unknown to
+            every method, at hover under a push, or on figure-8s with a preset for tracking. Without --methods, the
+            page compares hover/any or track/any with methods for a known vehicle.
         count: Number of hidden vehicles.
-        draw: Seed of the hidden vehicles.
+        draw: Seed from which the hidden vehicles are drawn.
     """
     task = load(preset).task
     if vehicles == "hidden":
@@ -134,7 +134,7 @@ def gauntlet(
                 flown[name] = own
                 result += rows_of(name, own, change_times(scenario.disturbance, home, seconds))
         if result:
-            run.write_results(result, seeds=seeds)  # written now, so that a kill loses running flights only
+            run.write_results(result, seeds=seeds)  # written now, so that a kill loses only running flights
     if result:
         if faults:
             document.more["promise"] = promise_rows(flown)
@@ -146,7 +146,7 @@ def gauntlet(
 
 
 def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str, Scenario], list[str]]:
-    """Return the conditions whose plants are installed, and a line on each of the others.
+    """Return the conditions whose plants are installed, and a line about each of the others.
 
     Raises:
         PlantError: No condition has an installed plant.
@@ -165,12 +165,12 @@ def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str,
 
 
 def rows_of(name: str, flights: Sequence[Flight], changes: Sequence[float]) -> list[dict[str, Any]]:
-    """Return a row for each method and metric of a condition.
+    """Return a condition's rows, one for each method and metric.
 
     Args:
         name: Name of the condition.
         flights: Flights of the condition.
-        changes: Times at which its world changed [s].
+        changes: Times at which the world changed [s].
     """
     result = list[dict[str, Any]]()
     for method in dict.fromkeys(flight.spec.method for flight in flights):
@@ -248,7 +248,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def _best_and_worst(flown: dict[str, list[Flight]]) -> Any:
-    """Plot the errors of all methods from the starts at which the last method had its smallest and largest peak."""
+    """Plot all methods' errors from the starts where the last method had its smallest and its largest peak."""
     last = [(name, f) for name, flights in flown.items() for f in flights if f.spec.method == flights[-1].spec.method]
     ranked = sorted(last, key=lambda pair: pair[1].peak)
     panels = []

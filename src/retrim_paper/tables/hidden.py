@@ -1,4 +1,4 @@
-"""The gauntlet of hidden vehicles: one policy for many vehicles that it does not know."""
+"""The gauntlet of hidden vehicles: one policy for many unknown vehicles."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,9 +24,9 @@ from retrim.viz import plots
 from retrim.viz.vehicle_map import vehicle_map
 
 MOST_VEHICLES = 10_000
-PUSHED = 4.0  # [s], time of the push in hover
-AFTER = 5.0  # [s] after the push: the error is scored for one second from here on
-SPUN_UP = 5.0  # [s]: tracking errors are scored from here on, when the reference has its own speed
+PUSHED = 4.0  # [s], time of the push at hover
+AFTER = 5.0  # [s], time after the push from which the error is scored for one second
+SPUN_UP = 5.0  # [s], time from which tracking errors are scored; the reference has its full speed by then
 INTRO = """\
 Made by `retrim gauntlet --vehicles hidden{option}`: {count} vehicles, drawn from one size factor (seed {seed}), from
 30 g to 3 kg: lag of the body rates 15 to 150 ms (second order, damping ratio 0.4 to 1.2), command delay 0 to 60 ms,
@@ -38,11 +38,11 @@ over all flights, 95th percentile, and worst; a lost flight counts as infinite (
 
 @dataclass(frozen=True)
 class Course:
-    """A flight of every vehicle."""
+    """A flight that every vehicle flies."""
 
     title: str
     stem: str
-    """Name of the figure."""
+    """File name of the figure."""
     disturbance: str
     seconds: float
     reference: str | None = None
@@ -50,13 +50,13 @@ class Course:
 
 @dataclass(frozen=True)
 class Scoring:
-    """Figures of a flight; the first one colours the map."""
+    """Scores of a flight; the first one colours the map."""
 
     columns: Mapping[str, str]
-    """Heading of each figure in tables, by its name."""
+    """Column heading for each score, by its name."""
     score: Callable[[Flight], Mapping[str, float]]
     colour: str
-    """Label of the colour scale."""
+    """Label for the colour scale."""
     about: str
 
 
@@ -105,12 +105,12 @@ SCORINGS = {
 
 @dataclass(frozen=True)
 class Entrant:
-    """A preset and a method of the benchmark."""
+    """A preset and a method in the benchmark."""
 
     preset: str
     method: str
     told: bool = False
-    """Whether the method receives a vehicle file with the true numbers."""
+    """Whether the method receives a vehicle file with the true parameters."""
 
     @property
     def label(self) -> str:
@@ -130,12 +130,12 @@ ENTRANTS: dict[str, tuple[Entrant, ...]] = {
 
 
 def entrants_of(task: str, preset: str, methods: Sequence[str]) -> tuple[Entrant, ...]:
-    """Return the entrants of a command: those of the published page, or the methods of one preset.
+    """Return the entrants for a command: those on the published page, or the given methods with one preset.
 
     Args:
         task: Task of the preset.
-        preset: Name of a preset, or a file.
-        methods: Methods to fly; empty for the published ones.
+        preset: Preset name, or file.
+        methods: Methods to fly; if empty, the published entrants are returned.
 
     Raises:
         ConfigError: There is no such benchmark for the task.
@@ -157,21 +157,21 @@ def fly_hidden(
     starts: int,
     sensors: str,
 ) -> None:
-    """Fly hidden vehicles, and write ``hidden.md``, ``results.json`` and a map for each course.
+    """Fly hidden vehicles and write ``hidden.md``, ``results.json`` and a map for each course.
 
     Args:
-        run: Folder of the results.
+        run: Folder for the results.
         reporter: Receives progress and the tables.
         task: Task of the entrants: hover or track.
         entrants: Presets and methods.
         count: Number of vehicles.
-        draw: Seed of the vehicles.
+        draw: Seed from which the vehicles are drawn.
         seeds: Training seeds.
         starts: Flights per vehicle, method and training seed.
         sensors: Name of a sensor model.
 
     Raises:
-        ConfigError: A name does not exist, or the parts do not fit together. Raised before training.
+        ConfigError: A name does not exist, or the parts are incompatible; raised before any training.
     """
     if not 1 <= count <= MOST_VEHICLES:
         raise ConfigError(f"count must be 1 to {MOST_VEHICLES} vehicles, got {count}")
@@ -224,7 +224,7 @@ def _fly(
     if not entrant.told:
         return fly_all(study, scenarios, run, reporter, **options).flown
     flights = list[Flight]()
-    for vehicle, scenario in zip(vehicles, scenarios, strict=True):  # each vehicle file makes another set-up
+    for vehicle, scenario in zip(vehicles, scenarios, strict=True):  # each vehicle file needs its own set-up
         told = replace(study, preset=replace(study.preset, vehicle=vehicle.spec))
         flights += fly_all(told, [scenario], run, reporter, **options).flown
     return flights
@@ -233,7 +233,7 @@ def _fly(
 def _row(
     entrant: Entrant, course: Course, vehicles: Sequence[HiddenVehicle], flight: Flight, scoring: Scoring
 ) -> dict[str, Any]:
-    """Return the figures of one flight and the numbers of its vehicle; None stands for infinity."""
+    """Return the scores of one flight and its vehicle's parameters; None stands for infinity."""
     number = next(n for n, each in enumerate(vehicles) if each.spec == flight.spec.scenario.vehicle)
     vehicle = vehicles[number]
     return {
@@ -289,7 +289,7 @@ def _section(
 
 
 def _quantiles(values: Sequence[float | None], name: str) -> str:
-    """Return median, 95th percentile and worst value of all flights."""
+    """Return the median, the 95th percentile and the worst value over all flights."""
     ranked = np.sort([np.inf if value is None else value for value in values])
     chosen = [ranked[min(len(ranked) - 1, int(share * len(ranked)))] for share in (0.5, 0.95, 1.0)]
     text = metres if name.endswith("_m") else "{:.2f}".format

@@ -34,16 +34,16 @@ def hover(
     """Table I: hover under three disturbances, for each preset, over several training seeds.
 
     Args:
-        run: Folder of hover.md, hover.json and the pictures.
+        run: Folder for hover.md, hover.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly.
-        seeds: Training seeds; each also seeds the starts and the learners of its flights.
+        seeds: Training seeds; each also seeds the starts and learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Plant of the flights.
+        plant: Plant for the flights.
         sensors: Sensors that measure the state for the policies.
-        methods: Methods for the policies, and baselines without a policy; baselines fly once, with the first preset.
-        datt_steps: Training steps of DATT, if it is among the methods.
+        methods: Methods for the policies, and baselines without a policy; baselines fly only with the first preset.
+        datt_steps: Number of training steps for DATT, if it is among the methods.
     """
     loaded = table_presets(presets, "hover", seeds=seeds, starts=starts, seconds=seconds)
     scenario = Scenario(plant=plant, sensors=sensors)

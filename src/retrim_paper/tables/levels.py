@@ -1,4 +1,4 @@
-"""Table sections in the paper's layout: a row per method, a column per level of disturbance."""
+"""Table sections in the paper's layout: a row per method, and a column per disturbance level."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,27 +28,27 @@ from .further_figures import figures_table
 LEVELS = {"none": "no disturbance", "small": "small, 0.5 m/s² per axis", "large": "large, 2 m/s² per axis"}
 """The paper's disturbances and their labels."""
 PaperRows = Mapping[str, tuple[str, str, str]]
-"""The paper's figures for the three levels [m], by method."""
+"""The paper's errors at the three levels [m], by method."""
 METHODS = ("base", "base-i", "base-do", "geometric", "geometric-i", "indi", "mppi", "l1-mpc", "full", "lora")
 """Methods of the paper's tables, except for those that need minutes of training."""
 
 
 def of_policies(methods: Sequence[str]) -> tuple[str, ...]:
-    """Return the methods that fly a policy of the table's preset."""
+    """Return the methods that fly a policy trained with the table's preset."""
     others = {*BASELINES, *RIVALS}
     return tuple(method for method in methods if method not in others and find_method(method).on_board is None)
 
 
 @dataclass(frozen=True)
 class Levels:
-    """One section in the paper's layout: a row per method, a column per level of disturbance."""
+    """One section in the paper's layout: a row per method, and a column per disturbance level."""
 
     title: str
     preset: Preset
     scenario: Scenario
-    """Scenario of the flights; each level replaces its disturbance."""
+    """Scenario for the flights; each level replaces its disturbance."""
     stem: str
-    """Name of the picture."""
+    """File name of the picture."""
     methods: Sequence[str] = ("base", "full", "lora")
     paper: PaperRows = field(default_factory=dict)
     levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
@@ -58,7 +58,7 @@ class Levels:
 
     @property
     def scenarios(self) -> list[Scenario]:
-        """Scenario of each level."""
+        """Scenario for each level."""
         return [replace(self.scenario, disturbance=level) for level in self.levels]
 
 
@@ -70,14 +70,14 @@ def fly_levels(
     seconds: float | None,
     datt_steps: int = DATT_STEPS,
 ) -> None:
-    """Train, fly and lay out every section; write the document after each, and after an interruption.
+    """Train, fly and lay out every section; write the document after each section and after an interruption.
 
     Args:
-        document: Receives the sections. Its seeds are those of training.
+        document: Receives the sections; its seeds are the training seeds.
         sections: Sections of the table; each preset is trained once.
         starts: Flights per disturbance, method and seed.
-        seconds: Length of a flight; the task's own by default.
-        datt_steps: Training steps of DATT, if it is among the methods.
+        seconds: Length of a flight [s]; by default that of the task.
+        datt_steps: Number of training steps for DATT, if it is among the methods.
 
     Raises:
         ConfigError: A name does not exist, or two settings are incompatible; raised before any training.
@@ -105,7 +105,7 @@ def fly_levels(
         key = dump(section.preset), trains
         if key not in studies and trains:
             studies[key] = train_all(section.preset, document.seeds, run, reporter)
-        elif key not in studies:  # no method flies a policy, so that only the seeds of the study matter
+        elif key not in studies:  # no method flies a policy, so only the seeds of the study matter
             untrained = Setup.from_preset(section.preset).new_policy(random.key(0))
             studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
         made = _level_section(
@@ -123,7 +123,7 @@ def fly_levels(
 
 
 def _files_behind(section: Levels) -> dict[str, str]:
-    """Return digests of the files that the section depends on, outside retrim and the preset."""
+    """Return digests of the files on which the section depends, except for retrim and the preset itself."""
     named = list[str | None](section.methods)
     for each in section.scenarios:
         named += named_by(each)
@@ -140,7 +140,7 @@ def _level_section(
     seconds: float | None,
     datt_steps: int,
 ) -> tuple[TableSection, list[dict[str, Any]]] | None:
-    """Return the section and its rows of results; None if no flight was completed."""
+    """Return the section and its rows of results; None if no flight finished."""
     methods, title = section.methods, section.title
     own = [method for method in methods if method not in RIVALS]
     flown = []
@@ -177,7 +177,7 @@ def level_table(
     title: str,
     levels: Mapping[str, str] = LEVELS,
 ) -> TableSection:
-    """Return rows of results in the paper's layout: methods down, disturbances across, its figures in brackets."""
+    """Return results in the paper's layout: methods down, disturbances across, the paper's figures in brackets."""
     by = {(row["method"], row["disturbance"]): row for row in found}
     cells = list[tuple[str, ...]]()
     for method in methods:
@@ -193,7 +193,7 @@ def level_table(
 
 
 def _in_step(row: dict[str, Any] | None) -> str:
-    """Return the error after the best constant time shift, and the distance from the reference's nearest point [m]."""
+    """Return the error after the best constant time shift, and the distance to the reference's nearest point [m]."""
     if row is None or row.get("unshifted_m") is None or "cross_track_m" not in row:
         return "-"
     return f"{metres(row['unshifted_m'])}; {metres(row['cross_track_m'])}"

@@ -1,4 +1,4 @@
-"""The blade-element plant: curves and figures compared with published ones."""
+"""The blade-element plant: its curves and figures compared with published ones."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,15 +22,15 @@ from retrim.viz.panels import Curve, Panel, panel_figure
 from ..published import GOLDEN_HOVER, Settled, published, settled_rotor
 
 DT = 0.02  # [s]
-SHOWN = ("small", "large", "kingfisher")  # vehicles; a user may have registered others
+SHOWN = ("small", "large", "kingfisher")  # vehicles shown; a user may have registered others
 PUBLISHED_MAP = 1.562522e-6  # [N s^2], thrust map of the 5.1 in rotors (Agilicious)
 
 
 def model(run: Run, reporter: Reporter) -> None:
-    """Pictures and figures of the blade-element plant: thrust, drag, inflow, rate and thrust steps, battery sag.
+    """Curves and figures of the blade-element plant: thrust, drag, inflow, rate and thrust steps, and battery sag.
 
     Args:
-        run: Folder of model.md, model.json, model.png and model.svg.
+        run: Folder for model.md, model.json, model.png and model.svg.
         reporter: Receives progress and the table.
     """
     reporter.say("computing the curves of the blade-element model")
@@ -53,7 +53,7 @@ def model(run: Run, reporter: Reporter) -> None:
 
 
 def thrust_panel() -> Panel:
-    """Plot the thrust of the 5.1 in rotor in still air, with the published thrust map."""
+    """Plot the 5.1 in rotor's thrust in still air, with the published thrust map."""
     speeds = np.linspace(200.0, 2300.0, 30)
     ours = np.array([Settled(five_inch(), float(w), 0.0, 0.0).thrust for w in speeds])
     points = np.array(GOLDEN_HOVER)
@@ -70,7 +70,7 @@ def thrust_panel() -> Panel:
 
 
 def drag_panel() -> Panel:
-    """Plot the deceleration of a level vehicle at hover thrust against its speed."""
+    """Plot a level vehicle's deceleration at hover thrust against its speed."""
     curves, speeds = list[Curve](), np.linspace(0.0, 10.0, 41)
     for i, name in enumerate(("small", "kingfisher")):
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
@@ -123,7 +123,7 @@ def inflow_panel() -> Panel:
 
 
 def rate_panel() -> Panel:
-    """Plot the responses of roll and yaw rate to a step of the command."""
+    """Plot the roll-rate and yaw-rate responses to a command step."""
     curves = list[Curve]()
     for name in SHOWN:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
@@ -137,7 +137,7 @@ def rate_panel() -> Panel:
 
 
 def step_panel() -> Panel:
-    """Plot the response of the acceleration to a step of collective thrust."""
+    """Plot the acceleration response to a step in collective thrust."""
     curves = []
     for name in SHOWN:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
@@ -149,7 +149,7 @@ def step_panel() -> Panel:
 
 
 def sag_panel() -> Panel:
-    """Plot the vertical acceleration under u_hover while the battery sags."""
+    """Plot the vertical acceleration under the hover command while the battery sags."""
     bem, sag, times = BemQuadrotor.of(VEHICLES["small"](), DT), disturbance("battery"), np.linspace(0.0, 120.0, 61)
     x = State.at(jnp.zeros(3))
     result = []
@@ -166,7 +166,7 @@ def sag_panel() -> Panel:
 
 @eqx.filter_jit
 def _flown(bem: BemQuadrotor, u: Command, steps: int) -> RotorState:
-    """Return the state after each millisecond, from hover."""
+    """Return the state after each millisecond, starting from hover."""
     effects = ExternalEffects.calm(jnp.zeros(3).dtype)
 
     def step(s: BemState, _: None) -> tuple[BemState, RotorState]:

@@ -1,4 +1,4 @@
-"""The paper's formulation of tracking with several readings of its observation, from blind to state and error."""
+"""The paper's tracking formulation with several readings of its observation, from blind to state and error."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -35,7 +35,7 @@ READINGS: dict[str, tuple[str, str, dict[str, Any]]] = {
     ),
     "both": ("o = [p, R, v, p - p_ref(t), v - v_ref(t)], 21 numbers", "both", {}),
 }  # fmt: skip
-"""Description, observation, and changes of the preset."""
+"""Description, observation and preset changes of each reading."""
 
 
 def phase(
@@ -50,18 +50,18 @@ def phase(
     starts: int = 4,
     plant: str = "bem",
 ) -> None:
-    """The paper's formulation of tracking with four observations, from blind to state and tracking error.
+    """The paper's tracking formulation with four observations, from blind to state and tracking error.
 
     Args:
-        run: Folder of phase.md, phase.json and the pictures.
+        run: Folder for phase.md, phase.json and the pictures.
         reporter: Receives progress and the sections.
-        readings: blind, relative, relative-delay, both.
-        references: circle, figure8, star.
-        methods: Methods of the flights.
+        readings: Readings of the observation: blind, relative, relative-delay, both.
+        references: References to track: circle, figure8, star.
+        methods: Methods to fly.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Plant of the flights.
+        plant: Plant for the flights.
     """
     _check("reading", readings, READINGS)
     _check("reference", references, PAPER)

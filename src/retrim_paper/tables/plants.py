@@ -22,7 +22,7 @@ Group = tuple[str, Scenario, tuple[str, ...]]
 
 
 def groups() -> tuple[Group, ...]:
-    """Return the groups of the table. It is a function because scenarios are validated on creation."""
+    """Return the table's groups; they are created on demand because creating a scenario validates it."""
     return (
         ("bem", Scenario(), ("none", "small", "large")),
         ("bem, wind of 4 m/s: steady, Dryden gusts, the jet of a fan", Scenario(), ("wind", "gusts", "fan")),
@@ -64,14 +64,14 @@ def plants(
     seconds: float = 30.0,
     starts: int = 8,
 ) -> None:
-    """Hover of one policy, without and with adaptation, in many scenarios and on independent simulators.
+    """Hover with one policy, with and without adaptation, in many scenarios and on independent simulators.
 
     Args:
-        run: Folder of plants.md and plants.json.
+        run: Folder for plants.md and plants.json.
         reporter: Receives progress and the sections.
-        preset: Preset to train with, for the small quadrotor.
-        plant: Plants to fly on. A plant whose package is not installed is left out, and the page has a note on it.
-        seeds: Training seeds; each also seeds the starts, the gusts and the learners of its flights.
+        preset: Preset for the small quadrotor, with which the policy is trained.
+        plant: Plants to fly on; if a plant's package is not installed, it is left out, and the page says so.
+        seeds: Training seeds; each also seeds the starts, gusts and learners of its flights.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
     """

@@ -12,17 +12,17 @@ from retrim.runkit.flights import Flight
 
 ADAPTING = ("full", "lora")
 BASE, OBSERVER = "base", "base-do"
-FACTOR, MARGIN = 1.2, 0.005  # bound on the steady error: factor on the better of base and observer, plus a margin [m]
+FACTOR, MARGIN = 1.2, 0.005  # bound on the steady error: factor times the better of base and observer, plus margin [m]
 ABOUT = """\
 crashed although the base policy survived: flights, paired by seed and start. steady: mean error over the last 2 s of
 the flights that survived. bound: 1.2 times the smaller steady error of base policy and observer, plus 5 mm."""
 
 
 def promise_rows(flights: Mapping[str, Sequence[Flight]]) -> list[dict[str, Any]]:
-    """Return a row for each condition and adapting method.
+    """Return a row for each combination of condition and adapting method.
 
     Args:
-        flights: Flights of each condition, by all methods.
+        flights: Flights by condition, with all methods.
     """
     result = list[dict[str, Any]]()
     for condition, group in flights.items():
@@ -78,6 +78,6 @@ def promise_section(rows: Sequence[dict[str, Any]]) -> TableSection:
 
 
 def _steady(flights: Sequence[Flight], method: str) -> float:
-    """Return the mean steady error of the flights that survived; infinite if all crashed."""
+    """Return the mean steady error of the flights that did not crash; infinite if all crashed."""
     survivors = [f.steady for f in flights if f.spec.method == method and not f.log.terminated]
     return float(np.mean(survivors)) if survivors else float("inf")

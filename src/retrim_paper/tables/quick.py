@@ -26,21 +26,21 @@ QUICK: dict[str, Options] = {
     "scaling": {"flights": (12, 40), "seconds": 6.0},
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
 }
-"""Options of the quick version, by table."""
+"""Options for the quick version, by table."""
 ALONE = ("model", "efficiency", "buses", "tuning", "design", "scaling")
 """Tables that do not use other machines."""
 GO_ON = (
     "hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "reversing", "plants", "everything"
 )  # fmt: skip
-"""Tables that are made in parts; the same command resumes after a kill."""
+"""Tables that are made in parts, so that the same command resumes after a kill."""
 REMARK = "A quick look, smaller than the table: figures to look at, not to quote."
 
 
 def options_of(make: Callable[..., None]) -> list[Parameter]:
     """Return the options of a table's command: those of its function, and ``on``, ``quick`` and ``out``.
 
-    Options of a function are its keyword-only parameters. Tables in ``ALONE`` do not get ``on``. Tables without a
-    quick version, or with a ``quick`` option of their own, do not get ``quick``.
+    A function's options are its keyword-only parameters. ``on`` is omitted for tables in ``ALONE``. ``quick`` is not
+    added for tables without a quick version, or with their own ``quick`` option.
     """
     options = [each for each in inspect.signature(make).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
     if make.__name__ not in ALONE:
@@ -51,7 +51,7 @@ def options_of(make: Callable[..., None]) -> list[Parameter]:
 
 
 def help_of(make: Callable[..., None]) -> str:
-    """Return the docstring of a table's command."""
+    """Return the docstring for a table's command."""
     text = inspect.getdoc(make) or ""
     if make.__name__ not in ALONE:
         text += "\n    on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers train and fly."
@@ -64,7 +64,7 @@ def help_of(make: Callable[..., None]) -> str:
 
 
 def folder_of(make: Callable[..., None], *, quick: bool = False) -> Path | None:
-    """Return the default folder of a table; None for a new folder, if its command does not resume after a kill."""
+    """Return the default folder of a table; None means a new folder, for commands that do not resume after a kill."""
     if make.__name__ not in GO_ON:
         return None
     whole = make.__name__ == "everything"  # it has its own folder for the quick version
@@ -72,11 +72,11 @@ def folder_of(make: Callable[..., None], *, quick: bool = False) -> Path | None:
 
 
 def looked(make: Callable[..., None], chosen: Mapping[str, Any], words: Sequence[str] = ()) -> tuple[Options, str]:
-    """Return the options of a table, and a remark on them for its documents.
+    """Return a table's options, and a remark about them for its documents.
 
     Args:
         make: Function that makes the table.
-        chosen: Options of the command; ``quick`` does not change those that differ from their defaults.
+        chosen: Command options; ``quick`` does not change those that differ from their defaults.
         words: Words of the command line; ``quick`` does not change the options that they name, either.
     """
     if make.__name__ not in QUICK:

@@ -1,4 +1,4 @@
-"""RAPTOR, the foundation policy, compared with ours: hover and a figure-8, undisturbed and disturbed."""
+"""RAPTOR, the foundation policy, compared with our policies: hover and a figure-8, undisturbed and disturbed."""
 
 from retrim.config.loading import with_vehicle
 from retrim.config.scenario import Scenario
@@ -39,15 +39,15 @@ def raptor(
     seconds: float = 30.0,
     starts: int = 8,
 ) -> None:
-    """RAPTOR, a policy of motor commands that needs no re-training, compared with ours.
+    """RAPTOR, a motor-command policy that does not need re-training, compared with our policies.
 
     Args:
-        run: Folder of raptor.md, raptor.json and the pictures.
+        run: Folder for raptor.md, raptor.json and the pictures.
         reporter: Receives progress and the sections.
-        presets: One for hover and one for tracking.
-        vehicles: Vehicles of the flights; policies are trained for each. small and large lift more than RAPTOR was
-            made for.
-        methods: Methods of the flights.
+        presets: One preset for hover and one for tracking.
+        vehicles: Vehicles to fly; our policies are trained for each. small and large can lift more than the vehicles
+            for which RAPTOR was made.
+        methods: Methods to fly.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.

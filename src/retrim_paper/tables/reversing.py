@@ -1,4 +1,4 @@
-"""Hover under a push that turns around every 15 s (the paper's Sec. IV-B.3)."""
+"""Hover under a push that reverses every 15 s (Sec. IV-B.3 of the paper)."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 
 PERIOD = 15.0  # [s]
-MOST = 6  # largest number of updates of which each has a column
+MOST = 6  # largest number of updates that each have a column
 METHODS: dict[str, str] = {
     "base": "base policy",
     "base-i": "integral action",
@@ -46,13 +46,13 @@ def reversing(
     seconds: float = 60.0,
     starts: int = 8,
 ) -> None:
-    """Hover under a push that reverses every 15 s: the error before and after each update, and the picture.
+    """Hover under a push that reverses every 15 s: the error before and after each update, and a picture.
 
     Args:
-        run: Folder of reversing.md, reversing.json and the picture.
+        run: Folder for reversing.md, reversing.json and the picture.
         reporter: Receives progress and the section.
-        preset: A preset for hover, to train with.
-        plant: Plant of the flights.
+        preset: Preset for hover, with which the policy is trained.
+        plant: Plant for the flights.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per method and seed.
@@ -92,7 +92,7 @@ def _peak(row: dict[str, Any]) -> str:
 
 
 def _moments(adapt: Adapt, seconds: float) -> tuple[np.ndarray, list[int]]:
-    """Return the times at which errors are read [s], and the numbers of the updates.
+    """Return the times at which errors are read [s], and the update numbers.
 
     Each row belongs to a reversal: its time, the times at which the updates take effect, and the end of the period.
     """
@@ -120,7 +120,7 @@ def _section(
     for i, reversal in enumerate(moments[:, 0]):
         for method, name in METHODS.items():
             table = [result[i] for result in errors[method]]
-            columns = np.array(table).T  # empty if no flight was completed
+            columns = np.array(table).T  # empty if no flight finished
             cells = [mean_and_deviation(column) for column in columns]
             cells = cells or ["-"] * moments.shape[1]
             lines.append((f"reversed at {reversal:g} s, {name}", *cells))

@@ -1,4 +1,4 @@
-"""Growth of time and memory with the number of flights."""
+"""Growth in time and memory with the number of flights."""
 
 import pickle
 import resource
@@ -28,7 +28,7 @@ CONDITIONS = ("gusts", "payload")
 METHODS = ("base", "full")
 EACH = len(CONDITIONS) * len(METHODS)
 MANY, MACHINES = 1_000_000, (1, 3, 10, 30, 100, 300, 1000)
-LINK, JOB_S = 117e6, 1e-3  # [bytes/s], [s]: assumed
+LINK, JOB_S = 117e6, 1e-3  # [bytes/s], [s], both assumed
 COLUMNS = (
     "flights",
     "compiling [s]",
@@ -47,14 +47,14 @@ def scaling(
     flights: tuple[int, ...] = (12, 40, 120, 400, 1000),
     seconds: float = 12.0,
 ) -> None:
-    """From a dozen to ten thousand flights: time, flights per second, memory, and their growth.
+    """From a dozen to ten thousand flights: the time, the flights per second, the memory, and their growth.
 
     Args:
-        run: Folder of scaling.md, scaling.json and the picture.
+        run: Folder for scaling.md, scaling.json and the picture.
         reporter: Receives progress and the table.
-        preset: A preset for hover, to train with.
-        flights: Numbers of flights, each a multiple of four. One half of the flights adapts; one half is in gusts, the
-            other one with a load.
+        preset: Preset for hover, with which the policy is trained.
+        flights: Numbers of flights, each a multiple of four. Half of the flights adapt; half fly in gusts, and half
+            with a load.
         seconds: Length of a flight [s].
     """
     (loaded,) = table_presets([preset], "hover", seeds=(0,), starts=1, seconds=seconds)
@@ -101,7 +101,7 @@ def scaling(
 
 
 def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
-    """Extrapolate to many machines by a model of four numbers, two of which are measured."""
+    """Extrapolate to many machines with a model of four numbers, two of which are measured."""
     last = rows[-1]
     per_flight, size, compiling = last["run_s"] / last["flights"], last["flight_bytes"], rows[0]["compile_s"]
     lines = []

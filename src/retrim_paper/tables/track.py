@@ -1,4 +1,4 @@
-"""Table II of the paper: circle, figure-8 and star."""
+"""Table II of the paper: the circle, figure-8 and star."""
 
 from collections.abc import Sequence
 
@@ -59,18 +59,18 @@ def track(
     starts: int = 8,
     plant: str = "bem",
 ) -> None:
-    """Table II: circle, figure-8 and star under three disturbances, and a figure-8 that is not part of training.
+    """Table II: the circle, figure-8 and star under three disturbances, and a figure-8 that was not trained on.
 
     Args:
-        run: Folder of track.md, track.json and the pictures.
+        run: Folder for track.md, track.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly.
-        methods: Methods for the policies, and baselines without a policy; baselines fly once, with the first preset.
-        datt_steps: Training steps of DATT, if it is among the methods.
+        methods: Methods for the policies, and baselines without a policy; baselines fly only with the first preset.
+        datt_steps: Number of training steps for DATT, if it is among the methods.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Plant of the flights.
+        plant: Plant for the flights.
     """
     loaded = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
     sections = [
@@ -83,7 +83,7 @@ def track(
 
 
 def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels]:
-    """Return a section per reference; a policy with preview is trained on all of them, others on one each."""
+    """Return a section per reference; policies with preview are trained on all of them, others on one each."""
 
     def section(
         title: str, preset: Preset, reference: str, paper: PaperRows, methods: Sequence[str] = methods

@@ -18,7 +18,7 @@ and the last 10 s of tracking [m]: mean ± standard deviation over flights. No m
 thrust command is normalised by the mass that the flight controller knows. Learning is charged to flight time by the
 preset's fixed latencies. The paper gives no figures for these flights."""
 FLOWN = ("base", "base-i", "base-do", "geometric-i", "indi", "l1-mpc", "full", "lora")
-"""Methods that compensate for a load or a wind, and the base policy."""
+"""The base policy, and methods that compensate for a load or wind."""
 HOVER_LEVELS = {"none": "alone", "payload": "with a load", "fan": "in front of a fan", "payload+fan": "load and fan"}
 TRACK_LEVELS = {"none": "calm air", "wind=4": "wind of 4 m/s"}
 
@@ -38,15 +38,15 @@ def transfer(
     """The paper's real flights in simulation: a load, a fan, and a policy on an unknown vehicle.
 
     Args:
-        run: Folder of transfer.md, transfer.json and the pictures.
+        run: Folder for transfer.md, transfer.json and the pictures.
         reporter: Receives progress and the sections.
-        presets: One for hover and one for tracking.
+        presets: One preset for hover and one for tracking.
         methods: Methods for the policies, and baselines without a policy.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per condition, method and seed.
-        plant: Plant of the flights; bem or simple.
-        datt_steps: Training steps of DATT, if it is among the methods.
+        plant: Plant for the flights; bem or simple.
+        datt_steps: Number of training steps for DATT, if it is among the methods.
     """
     (hover,) = table_presets(presets[:1], "hover", seeds=seeds, starts=starts, seconds=seconds)
     (track,) = table_presets(presets[1:], "track", seeds=seeds, starts=starts, seconds=seconds)

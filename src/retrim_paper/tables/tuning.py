@@ -1,4 +1,4 @@
-"""Settings of the classical baselines, by random search on conditions that are not part of any table."""
+"""Settings of the classical baselines, found by random search on conditions that are not part of any table."""
 
 import contextlib
 from collections.abc import Sequence
@@ -37,10 +37,10 @@ CONDITIONS: dict[Shown, tuple[tuple[str, str, str, str | None], ...]] = {
         ("vision/retrim", "push=-1.8", "ideal", None),
     ),
 }
-"""Conditions by input of the controllers: preset (for task and declared lag), disturbance, sensors and reference."""
+"""Conditions by controller input: preset (for the task and the declared lag), disturbance, sensors and reference."""
 SHOWN = {"state": "the measured state", "keypoints": "the pose that a filter estimates from keypoints"}
-CRASH = 1.0  # [m], error of a crashed flight in the score
-SETTLING = 3.0  # [s], start of a flight that does not count
+CRASH = 1.0  # [m], error assigned to a crashed flight in the score
+SETTLING = 3.0  # [s], initial part of a flight that does not count
 
 
 def tuning(
@@ -58,15 +58,15 @@ def tuning(
     """Settings of the classical baselines: the best of random candidates, on separate pushes, starts and seeds.
 
     Args:
-        run: Folder of tuning.md and tuning.json; the names contain the input of the controllers unless it is the state.
+        run: Folder for tuning.md and tuning.json; the names contain the controllers' input unless it is the state.
         reporter: Receives progress and the sections.
         methods: Baselines to tune.
-        shown: Input of the controllers: the measured state, or the pose that a filter estimates from keypoints.
-        candidates: Number of settings to try for each baseline, in addition to the present ones; a third for MPPI.
+        shown: Input of the controllers: the measured state, or the pose estimated by a filter from keypoints.
+        candidates: Number of settings to try for each baseline, in addition to the present ones; MPPI tries a third.
         starts: Flights per candidate and condition.
         seconds: Length of a flight [s]; the first 3 s do not count.
-        seed: Seed of candidates, starts and gusts.
-        plant: Plant of the flights; bem or simple.
+        seed: Seed for candidates, starts and gusts.
+        plant: Plant for the flights; bem or simple.
     """
     check_seeds([seed])
     check_flights(starts, seconds)
@@ -112,7 +112,7 @@ def tuning(
 
 
 def _drawn(baseline: Baseline, n: int, seed: int) -> list[Settings]:
-    """Return random candidates; those of a baseline depend on the seed only."""
+    """Return random candidates, which depend only on the baseline, their number and the seed."""
     low, high = np.array(list(baseline.ranges.values())).T
     shares = np.asarray(random.uniform(random.key(seed), (n, len(low))))
     drawn = low * (high / low) ** shares

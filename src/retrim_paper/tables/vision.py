@@ -48,15 +48,15 @@ def vision(
     """Table III: hover from seven points on the ground under three disturbances.
 
     Args:
-        run: Folder of vision.md, vision.json and the pictures.
+        run: Folder for vision.md, vision.json and the pictures.
         reporter: Receives progress and the sections.
         presets: Presets to train and fly; vision/paper trains for several minutes.
-        methods: Methods of the flights; by default all that the preset supports: baselines with the estimate of a pose
-            filter, and base-do in the frame of effective gravity.
+        methods: Methods to fly; by default all that the preset supports. Baselines use the estimate of a pose filter,
+            and base-do uses the frame of effective gravity.
         seeds: Training seeds.
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
-        plant: Plant of the flights.
+        plant: Plant for the flights.
     """
     loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
     if trained := [method for method in methods if method in RIVALS]:
@@ -74,7 +74,7 @@ def _section(preset: Preset, scenario: Scenario, methods: Sequence[str]) -> Leve
 
 
 def _flyable(preset: Preset) -> list[str]:
-    """Return the methods of the other tables that work with keypoints or with the pose that a filter estimates."""
+    """Return the other tables' methods that work with keypoints or with a filter's pose estimate."""
     cannot = {"base-i"}
     if preset.adapt.frame != "gravity":
         cannot.add("base-do")

@@ -1,1 +1,1 @@
-"""Runtime of compiled programs: operations of JAX in NumPy."""
+"""Runtime of compiled programs: JAX operations in NumPy."""

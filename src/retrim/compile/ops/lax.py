@@ -1,4 +1,4 @@
-"""Operations of controllers for which NumPy has no function, with the semantics of :mod:`jax.lax`."""
+"""Controller operations for which NumPy has no function, with the semantics of :mod:`jax.lax`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +15,7 @@ def logistic(x: Any) -> Any:
 
 def erf_inv(x: Any) -> Any:
     """Return the inverse of the error function."""
-    # Local, because it takes as long to import as all of retrim. Every program is run once before the flight.
+    # A local import, because SciPy takes as long to import as all of retrim. Every program runs once before the flight.
     from scipy import special
 
     return special.erfinv(x)
@@ -35,7 +35,7 @@ def to_integer(x: Any, dtype: str) -> Any:
 
 
 def pad(x: Any, value: Any, config: Sequence[tuple[int, int, int]]) -> Any:
-    """Pad with (low, high, interior) per axis; negative values crop."""
+    """Pad each axis by (low, high, interior); negative values crop."""
     x = np.asarray(x)
     shape = [
         max(0, low + high + n + max(0, n - 1) * inside) for n, (low, high, inside) in zip(x.shape, config, strict=True)
@@ -52,13 +52,13 @@ def pad(x: Any, value: Any, config: Sequence[tuple[int, int, int]]) -> Any:
 
 
 def dynamic_slice(x: Any, starts: Sequence[Any], sizes: Index) -> Any:
-    """Return a block whose start is clamped so that it lies inside."""
+    """Return a block of ``x``; its start is clamped so that the block lies inside."""
     at = _clamped(x.shape, starts, sizes)
     return x[tuple(slice(i, i + n) for i, n in zip(at, sizes, strict=True))]
 
 
 def dynamic_update_slice(x: Any, block: Any, starts: Sequence[Any]) -> Any:
-    """Return a copy with ``block`` at a start that is clamped so that it lies inside."""
+    """Return a copy of ``x`` with ``block`` at a start that is clamped so that the block lies inside."""
     block, out = np.asarray(block), np.array(x)
     at = _clamped(out.shape, starts, block.shape)
     out[tuple(slice(i, i + n) for i, n in zip(at, block.shape, strict=True))] = block
@@ -83,7 +83,7 @@ def gather(
         indices: Start of each slice.
         offset: Axes of the result that are axes of a slice.
         collapsed: Axes of a slice that are dropped.
-        start_map: Axis of ``x`` for each number of an index vector.
+        start_map: Axis of ``x`` for each entry of an index vector.
         sizes: Size of a slice.
         fill: Whether a slice that exceeds the array is filled with ``value``; otherwise it is moved inside.
         value: Fill value; by default NaN, the smallest signed or largest unsigned integer, or true.

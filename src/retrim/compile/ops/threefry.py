@@ -1,7 +1,7 @@
-"""JAX's random numbers in NumPy: Threefry-2x32 with 20 rounds (Salmon et al. 2011), with the counter layout of JAX.
+"""JAX's random numbers in NumPy: Threefry-2x32 with 20 rounds (Salmon et al. 2011), with JAX's counter layout.
 
-A key is two 32-bit words, on the last axis. Controllers that draw random numbers, for example to simulate a camera,
-draw the same numbers in a live flight.
+A key consists of two 32-bit words, on the last axis. Controllers that draw random numbers, for example to simulate a
+camera, draw the same numbers in a live flight.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ PARITY = np.uint32(0x1BD11BDA)
 
 
 def threefry(key: Any, high: Any, low: Any) -> tuple[Any, Any]:
-    """Return the two words of each counter (``high``, ``low``) under a key."""
+    """Return the two random words for each counter (``high``, ``low``) under a key."""
     words = (key[0], key[1], key[0] ^ key[1] ^ PARITY)
     a, b = high + words[0], low + words[1]
     for i in range(5):

@@ -1,4 +1,4 @@
-"""Command path of a vehicle, identified in flight: delay, lags, damping and gains, with their uncertainty."""
+"""A vehicle's command path, identified in flight: delay, lags, damping and gains, with their uncertainty."""
 
 from .estimate import Estimate as Estimate
 from .estimate import PathEstimate as PathEstimate

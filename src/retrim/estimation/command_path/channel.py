@@ -1,9 +1,9 @@
 """Recursive sums of one channel of the command path: roll and pitch rates, yaw rate, or thrust.
 
 A measurement is z = g h(theta) . f + D n + noise, with the features f of the commands, the response h from delay, lag
-and damping, the gain g, and further features n. Sums of products of whitened features and measurements are sufficient
-for every theta at once, so that a grid does not need to be stored. Measurements enter as differences from the present
-prediction, because single precision cannot represent the small difference of large sums.
+and damping (theta), the gain g, and further features n. Sums of products of whitened features and measurements are
+sufficient for every theta at once, so that a grid does not need to be stored. Measurements enter as differences from
+the present prediction, because single precision cannot represent the small difference of large sums.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ class Sample(eqx.Module):
     value: Float[Array, " axes"]
     """Measured mean over ``width``, as a difference from hover."""
     other: Float[Array, "axes n"]
-    """Features in addition to the commands."""
+    """Features in addition to those of the commands."""
     usable: Bool[Array, ""]
     kinds: Float[Array, "kinds 2"]
-    """Possible kinds of the noise."""
+    """Possible kinds of noise."""
     age: Float[Array, ""]
     """Time since the end of the mean [s]."""
     width: Float[Array, ""]
@@ -101,7 +101,7 @@ class Channel(eqx.Module):
 
         Args:
             axes: Number of axes that share all parameters except for their disturbances.
-            others: Number of features in addition to the commands.
+            others: Number of features in addition to those of the commands.
             response: Mean of gain times response before any flight.
             spread: Covariance of ``response``.
             noise: Standard deviation of the noise before any flight.
@@ -123,7 +123,7 @@ class Channel(eqx.Module):
             sample: The measurement; if it is not usable, only the time advances.
             keep: Remaining weight of earlier measurements.
             dt: Control tick [s].
-            pushed: Whether the disturbance of the channel may jump, as the force of a push does.
+            pushed: Whether the disturbance of the channel may jump, as a push does.
         """
         row = jnp.concatenate([features, sample.other, sample.value[:, None]], axis=1)
         innovation, variance = self.whitening.innovation(row, sample.kinds)
@@ -136,7 +136,7 @@ class Channel(eqx.Module):
         doubt = self.doubt + dt / DOUBT_TAU * (far.astype(keep.dtype) - self.doubt)
         doubt = jnp.where(sample.usable, doubt, self.doubt)
         counts = sample.usable & (~far | (self.doubt > DOUBTFUL))
-        # A push that begins is no property of the vehicle: the disturbance is estimated again.
+        # The beginning of a push is not a property of the vehicle, so the disturbance is estimated again.
         jumped = sample.usable & ~counts & pushed
         weight = counts.astype(keep.dtype)
         column = jnp.concatenate([innovation[..., :-1], misfit[..., None]], axis=2)
@@ -154,7 +154,7 @@ class Channel(eqx.Module):
         )  # fmt: skip
 
     def predicted_by(self, posterior: PathPosterior) -> "Channel":
-        """Return the channel with another prediction, and with its sums relative to that prediction."""
+        """Return the channel with a new prediction, and with its sums relative to that prediction."""
         m = self.response.shape[0]
         change = posterior.response - self.response
         misfit = self.products[..., -1] - self.products[..., :m] @ change

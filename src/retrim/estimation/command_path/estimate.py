@@ -36,11 +36,11 @@ class PathEstimate(eqx.Module):
     rate_lag: Estimate
     """Lag of the roll and pitch rates, 2 zeta / omega_n, which is the delay of a ramp [s]."""
     rate_damping: Estimate
-    """Damping ratio zeta of the roll and pitch rates [-]; a large one means first order."""
+    """Damping ratio zeta of the roll and pitch rates [-]; a large value means first order."""
     rate_gain: Estimate
     """Body rate per commanded body rate, roll and pitch [-]."""
     yaw_lag: Estimate
-    """The same lag of the yaw rate [s]."""
+    """Lag of the yaw rate, defined in the same way [s]."""
     yaw_gain: Estimate
     thrust_lag: Estimate
     """First-order lag of the thrust [s]."""
@@ -48,7 +48,7 @@ class PathEstimate(eqx.Module):
     """Thrust per commanded thrust [-]."""
 
     def first_order(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return delay and lag [s] of the first-order path with the most similar turning response."""
+        """Return the delay and lag [s] of the first-order path with the most similar turning response."""
         return first_order_equivalent(self.delay.mean, self.rate_lag.mean, self.rate_damping.mean)
 
 

@@ -1,7 +1,7 @@
 """Online estimator of the command path: delay, lags, damping and gains between commands and the vehicle's motion.
 
 Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimator.issued` with the new command, and
-:meth:`PathEstimator.accepted` if the plant accepted another one. For a batch of ticks, call
+:meth:`PathEstimator.accepted` if the plant accepted a different one. For a batch of ticks, call
 :meth:`PathEstimator.measured` in each and :meth:`PathEstimator.estimated` at the end. All arrays have fixed shapes.
 """
 
@@ -24,7 +24,7 @@ from .noise import DIFFERENCE, DIRECT
 from .posterior import channel_before, path_posterior
 from .prior import Prior, delay_belief, full_belief
 
-SETTLING = 0.1  # [s], start of a flight, during which the thrust depends on commands before it
+SETTLING = 0.1  # [s], start of a flight, during which the thrust depends on earlier commands
 FADING = (0.03, 0.08)  # [s], time constants with which their remaining effect fades afterwards
 
 
@@ -46,14 +46,14 @@ class Reading(NamedTuple):
     value: Float[Array, " axes"]
     usable: Bool[Array, ""]
     kinds: tuple[tuple[float, float], ...]
-    """Possible kinds of the noise."""
+    """Possible kinds of noise."""
     age: Float[Array, ""]
     """Age of the reading [s]."""
     width: float
     """Length of the mean [s]."""
 
     def sample(self, axes: slice, other: Float[Array, "axes n"]) -> Sample:
-        """Return the sample of some axes, with their further features."""
+        """Return the sample for some axes, with their further features."""
         value, dtype = self.value[axes], self.age.dtype
         width = jnp.full((), self.width, dtype)
         usable = self.usable & jnp.all(jnp.isfinite(value))
@@ -136,7 +136,7 @@ class PathEstimator(eqx.Module):
         a: Float[Array, "3"] | None = None,
         age: Float[Array, ""] | float = 0.0,
     ) -> PathState:
-        """Return the memory after a measurement, with a new estimate; for the arguments see :meth:`measured`."""
+        """Return the memory after a measurement, with a new estimate; for the arguments, see :meth:`measured`."""
         return self.estimated(self.measured(s, t, x, omega, a, age))
 
     def measured(
@@ -192,7 +192,7 @@ class PathEstimator(eqx.Module):
         thrust = now.thrust.measured(features[:1], lifted, keep, dt, pushed=True)
         force = now.force
         if a is not None:
-            # The accelerometer has no latency, even if the attitude has.
+            # The accelerometer has no latency, even if the attitude does.
             turn = so3.exp(age * turning)
             axis = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))[:, 2]
             lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
@@ -231,7 +231,7 @@ class PathEstimator(eqx.Module):
         return dataclasses.replace(s, channels=result, estimate=estimate)
 
     def issued(self, s: PathState, u: Command) -> PathState:
-        """Return the memory after the command ``u`` was issued for the tick that begins."""
+        """Return the memory after the command ``u`` was issued for the tick that begins now."""
         return dataclasses.replace(s, history=s.history.issued(_from_hover(u)))
 
     def accepted(self, s: PathState, u: Command) -> PathState:

@@ -1,4 +1,4 @@
-"""Grids over delay, logarithm of the lag, and ringing."""
+"""Grids over the delay, the logarithm of the lag, and the ringing."""
 
 import math
 
@@ -39,14 +39,17 @@ def unit_grid(cells: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
 def moments(
     cells: Float[Array, "cells 3"], weight: Float[Array, " cells"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return mean and covariance of weighted cells."""
+    """Return the mean and covariance of weighted cells."""
     mean = weight @ cells
     away = cells - mean[None]
     return mean, (weight[:, None] * away).T @ away
 
 
 def cholesky(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the lower factor of a covariance. It is written out, since LAPACK takes longer and has no NumPy form."""
+    """Return the lower Cholesky factor of a covariance.
+
+    It is written out, since LAPACK takes longer and has no NumPy form.
+    """
     zero = jnp.zeros_like(a[0, 0])
     l00 = jnp.sqrt(a[0, 0] + TINY)
     l10, l20 = a[1, 0] / l00, a[2, 0] / l00

@@ -1,7 +1,7 @@
 """Commands of the last second as features that are linear in a step response.
 
-A command that is held over each tick is a sum of steps. Its response is therefore the sum of the steps times the step
-response at their ages. Ages of more than half a second are joined by linear interpolation, since the response is
+A command that is held over each tick is a sum of steps. Its response is therefore the sum of the steps, each times the
+step response at its age. Ages of more than half a second are joined by linear interpolation, since the response is
 smooth.
 """
 
@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 SPAN = 1.2  # [s], time span of the stored commands; the response to older ones is complete
-SINGLE = 12  # the distance of ages is 1/SINGLE of the age, and at least one tick
+SINGLE = 12  # the spacing of ages is 1/SINGLE of the age, and at least one tick
 
 
 class CommandHistory(eqx.Module):
-    """Commands of the last ticks, oldest first."""
+    """Commands of the last few ticks, oldest first."""
 
     commands: Float[Array, "k 4"]
     """Commands [c, omega] as differences from hover [m/s^2, rad/s]."""
@@ -30,7 +30,7 @@ class CommandHistory(eqx.Module):
         return CommandHistory(jnp.concatenate([self.commands[1:], u[None].astype(self.commands.dtype)]))
 
     def replaced(self, u: Float[Array, "4"]) -> "CommandHistory":
-        """Return the history with another last command."""
+        """Return the history with the last command replaced."""
         return CommandHistory(jnp.concatenate([self.commands[:-1], u[None].astype(self.commands.dtype)]))
 
     def held(self, ticks: Float[Array, ""]) -> "CommandHistory":

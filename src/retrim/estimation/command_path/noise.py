@@ -1,9 +1,9 @@
-"""Noise of a measured rate or thrust: a wandering disturbance, and white noise or the difference of white noise.
+"""Noise of a measured rate or thrust: a wandering disturbance, plus white noise or the difference of white noise.
 
 The residual of a channel is r_k = b_k + e_k - mu e_(k-1), where the disturbance b is a random walk. A gyroscope has
 mu = 0; the difference of two noisy attitudes has mu = 1. The Kalman filter of (b, e) turns residuals into innovations,
-which are independent. It is linear, so that it is applied to both commands and measurements before they are compared.
-Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), sections 3.2 and 4.2.
+which are independent. It is linear, so it is applied to both commands and measurements before they are compared.
+See Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), sections 3.2 and 4.2.
 """
 
 import equinox as eqx
@@ -19,7 +19,7 @@ KINDS = len(DIRECT)
 
 
 class Whitening(eqx.Module):
-    """Memory of the Kalman filters of all kinds of noise; columns share the covariance."""
+    """Memory of the Kalman filters for all kinds of noise; columns share the covariance."""
 
     disturbance: Float[Array, "kinds axes columns"]
     error: Float[Array, "kinds axes columns"]
@@ -36,7 +36,7 @@ class Whitening(eqx.Module):
     def innovation(
         self, row: Float[Array, "axes columns"], kinds: Float[Array, "kinds 2"]
     ) -> tuple[Float[Array, "kinds axes columns"], Float[Array, " kinds"]]:
-        """Return the innovation of each column, and their variance in units of the white noise.
+        """Return the innovation of each column, and its variance in units of the white noise.
 
         Args:
             row: Commands, other features and the measurement of each axis.

@@ -1,9 +1,9 @@
 """Posterior of one channel over delay, lag and damping, on grids that adapt to its region.
 
-Given these three, gain and noise have a conjugate posterior (normal, inverse gamma), so that they are integrated in
-closed form. The grid covers the ellipsoid of the posterior of the last tick, and moves and shrinks with it. A coarse
+Given these three, gain and noise have a conjugate posterior (normal, inverse gamma), so they are integrated in closed
+form. The grid covers the ellipsoid of the posterior of the last tick, and moves and shrinks with it. A coarse
 grid over the prior finds other regions of the posterior, for example after a change of the vehicle; it tempers the
-likelihood, since its cells are wider than the ridge. All shapes are fixed, so that programs are not compiled again.
+likelihood, since its cells are wider than the ridge. All shapes are fixed, so that nothing is recompiled.
 """
 
 from typing import NamedTuple
@@ -19,8 +19,8 @@ from .prior import MOST_RINGING, Belief, GainPrior, Prior, gain_prior, log_prior
 from .response import mean_step_response
 
 TEMPER = 0.03  # share of the information that a coarse grid uses
-ELSEWHERE = 2.0  # excess of the log posterior outside of the grid at which the grid moves there
-WIDER = 1.2  # factor of the covariance for the next grid, since a posterior may also widen
+ELSEWHERE = 2.0  # excess of the log posterior outside the grid at which the grid moves there
+WIDER = 1.2  # factor on the covariance for the next grid, since a posterior may also widen
 COARSE = 0.35  # smallest deviation of the next grid, as a share of the spacing of this one
 GAINS = (0.2, 5.0)  # range in which a gain is linearised
 FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the variance of the noise
@@ -131,7 +131,7 @@ def responses(
         cells: Delay [s], logarithm of the lag [s], ringing.
         age: Time since the end of the measured mean [s].
         width: Length of the mean [s].
-        hover: Command from which the features are differences.
+        hover: Hover command; the features are differences from it.
         dt: Control tick [s].
     """
     delay, lag, ringing = cells[:, :1], jnp.exp(cells[:, 1:2]), jnp.clip(cells[:, 2:], 0.0, MOST_RINGING)

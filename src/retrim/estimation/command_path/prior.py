@@ -32,13 +32,13 @@ class Prior(eqx.Module):
     floor: Float[Array, ""]
     """Smallest standard deviation of unmodelled effects."""
     hover: Float[Array, ""]
-    """Hover command, from which commands and measurements are differences."""
+    """Hover command; commands and measurements are differences from it."""
     cells: tuple[int, int, int] = eqx.field(static=True)
-    """Cells of each grid along delay, lag and damping; one cell along damping means a channel of first order."""
+    """Number of cells along delay, lag and damping; one cell along damping means a first-order channel."""
 
 
 class Belief(NamedTuple):
-    """Normal distribution of delay, logarithm of the lag, and gain, from another channel."""
+    """Normal distribution of the delay, the logarithm of the lag, and the gain, from another channel."""
 
     mean: Float[Array, "2"]
     """Delay [s], logarithm of the lag [s]."""
@@ -87,7 +87,7 @@ def gain_prior(cells: Float[Array, "cells 3"], prior: Prior, belief: Belief | No
 
 
 def log_prior(cells: Float[Array, "cells 3"], prior: Prior, belief: Belief | None) -> Float[Array, " cells"]:
-    """Return the logarithm of the prior of delay, lag and ringing; minus infinity outside of their ranges."""
+    """Return the logarithm of the prior of delay, lag and ringing; minus infinity outside their ranges."""
     d, log_lag, ringing = cells.T
     inside = (d >= 0.0) & (d <= LONGEST_DELAY) & (log_lag >= jnp.log(LAGS[0])) & (log_lag <= jnp.log(LAGS[1]))
     inside &= (ringing >= 0.0) & (ringing <= MOST_RINGING)

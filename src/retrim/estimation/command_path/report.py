@@ -1,4 +1,4 @@
-"""The identified command path in one line."""
+"""Describes the identified command path in one line."""
 
 from jaxtyping import Array, Float
 

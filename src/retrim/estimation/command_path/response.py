@@ -2,7 +2,7 @@
 
 The transfer function is 1 / (1 + tau s + kappa tau^2 s^2): tau = 2 zeta / omega_n is the delay of a ramp, and
 kappa = 1 / (4 zeta^2). A first-order lag has kappa = 0. The coordinate ``ringing`` = kappa / (kappa + 1/2) =
-1 / (1 + 2 zeta^2) covers all shapes in [0, 1): 0 is first order, 1/3 critical damping.
+1 / (1 + 2 zeta^2) covers all shapes in [0, 1): 0 is first order, 1/3 is critical damping.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ SMALLEST_ROOT = 1e-2  # root of |1 - 4 kappa|; nearer to critical damping, the t
 NARROW = 1e-4  # [s], width below which a mean is computed as a value
 LONGEST = 60.0  # exponents beyond which the exponential is zero to rounding
 SHARE_AT = np.linspace(0.0, 0.6, 7)
-SHARE = np.array([1.0, 0.94, 0.88, 0.79, 0.70, 0.61, 0.56])  # of the lag in lag + delay of the first-order path
+SHARE = np.array([1.0, 0.94, 0.88, 0.79, 0.70, 0.61, 0.56])  # share of the lag in lag + delay, first order
 
 
 def ringing_of(damping: Any) -> Any:
@@ -38,7 +38,7 @@ def mean_step_response(
         t: Time since the step [s]; the response before it is zero.
         width: Length of the mean [s]; zero for the value at ``t``.
         lag: Time constant tau [s].
-        ringing: Shape of the response; see the docstring of the module.
+        ringing: Shape of the response; see the module docstring.
     """
     value, integral = _step_and_ramp(t, lag, ringing)
     _, before = _step_and_ramp(t - width, lag, ringing)
@@ -67,7 +67,7 @@ def _step_and_ramp(
 
 
 def first_order_equivalent(delay: Any, lag: Any, damping: Any) -> tuple[Any, Any]:
-    """Return delay and lag [s] of the first-order path whose step response is nearest to that of a second-order path.
+    """Return the delay and lag [s] of the first-order path with the step response nearest to a second-order path's.
 
     Both have the same sum of delay and lag. The share of the lag is a fit to the least squared difference of the step
     responses for damping ratios from 0.3 to infinity.

@@ -1,4 +1,4 @@
-"""Reads flight logs of other systems: CSV, NPZ, ULog of PX4, bags of ROS 1 and 2, MCAP."""
+"""Reads flight logs from other systems: CSV, NPZ, PX4 ULog, ROS 1 and ROS 2 bags, and MCAP."""
 
 from .flight_log import FlightLog as FlightLog
 from .flight_log import read_flight_log as read_flight_log

@@ -1,7 +1,7 @@
-"""Measures the agreement of the quantities of a log with each other.
+"""Measures how well the quantities in a log agree with each other.
 
-The velocity is the derivative of the position. Acceleration lies along the thrust axis and follows the thrust.
-Rotation follows the commanded rates and equals the measured ones. Wind, drag and lags leave a remainder in every log.
+The velocity is the derivative of the position. The acceleration lies along the thrust axis and follows the thrust. The
+rotation follows the commanded rates and equals the measured ones. Wind, drag and lags leave a remainder in every log.
 """
 
 import math
@@ -15,9 +15,9 @@ from .resampling import smoothed
 
 SMOOTH = 0.2  # time span of differences [s]
 MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.25  # [m/s], [rad], [rad/s], [m/s^2]: least motion that is compared
-AGAINST = -0.3  # agreement of one axis below which its sign is opposite, even if the axis contributes little
-SLOW = 3.0  # [s]: slower changes, for example those of a battery, are removed
-LATE = 0.2  # longest delay of an acceleration behind the thrust [s]
+AGAINST = -0.3  # agreement of one axis below which its sign is wrong, even if the axis contributes little
+SLOW = 3.0  # [s]: slower changes, for example from a battery, are removed
+LATE = 0.2  # longest delay between a thrust command and the acceleration [s]
 
 CLAIMS: Mapping[str, str] = {
     "motion": "velocity explains {} % of the motion of the position",
@@ -27,11 +27,11 @@ CLAIMS: Mapping[str, str] = {
     "turning": "commanded rates explain {} % of the turning",
     "gyroscope": "measured rates explain {} % of the turning",
 }
-"""Meaning of each figure."""
+"""What each figure means."""
 
 
 def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, float]:
-    """Return the figures of agreement, 1 for complete agreement; a figure without enough motion is absent."""
+    """Return the agreement figures, where 1 is complete agreement; a figure is absent without enough motion."""
     k = max(1, round(SMOOTH / ticks.dt))
     both = np.convolve(valid, np.ones(k + 1), mode="valid") > k
     if both.sum() < 2 * k:
@@ -69,14 +69,14 @@ def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, floa
 
 
 def heading_between(ticks: Ticks, valid: np.ndarray) -> float:
-    """Return the rotation of attitudes about the vertical that aligns their tilt with the acceleration [deg]."""
+    """Return the rotation about the vertical that aligns the attitudes' tilt with the acceleration [deg]."""
     felt, axis = (x - x.mean(axis=0) for x in ((ticks.a + UP)[valid, :2], ticks.R[valid, :2, 2]))
     cross = np.sum(axis[:, 0] * felt[:, 1] - axis[:, 1] * felt[:, 0])
     return float(np.nan_to_num(np.degrees(np.arctan2(cross, np.sum(axis * felt)))))
 
 
 def _lift(felt: np.ndarray, axis: np.ndarray) -> float:
-    """Return how well the specific force aligns with the thrust axis, and its sideways part with the tilt."""
+    """Return the worse of two agreements: specific force with thrust axis, and its sideways part with the tilt."""
     aligned = float(np.mean(np.sum(felt * axis, axis=1) / np.maximum(np.linalg.norm(felt, axis=1), 1e-9)))
     sideways, tilt = (x[:, :2] - x[:, :2].mean(axis=0) for x in (felt, axis))
     if _rms(tilt) <= TILTS:
@@ -88,13 +88,13 @@ def _lift(felt: np.ndarray, axis: np.ndarray) -> float:
 def _with_signs(
     score: float, x: np.ndarray, by: np.ndarray, least: float, agree: Callable[[np.ndarray, np.ndarray], float]
 ) -> float:
-    """Return the agreement of all axes, or that of an axis of opposite sign whose motion exceeds ``least``."""
+    """Return the agreement of all axes, or that of a wrong-signed axis whose motion exceeds ``least``."""
     axes = [(p, q) for p, q in zip(x.T, by.T, strict=True) if min(_size(p), _size(q)) > least]
     return min([score, *(result for p, q in axes if (result := agree(p, q)) < AGAINST)])
 
 
 def _beyond_noise(changes: np.ndarray, k: int) -> float:
-    """Return the size of mean accelerations without the noise of velocities, which anticorrelates adjacent spans."""
+    """Return the size of mean accelerations without velocity noise, which anticorrelates adjacent spans."""
     if len(changes) < 3 * k:
         return 0.0
     signal = np.mean(changes**2) + 2.0 * np.mean(changes[k:] * changes[:-k])
@@ -110,12 +110,12 @@ def _rms(x: np.ndarray) -> float:
 
 
 def _explained(x: np.ndarray, by: np.ndarray) -> float:
-    """Return the explained share of the larger of both signals."""
+    """Return the explained share of the larger of the two signals."""
     return 1.0 - float(np.sum((x - by) ** 2) / max(np.sum(x**2), np.sum(by**2), 1e-12))
 
 
 def _alike(x: np.ndarray, by: np.ndarray) -> float:
-    """Return the correlation times the root of the ratio of sizes, so that a lag is not a disagreement."""
+    """Return the correlation times the square root of the size ratio, so that a lag is not a disagreement."""
     small, large = sorted((float(np.linalg.norm(x)), float(np.linalg.norm(by))))
     return float(np.sum(x * by)) / max(small * large, 1e-12) * float(np.sqrt(small / max(large, 1e-12)))
 

@@ -1,4 +1,4 @@
-"""Converts the attitudes of a log to rotation matrices."""
+"""Converts the attitudes in a log to rotation matrices."""
 
 from pathlib import Path
 
@@ -8,15 +8,15 @@ from ...errors import LogError
 from .log_map import ANGLES, Attitude
 
 COLUMNS = {"xyzw": 4, "wxyz": 4, "matrix": 9, "roll pitch yaw": 3, "rotation vector": 3}
-OFF = 0.05  # tolerance of the norm of a quaternion, or of a product of columns
+OFF = 0.05  # tolerance for the norm of a quaternion, and for orthogonality (also added to the angle limit)
 RARE = 0.01  # accepted share of samples outside the tolerance; these are left out
 
 
 def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation matrices, (n, 3, 3), body to world in the frames of the log, and a mask of valid rotations.
+    """Return rotation matrices, (n, 3, 3), body to world in the log's frames, and a mask of valid rotations.
 
     Raises:
-        LogError: The numbers cannot be attitudes of this form.
+        LogError: The numbers cannot be attitudes in this form.
     """
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 

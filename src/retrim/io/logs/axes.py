@@ -1,4 +1,4 @@
-"""Converts axes of a log, named by letters, to east-north-up and forward-left-up."""
+"""Converts a log's axes, named by letters, to east-north-up and forward-left-up."""
 
 import numpy as np
 
@@ -7,27 +7,27 @@ BODY = {"F": (1, 0, 0), "B": (-1, 0, 0), "L": (0, 1, 0), "R": (0, -1, 0), "U": (
 
 
 def check_world(name: str) -> str:
-    """Return the axes of a world if they are three of east, west, north, south, up, down, one from each pair."""
+    """Return the world axes if they are three of east, west, north, south, up and down, one from each pair."""
     return _check(name, WORLD, "E, W, N, S, U, D, as ENU, NED, NWU or EUS")
 
 
 def check_body(name: str) -> str:
-    """Return the axes of a body if they are three of forward, back, left, right, up, down, one from each pair."""
+    """Return the body axes if they are three of forward, back, left, right, up and down, one from each pair."""
     return _check(name, BODY, "F, B, L, R, U, D, as FLU, FRD or RFU")
 
 
 def to_world(name: str) -> np.ndarray:
-    """Return the matrix (3, 3) from axes of the log's world to east, north, up."""
+    """Return the matrix (3, 3) from the log's world axes to east, north, up."""
     return np.array([WORLD[letter] for letter in name], dtype=float).T
 
 
 def to_body(name: str) -> np.ndarray:
-    """Return the matrix (3, 3) from axes of the log's body to forward, left, up."""
+    """Return the matrix (3, 3) from the log's body axes to forward, left, up."""
     return np.array([BODY[letter] for letter in name], dtype=float).T
 
 
 def left_handed(name: str) -> bool:
-    """Return whether axes of a world or a body are left-handed."""
+    """Return whether world or body axes are left-handed."""
     table = WORLD if set(name) <= set(WORLD) else BODY
     return bool(np.linalg.det(np.array([table[letter] for letter in name], dtype=float)) < 0.0)
 

@@ -1,4 +1,4 @@
-"""Reads CSV logs: a header and one line per sample; a cell may hold a list, for example ``"[0.1, 0.2, 0.3]"``."""
+"""Reads CSV logs: a header and one line per sample; a cell may contain a list, for example ``"[0.1, 0.2, 0.3]"``."""
 
 import csv
 import json
@@ -18,7 +18,8 @@ def read_csv(
 ) -> tuple[dict[str, Series], list[str]]:
     """Read the columns of a CSV file; see :class:`~retrim.io.logs.series.LogReader`.
 
-    ``p[0]`` and ``p[0:3]`` select numbers from a column of lists. If a name has no exact match, letter case is ignored.
+    ``p[0]`` and ``p[0:3]`` select numbers from a column of lists. If there is no exact match for a name, case is
+    ignored.
     """
     if time is None:
         raise LogError(f'{path}: a CSV file needs a table [time] in the map, as field = "t" and unit = "s"')
@@ -55,7 +56,7 @@ def read_csv(
 
 
 def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header, and all other non-empty lines with their numbers."""
+    """Return the header, and all other non-empty lines with their line numbers."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             first = file.readline()
@@ -77,7 +78,7 @@ def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _place(path: Path, name: str, header: list[str]) -> tuple[int, slice]:
-    """Return the column of a field, and the slice of the numbers in it."""
+    """Return a field's column, and the slice of the numbers in it."""
     alike = [each.lower() for each in header]
     if name in header:
         return header.index(name), slice(None)
@@ -105,7 +106,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _numbers(cell: str, where: str) -> list[float]:
-    """Return the numbers of a cell; NaN for an empty one."""
+    """Return the numbers in a cell; NaN for an empty cell."""
     text = cell.strip()
     if not text:
         return [np.nan]

@@ -1,4 +1,4 @@
-"""Reads a flight from a log: states and commands on one clock, in the frames and units of retrim."""
+"""Reads a flight from a log: states and commands on one clock, in retrim's frames and units."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,7 +21,7 @@ class FlightLog:
     """A flight on one clock; world ENU, body forward-left-up."""
 
     t: np.ndarray
-    """Times since the beginning [s], (n,), one tick apart."""
+    """Times from the beginning [s], (n,), one tick apart."""
     p: np.ndarray
     """Position, world [m], (n, 3)."""
     R: np.ndarray
@@ -41,13 +41,13 @@ class FlightLog:
     dt: float
     """Tick [s]."""
     full_thrust: float | None
-    """Acceleration at full thrust, if commanded thrust is a share of it [m/s^2]."""
+    """Acceleration at full thrust [m/s^2], if the commanded thrust is a share of it."""
     notes: tuple[str, ...]
-    """Notes on findings and on excluded parts; doubtful findings come first."""
+    """Notes on findings and excluded parts; doubtful findings come first."""
     agreement: Mapping[str, float] = field(default_factory=dict)
-    """Agreement of the log's quantities, 1 for complete agreement; see :data:`retrim.io.logs.agreement.CLAIMS`."""
+    """Agreement of the log's quantities, where 1 is complete; see :data:`retrim.io.logs.agreement.CLAIMS`."""
     warnings: tuple[str, ...] = ()
-    """Warnings about agreement so low that results from the log are unreliable."""
+    """Warnings about agreement that is too low for reliable results."""
 
     @property
     def seconds(self) -> float:
@@ -59,12 +59,12 @@ class FlightLog:
 def read_flight_log(path: Path, log_map: LogMap | None = None, *, dt: float = 0.02) -> FlightLog:
     """Read a flight.
 
-    If the states come about every ``dt``, the log is read sample by sample. A faster log is interpolated. A slower log
-    determines the tick.
+    If the states arrive about every ``dt``, the log is read sample by sample. A faster log is interpolated. A slower
+    log determines the tick.
 
     Args:
-        path: CSV, NPZ, ULog, bag of ROS 1 or 2, or MCAP.
-        log_map: Map of the log's fields; by default a map for the output of retrim or of a usual autopilot.
+        path: A CSV, NPZ, ULog or MCAP file, or a ROS 1 or ROS 2 bag.
+        log_map: Map of the log's fields; by default a map for the output of retrim or of a common autopilot.
         dt: Control tick [s].
 
     Raises:

@@ -1,4 +1,4 @@
-"""Selects the ticks of a log that are flight with complete data, and reports the reasons for excluding others."""
+"""Selects the ticks of a log at which the vehicle flies with complete data, and reports why others are excluded."""
 
 from pathlib import Path
 
@@ -12,22 +12,22 @@ from .on_one_clock import Ticks
 from .resampling import around, runs
 
 LEAST = 1.0  # shortest flight [s]
-JUMP = 15.0  # [m/s] above the speed of the vehicle: a position that moves faster has jumped
-ENDS = 2  # ticks at each end, and next to a jump, without a derivative
-FROZEN = 0.3  # time after which the constant position of a vehicle in the air counts as frozen [s]
+JUMP = 15.0  # difference from the velocity above which a position has jumped [m/s]
+ENDS = 2  # ticks without a derivative at each end and next to a jump
+FROZEN = 0.3  # time after which a constant position in the air counts as frozen [s]
 
 
 def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bool) -> tuple[np.ndarray, list[str]]:
     """Return the ticks at which the vehicle flies with complete data, and notes on the excluded ones.
 
     Args:
-        path: File of the log, for messages.
+        path: The log file, for messages.
         ticks: The log on one clock.
-        marks: Marks of its autopilot.
-        measured_position: Whether the log has positions.
+        marks: The autopilot's marks.
+        measured_position: Whether the log contains positions.
 
     Raises:
-        LogError: Too little flight remains.
+        LogError: Too little flight data remains.
     """
     notes, dt, valid = list[str](), ticks.dt, ticks.known & _finite(ticks)
     most, least = ticks.thrust[ticks.known].max(initial=-np.inf), ticks.thrust[ticks.known].min(initial=np.inf)
@@ -64,7 +64,7 @@ def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bo
 
 
 def _finite(ticks: Ticks) -> np.ndarray:
-    """Return where all quantities are finite; differences of damaged times may not be."""
+    """Return where all quantities are finite; damaged times may lead to values that are not."""
     columns = [ticks.p, ticks.v, ticks.a, ticks.rates, ticks.thrust[:, None], ticks.R.reshape(-1, 9)]
     if ticks.command is not None:
         columns.append(ticks.command)

@@ -1,4 +1,4 @@
-"""Detects a vehicle on the ground: it does not move although its thrust is below that of hover."""
+"""Detects a vehicle on the ground: it does not move although its thrust is below hover thrust."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from .on_one_clock import UP, Ticks
 from .resampling import runs, smoothed
 
 FLIES = 0.3  # share of the largest thrusts below which a vehicle is not in the air
-AROUND, LASTS = 0.3, 0.5  # time span of means, and shortest duration of a contact [s]
-STILL, AT_REST = 0.2, 0.1  # upper speeds of a vehicle in contact, and of one before it leaves its position [m/s]
+AROUND, LASTS = 0.3, 0.5  # averaging time, and shortest duration of a contact [s]
+STILL, AT_REST = 0.2, 0.1  # largest speeds of a vehicle in contact, and of one before it leaves its position [m/s]
 STEADY, TURNS = 1.0, 0.2  # [m/s^2], [rad/s]: a vehicle in contact accelerates and turns less
-CARRIES = 0.85  # share of the thrust of hover below which a vehicle cannot stay in the air
-PLACE = 0.05  # tolerance of height around that of the contact [m]
-MOVES, HIGH = 0.3, 0.3  # [m/s], [m] above the lowest position: a vehicle beyond these flies
-ENOUGH = 2.0  # duration of flight that is sufficient to determine the thrust of hover [s]
+CARRIES = 0.85  # share of hover thrust below which a vehicle cannot stay in the air
+PLACE = 0.05  # height tolerance around the contact height [m]
+MOVES, HIGH = 0.3, 0.3  # [m/s], [m] above the lowest position: a vehicle that exceeds either one flies
+ENOUGH = 2.0  # flight time that is sufficient to determine hover thrust [s]
 
 
 def on_ground(ticks: Ticks) -> np.ndarray:
@@ -39,14 +39,14 @@ def on_ground(ticks: Ticks) -> np.ndarray:
 
 
 def _hover(ticks: Ticks, candidates: np.ndarray, speed: np.ndarray) -> float:
-    """Return the thrust at hover, in the unit of the log, from ticks at which the vehicle certainly flies."""
+    """Return the hover thrust, in the log's unit, from ticks at which the vehicle certainly flies."""
     if not candidates.any():
         return 0.0
     z = ticks.p[:, 2]
     flies = candidates & ((speed > MOVES) | (z > np.percentile(z[candidates], 5) + HIGH))
     if np.sum(flies) * ticks.dt < ENOUGH:
         flies = candidates
-    upwards = np.maximum((ticks.a + UP)[flies, 2], 0.3 * STANDARD_GRAVITY)  # vertical only: wind pushes sideways
+    upwards = np.maximum((ticks.a + UP)[flies, 2], 0.3 * STANDARD_GRAVITY)  # vertical only, as wind pushes sideways
     return float(np.median(ticks.thrust[flies] * ticks.R[flies, 2, 2] * STANDARD_GRAVITY / upwards))
 
 

@@ -1,21 +1,21 @@
-"""Detects jumps of an estimate that a vehicle cannot make: resets of an estimator, swapped markers."""
+"""Detects jumps in an estimate that a vehicle cannot make, such as estimator resets and swapped markers."""
 
 import numpy as np
 
 from .on_one_clock import Ticks
 
-LEAST = {"velocity": 4.0, "attitude": 4.0}  # [m/s^2], [rad/s] by which one tick must differ from its neighbours
-LEAST_SPEED = 2.0  # [m/s] by which the step of a position must differ from its neighbours
+LEAST = {"velocity": 4.0, "attitude": 4.0}  # minimum difference between a tick and its neighbours [m/s^2], [rad/s]
+LEAST_SPEED = 2.0  # minimum difference between a position step and its neighbours [m/s]
 BEYOND = 5.0  # threshold in multiples of the noise
-ENDS = 3.0  # factor of the threshold for a step at an end of the log
-CALM = 0.25  # largest difference of the neighbours of a step at an end of the log, as a share of the step
-BESIDE = 2  # distance in ticks of the compared steps: one sample in two ticks is spread over both
+ENDS = 3.0  # factor on the threshold for a step at an end of the log
+CALM = 0.25  # for a step at an end of the log: largest difference between its neighbours, as a share of the step
+BESIDE = 2  # distance between compared steps in ticks; a sample every two ticks is spread over both
 
 
 def jumps_of(ticks: Ticks, name: str) -> np.ndarray:
-    """Return the ticks immediately after a jump of velocity or attitude, (n,).
+    """Return the ticks immediately after a jump in velocity or attitude, (n,).
 
-    A jump of an estimate appears as an acceleration, or a rate, in one tick only.
+    A jump in an estimate appears as an acceleration, or a rate, in a single tick.
     """
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
@@ -30,9 +30,9 @@ def stands_out(steps: np.ndarray, known: np.ndarray, least: float) -> np.ndarray
     """Return the steps that differ from those before and after by more than the noise.
 
     Args:
-        steps: Steps per time, (n, columns).
+        steps: Steps per unit of time, (n, columns).
         known: Steps that are used to estimate the noise, (n,).
-        least: Least difference of a detected step, for any noise.
+        least: Minimum difference for a detected step, whatever the noise.
     """
     if len(steps) < 4 * BESIDE:
         return np.zeros(len(steps), dtype=bool)
@@ -45,6 +45,6 @@ def stands_out(steps: np.ndarray, known: np.ndarray, least: float) -> np.ndarray
     far = np.where(before * after > 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
     bent = np.abs(0.5 * (before + after))[known] if known.any() else np.zeros((1, 3))
     limit = np.maximum(least, BEYOND * 1.4826 * np.median(bent, axis=0))
-    far[:BESIDE] /= ENDS  # so that a vehicle that starts or stops is not a jump
+    far[:BESIDE] /= ENDS  # so that a vehicle that starts or stops does not count as a jump
     far[-BESIDE:] /= ENDS
     return np.asarray(np.any(far > limit, axis=1))

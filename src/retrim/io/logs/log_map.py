@@ -1,4 +1,4 @@
-"""Maps the fields of a log to quantities, units and frames: a small TOML file.
+"""Maps a log's fields to quantities, units and frames, in a small TOML file.
 
 A field may have a sign, for example ``-pitch``. It may have alternatives, for example
 ``stabilizer.thrust|controller.cmd_thrust``; the first one in the log is used.
@@ -15,7 +15,7 @@ STRICT = ConfigDict(extra="forbid")
 
 
 def check_flag(name: str) -> str:
-    """Return a flag, a field that is not zero or ``field==number``, if its number is valid."""
+    """Return a flag if it is valid: the name of a field that is not zero when set, or ``field==number``."""
     _, sign, number = name.partition("==")
     if sign:
         try:
@@ -43,17 +43,17 @@ ACCELERATIONS = {"m/s^2": 1.0, "g": 9.80665}
 
 @dataclass(frozen=True, config=STRICT)
 class Time:
-    """Time of CSV and NPZ files; for ULogs and bags, the field of a topic with its time, if the topic has the field."""
+    """Time field of CSV and NPZ files; in ULogs and bags, the time field of each topic that contains it."""
 
     field: Name
     unit: Literal["s", "ms", "us", "ns"] = "s"
     age: str | None = None
-    """Field with the age of position, velocity and attitude at that time, in the same unit."""
+    """Field with the age of the position, velocity and attitude at that time, in the same unit."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Position:
-    """Position of the vehicle in the world."""
+    """The vehicle's position in the world."""
 
     fields: Fields
     unit: Literal["m", "cm", "mm"] = "m"
@@ -65,7 +65,7 @@ class Position:
 
 @dataclass(frozen=True, config=STRICT)
 class Velocity:
-    """Velocity of the vehicle."""
+    """The vehicle's velocity."""
 
     fields: Fields
     unit: Literal["m/s", "cm/s", "mm/s", "km/h"] = "m/s"
@@ -76,16 +76,16 @@ class Velocity:
 
 @dataclass(frozen=True, config=STRICT)
 class Attitude:
-    """Attitude of the vehicle in the world."""
+    """The vehicle's attitude in the world."""
 
     fields: Fields
     form: Literal["xyzw", "wxyz", "matrix", "roll pitch yaw", "rotation vector"]
-    """Order of a quaternion; a rotation matrix row by row; angles about the axes x, y, z; or an axis times an angle."""
+    """Quaternion order; rotation matrix, row by row; angles about the x, y and z axes; or an axis times an angle."""
     unit: Literal["rad", "deg"] = "rad"
     """Unit of angles."""
     turns: Literal["body to world", "world to body"] = "body to world"
     world: World | None = None
-    """Axes of the world to which the attitude refers, if they are not those of [frames]."""
+    """World axes to which the attitude refers, if they differ from those in [frames]."""
     body: Body | None = None
     heading: Annotated[float, Field(ge=-360.0, le=360.0, strict=True)] = 0.0
     """Rotation about the vertical that aligns the attitudes with the positions, counter-clockwise from above [deg]."""
@@ -95,22 +95,22 @@ class Attitude:
 
 @dataclass(frozen=True, config=STRICT)
 class Thrust:
-    """The command of collective thrust."""
+    """The commanded collective thrust."""
 
     fields: Fields
     unit: Literal["m/s^2", "g", "N", "share"]
-    """Mass-normalised (m/s^2, g); in newtons; or a share of the autopilot's own scale."""
+    """Mass-normalised (m/s^2 or g); in newtons; or a share on the autopilot's own scale."""
     positive: Literal["up", "down"] = "up"
     mass: Positive | None = None
-    """Mass for the unit N [kg]."""
+    """Mass [kg], for the unit N."""
     hover: Positive | Name | None = None
-    """For a share: the share at hover, or the field that holds it; by default it is estimated from the flight."""
+    """For a share: the value at hover, or the field that contains it; by default it is estimated from the flight."""
     full: Positive = 1.0
     """For a share: the number for full thrust, for example 65535."""
 
     @property
     def scale(self) -> float | None:
-        """Mass-normalised thrust of one unit [m/s^2]; None for a share: the flight or ``hover`` gives its scale."""
+        """Mass-normalised thrust of one unit [m/s^2]; None for a share, which the flight or ``hover`` scales."""
         return {"m/s^2": 1.0, "g": ACCELERATIONS["g"], "N": 1.0 / (self.mass or 1.0)}.get(self.unit)
 
     @property
@@ -136,7 +136,7 @@ class BodyRates:
     fields: Fields
     unit: Literal["rad/s", "deg/s", "mrad/s"] = "rad/s"
     optional: bool = False
-    """Whether the log may be read without them if it does not contain the field."""
+    """Whether a log without these fields may still be read."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -147,7 +147,7 @@ class Acceleration:
     unit: Literal["m/s^2", "g"] = "m/s^2"
     axes: Literal["world", "body"] = "body"
     gravity: Literal["felt", "removed"] = "felt"
-    """Specific force of an accelerometer (felt), one g upwards at rest; or the derivative of the velocity (removed)."""
+    """An accelerometer's specific force, one g upwards at rest (felt); or the derivative of the velocity (removed)."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -159,12 +159,12 @@ class Landed:
 
 @dataclass(frozen=True, config=STRICT)
 class Frames:
-    """Axes of the log; three letters for the directions of x, y and z."""
+    """The log's axes; three letters for the directions of x, y and z."""
 
     world: World = "ENU"
-    """East, north, up; NED; NWU; EUS for y upwards; the direction of north is arbitrary."""
+    """ENU (east, north, up), NED, NWU, or for example EUS if y points up; the direction of north is arbitrary."""
     body: Body = "FLU"
-    """Forward, left, up; FRD: forward, right, down; RFU; and so on."""
+    """FLU (forward, left, up), FRD (forward, right, down), RFU, and so on."""
 
     @model_validator(mode="after")
     def _both(self) -> "Frames":
@@ -175,7 +175,7 @@ class Frames:
 
 @dataclass(frozen=True, config=STRICT)
 class Part:
-    """Part of the log that is used, since its beginning [s]."""
+    """The part of the log to use, in time from its beginning [s]."""
 
     start: Seconds = 0.0
     end: Seconds | None = None
@@ -183,18 +183,18 @@ class Part:
 
 @dataclass(frozen=True, config=STRICT)
 class LogMap:
-    """Map of a log's fields to quantities."""
+    """A map from a log's fields to quantities."""
 
     attitude: Attitude
     thrust: Thrust
     position: Position | None = None
-    """Without it, positions are the integral of the velocities."""
+    """Without it, positions are integrated from the velocities."""
     velocity: Velocity | None = None
-    """Without it, velocities are the smoothed derivative of the positions."""
+    """Without it, velocities are the smoothed derivatives of the positions."""
     rates: BodyRates | None = None
     """Commanded body rates."""
     measured_rates: BodyRates | None = None
-    """Rates of a gyroscope; by default they are derived from the attitudes."""
+    """Gyroscope rates; by default they are derived from the attitudes."""
     acceleration: Acceleration | None = None
     landed: Landed | None = None
     time: Time | None = None

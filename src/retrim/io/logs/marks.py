@@ -1,4 +1,4 @@
-"""Reads the marks of an autopilot in its log: validity of estimates, resets of the estimator, and landing."""
+"""Reads an autopilot's marks in its log: the validity of estimates, estimator resets, and landing."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Marks:
 
 
 def marks_of(log_map: LogMap, series: Mapping[str, Series], t: np.ndarray) -> Marks:
-    """Return the marks of a log at the times of a grid."""
+    """Return a log's marks at the times of a grid."""
     holds, resets = dict[str, np.ndarray](), dict[str, np.ndarray]()
     for name in QUANTITIES:
         spec = getattr(log_map, name)
@@ -47,7 +47,7 @@ def marks_of(log_map: LogMap, series: Mapping[str, Series], t: np.ndarray) -> Ma
 
 
 def _around(series: Series, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of the samples at or before each time, and at or after it."""
+    """Return the sample values at or before each time, and those at or after it."""
     last = len(series.t) - 1
     before = np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, last)
     after = np.clip(np.searchsorted(series.t, t, side="left"), 0, last)
@@ -55,6 +55,6 @@ def _around(series: Series, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _true(values: np.ndarray, field: str) -> np.ndarray:
-    """Return where a flag is set: not zero, or equal to the number in its field, for example ``state==1``."""
+    """Return where a flag is set: it is not zero, or equals the number in its field, for example ``state==1``."""
     number = field.partition("==")[2]
     return np.asarray(values == float(number) if number else values != 0.0)

@@ -1,4 +1,4 @@
-"""Determines the times of the messages of a bag, on one clock; their own stamps are used if they exist."""
+"""Determines the times of the messages in a bag, on one clock; their own stamps are used if they exist."""
 
 from collections.abc import Mapping
 from operator import attrgetter
@@ -9,19 +9,19 @@ import numpy as np
 from .series import Clock
 
 MICROSECOND, NANOSECOND = 1e-6, 1e-9
-APART = 1.0  # difference above which two clocks are not the same [s]
+APART = 1.0  # difference above which two clocks are different [s]
 FEWEST, AROUND = 50, 0.5  # minimum number of messages, and time around each [s], from which its delay is estimated
 EVEN, LOST = (
     3.0,
     0.5,
-)  # upper limits in periods, for an even rate: delay of messages, and of the earliest ones if no message is lost
-EARLY = 5.0  # percentile of delays that counts as the delay of a message without a wait
+)  # limits in periods for an even rate: spread of delays, and spread of the shortest delays if no message is lost
+EARLY = 5.0  # percentile of delays that counts as the delay of a message that did not wait
 
 
 def stamp_of(message: Any, time: Clock | None) -> float:
-    """Return the message's own time [s]: from the map's field, the header or the stamps of PX4.
+    """Return the message's own time [s] from the map's field, the header or the PX4 stamps.
 
-    Zero is an unset stamp, or the beginning of a simulation; NaN means that the message has no stamp.
+    Zero is an unset stamp or the beginning of a simulation; NaN means that the message has no stamp.
     """
     result = float("nan")
     stamps = [] if time is None else [(time.field, time.scale)]
@@ -43,13 +43,14 @@ def stamp_of(message: Any, time: Clock | None) -> float:
 
 
 def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the times of each topic on one clock, and notes.
+    """Return each topic's times on one clock, and notes.
 
-    A topic whose messages have no stamp gets the times of reception. If other topics are stamped by another clock, for
-    example the uptime of an autopilot, they are shifted to the clock of the recorder by their earliest messages.
+    For a topic whose messages have no stamps, the times of reception are used. Other topics may have stamps from a
+    different clock, for example an autopilot's uptime. They are then shifted to the recorder's clock by their earliest
+    messages.
 
     Args:
-        stamps: Stamp (NaN if absent) and reception of each message [s], (n, 2), by topic.
+        stamps: Stamp (NaN if absent) and time of reception of each message [s], (n, 2), by topic.
     """
     times, notes, ahead = dict[str, np.ndarray](), list[str](), dict[str, float]()
     for topic, both in stamps.items():
@@ -72,10 +73,10 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
 
 
 def evenly(received: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the send times of messages with an even rate, up to the shortest delay, and whether the rate is even.
+    """Return the send times of messages with an even rate, plus the shortest delay, and whether the rate is even.
 
-    A message may be late but never early. The neighbour with the smallest delay therefore determines the send times of
-    the messages around it. If the rate is not even, or messages are lost, the times of reception are returned.
+    A message may be late but never early. The neighbour with the shortest delay therefore determines the send times of
+    the messages around it. If the rate is not even, or if messages are lost, the times of reception are returned.
     """
     n = len(received)
     if n < FEWEST:

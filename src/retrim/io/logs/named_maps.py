@@ -1,4 +1,4 @@
-"""Maps by name, TOML files in the folder ``maps``, for logs of retrim and of usual autopilots."""
+"""Named maps for logs from retrim and common autopilots, as TOML files in the folder ``maps``."""
 
 import tomllib
 from functools import cache
@@ -27,7 +27,7 @@ def names() -> tuple[str, ...]:
 
 
 def read_map(source: str | Path) -> LogMap:
-    """Return a map by name, or from a TOML file.
+    """Return a map by name or from a TOML file.
 
     Raises:
         ConfigError: The file cannot be read, or a value is missing, unknown or impossible.

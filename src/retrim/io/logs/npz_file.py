@@ -1,4 +1,4 @@
-"""Reads NPZ logs: arrays whose first axis is time, as written by `retrim fly`."""
+"""Reads NPZ logs: arrays whose first axis is time, such as those that `retrim fly` writes."""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -34,7 +34,7 @@ def read_npz(
 
 
 def _flat(path: Path, name: str, arrays: NpzMembers) -> np.ndarray:
-    """Return an array of samples x columns."""
+    """Return an array with one row per sample."""
     base, _, part = name.partition("[")
     if base not in arrays:
         raise missing_field(path, base, list(arrays))

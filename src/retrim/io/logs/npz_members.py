@@ -1,4 +1,4 @@
-"""Arrays of an NPZ file; each is read when it is accessed, after a check of its size."""
+"""Arrays in an NPZ file; each is read when it is accessed, after its size is checked."""
 
 import math
 import zipfile
@@ -12,12 +12,12 @@ from numpy.lib import format as npy
 from ...errors import LogError, excerpt
 
 MAX_MEMBER = 512 * 2**20
-"""Maximum unpacked size of an array [bytes]: 45 minutes at 1 kHz of an attitude's nine numbers are 200 MB."""
+"""Maximum unpacked size of an array [bytes]; the nine numbers of an attitude, for 45 minutes at 1 kHz, take 200 MB."""
 SUFFIX = ".npy"
 
 
 class NpzMembers(Mapping[str, Any]):
-    """The arrays of a file by name. A member that is not accessed is not unpacked, whatever its size."""
+    """A file's arrays by name; a member that is not accessed is not unpacked, whatever its size."""
 
     def __init__(self, path: Path) -> None:
         """Read the table of members.
@@ -36,7 +36,7 @@ class NpzMembers(Mapping[str, Any]):
         """Return an array.
 
         Raises:
-            LogError: It is too large, damaged, or not an array of numbers.
+            LogError: The array is too large or damaged, or does not consist of numbers.
         """
         member = self._members[name]
         if member.file_size > MAX_MEMBER:
@@ -63,7 +63,7 @@ class NpzMembers(Mapping[str, Any]):
 
 
 def _array(file: Any, size: int) -> np.ndarray:
-    """Read an array; its header may contain an arbitrary shape, which is validated."""
+    """Read an array, after validating its header, which may contain an arbitrary shape."""
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(file)
     if version not in read:

@@ -1,4 +1,4 @@
-"""Applies a map to series: states and commands on one clock, in the frames and units of retrim."""
+"""Applies a map to series: states and commands on one clock, in retrim's frames and units."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +16,11 @@ from .series import Series
 
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 STATES = ("position", "velocity", "attitude")
-SLOWEST = 0.1  # [s]: slower states do not determine accelerations, and presets have no such tick
-SHORTEST = 2e-5  # [s]: states never come that often
-ROUNDING = 0.045  # relative deviation of a logger that is set to ten samples a second
-LONGEST = 5_000_000  # maximum number of ticks: times with a larger span do not belong to one flight
-ALIKE = 0.02  # relative difference of the periods of log and control up to which they count as equal
+SLOWEST = 0.1  # [s]: slower states do not determine accelerations, and no preset has such a tick
+SHORTEST = 2e-5  # [s]: states never arrive that often
+ROUNDING = 0.045  # relative deviation of a logger that is set to ten samples per second
+LONGEST = 5_000_000  # maximum number of ticks; times that span more do not belong to one flight
+ALIKE = 0.02  # relative difference up to which the log's period and the control period count as equal
 COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
 
 
@@ -35,14 +35,14 @@ class Ticks:
     a: np.ndarray
     rates: np.ndarray
     thrust: np.ndarray
-    """Thrust in the unit of the map, upwards; a share is not converted."""
+    """Upward thrust in the map's unit; a share is not converted."""
     command: np.ndarray | None
     known: np.ndarray
     """Ticks at which all of these quantities are known."""
     hover: np.ndarray | None
     dt: float
     gyroscope: bool
-    """Whether the rates are measured instead of derived from the attitudes."""
+    """Whether the rates are measured, not derived from the attitudes."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     """Return the clock on which a log is read.
 
     Raises:
-        LogError: States come too rarely, or the quantities do not overlap in time.
+        LogError: States arrive too rarely, or the quantities do not overlap in time.
     """
     states = [name for name in STATES if name in series]
     own = max(period(series[name]) for name in states)
@@ -94,7 +94,7 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     """Return the series on a grid, converted by the map.
 
     Raises:
-        LogError: A quantity has the wrong number of columns, or is not an attitude.
+        LogError: A quantity has the wrong number of columns, or the attitude is not valid.
     """
     W, B = to_world(log_map.frames.world), to_body(log_map.frames.body)
     t, dt = grid.t, grid.dt
@@ -142,20 +142,20 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
 
 
 def _speed(log_map: LogMap) -> float:
-    """Return the m/s per unit of velocity; a velocity that is not in the log is in the unit of the position."""
+    """Return the m/s per unit of velocity; a velocity that is not in the log uses the position's unit."""
     if log_map.velocity is not None:
         return maps.SPEEDS[log_map.velocity.unit]
     return 1.0 if log_map.position is None else maps.METRES[log_map.position.unit]
 
 
 def _told(command: Series, grid: Grid) -> np.ndarray:
-    """Return a command at each tick: its sample, or the mean over the tick if the command has times of its own."""
+    """Return a command at each tick: its sample, or its mean over the tick if the command has its own times."""
     sampled = grid.sampled and np.array_equal(np.intersect1d(command.t, grid.t), grid.t)
     return held(command, grid.t) if sampled else held_mean(command, grid.t, grid.dt)
 
 
 def turning(R: np.ndarray, dt: float) -> np.ndarray:
-    """Return the body rates from central differences of attitudes on a grid [rad/s]."""
+    """Return the body rates [rad/s], from central differences of attitudes on a grid."""
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     before, after = np.concatenate([R[:1], R[:-1]]), np.concatenate([R[1:], R[-1:]])
@@ -166,7 +166,7 @@ def turning(R: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _columns(path: Path, name: str, series: dict[str, Series]) -> Series:
-    """Return a series after a check of its number of columns."""
+    """Return a series after checking its number of columns."""
     wanted, result = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
     if name != "attitude" and result != wanted:
         hint = "; add the motors' thrusts up into one column" if name == "thrust" and result == 4 else ""

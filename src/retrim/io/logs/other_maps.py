@@ -1,4 +1,4 @@
-"""Generates maps that differ from a given one in one statement, with text: candidates for the intended map."""
+"""Generates maps that differ from a given one in one statement, with a text: candidates for the intended map."""
 
 import dataclasses
 import math
@@ -20,16 +20,16 @@ STATEMENTS = (
 
 
 class Other(NamedTuple):
-    """An alternative map of a log."""
+    """An alternative map for a log."""
 
     words: str
-    """Text of the map's changed statement."""
+    """Text of the changed statement."""
     log_map: LogMap
     turns: Mapping[str, np.ndarray]
-    """Matrices that multiply the columns of quantities from the right."""
+    """Matrices that multiply the quantities' columns from the right."""
 
     def applied(self, series: Mapping[str, Series]) -> dict[str, Series]:
-        """Return the series after multiplication with ``turns``."""
+        """Return the series after multiplication by ``turns``."""
         return {
             name: Series(each.t, each.values @ self.turns[name]) if name in self.turns else each
             for name, each in series.items()
@@ -96,17 +96,17 @@ def turned_about_z(name: str, letters: str) -> list[str]:
 
 
 def other_world(name: str) -> str:
-    """Return the usual world with the opposite direction of z."""
+    """Return the usual world axes with the opposite z direction."""
     return "NED" if "U" in name else "ENU"
 
 
 def other_body(name: str) -> str:
-    """Return the usual body with the opposite direction of z."""
+    """Return the usual body axes with the opposite z direction."""
     return "FRD" if "U" in name else "FLU"
 
 
 def _signs(chosen: LogMap) -> Iterator[Other]:
-    """Return maps with other signs of a quantity's numbers, and with x and y exchanged."""
+    """Return maps in which a quantity's numbers have different signs, or a different order."""
     for table in ("position", "velocity", "attitude", "rates", "measured_rates"):
         spec: Any = getattr(chosen, table)
         if spec is None or (table == "attitude" and spec.form in ("matrix", "rotation vector")):
@@ -126,7 +126,7 @@ def _signs(chosen: LogMap) -> Iterator[Other]:
 
 
 def _arranged(chosen: LogMap, table: str, order: Sequence[int], signs: Sequence[int]) -> Other:
-    """Return a map with the fields in another order, each with a sign."""
+    """Return a map with the fields in a different order, each with a sign."""
     spec: Any = getattr(chosen, table)
     turn = np.zeros((len(order), len(order)))
     for column, (row, sign) in enumerate(zip(order, signs, strict=True)):
@@ -149,5 +149,5 @@ def _values(spec: Any, key: str) -> tuple[Any, ...]:
 def _with(chosen: LogMap, table: str, key: str, value: Any) -> LogMap:
     changes = {key: value} | (
         {"mass": None, "hover": None, "full": 1.0} if table == "thrust" else {}
-    )  # these belong to one unit only
+    )  # these belong to a single unit
     return dataclasses.replace(chosen, **{table: dataclasses.replace(getattr(chosen, table), **changes)})

@@ -1,8 +1,8 @@
-"""Checks the consistency of a log, and finds mistakes of units, frames and signs in its map.
+"""Checks a log's consistency, and finds mistakes in its map's units, frames and signs.
 
-If figures of :mod:`retrim.io.logs.agreement` are low, every map that differs in one statement is tried. If the log
+If figures from :mod:`retrim.io.logs.agreement` are low, every map that differs in one statement is tried. If the log
 agrees far better with one of them, the error names that map. A log that is inconsistent with every map is refused. A
-log with low agreement is read with a warning.
+log with low agreement is read, but with a warning.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from .on_one_clock import Ticks
 from .other_maps import Other, others, with_heading
 
 SUSPECT = 0.05  # unexplained share above which other maps are tried
-BETTER, AGREES = 5.0, 0.75  # required of another map: factor of the reduced remainder, and least agreement
-PART = 3000  # number of ticks of a long log that are used to try other maps
+BETTER, AGREES = 5.0, 0.75  # required of another map: factor by which the remainder shrinks, and minimum agreement
+PART = 3000  # number of ticks in a long log that are used to try other maps
 REFUSED = {"motion": 0.0, "lift": 0.0, "thrust": 0.0, "turning": -0.3, "gyroscope": -0.3}
 """Agreement below which a log is refused."""
 DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.65, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
@@ -28,20 +28,20 @@ DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.65, "climb": 0.25, "turning
 def check_plausible(
     path: Path, chosen: LogMap, ticks: Ticks, read: Callable[[Other, slice], Ticks], valid: np.ndarray
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Check that the quantities of a log agree with each other.
+    """Check that a log's quantities agree with each other.
 
     Args:
-        path: File of the log, for messages.
+        path: The log file, for messages.
         chosen: The map.
         ticks: The log, read with the map.
-        read: Reads a part of the log with another map.
+        read: Reads a part of the log with a different map.
         valid: Mask of the ticks that are used.
 
     Returns:
-        The figures of agreement, 1 for complete agreement, and a warning for each low one.
+        The agreement figures, where 1 is complete agreement, and a warning for each low one.
 
     Raises:
-        LogError: The quantities do not agree; the message names the wrong statement of the map, if there is one.
+        LogError: The quantities do not agree; the message names the wrong statement in the map, if there is one.
     """
     scores = agreement(chosen, ticks, valid)
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
@@ -61,7 +61,7 @@ def check_plausible(
 
 
 def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.ndarray) -> str:
-    """Return the error and the statement of the map that corrects it best; an empty string if no statement does."""
+    """Return the error and the map statement that corrects it best; an empty string if no statement does."""
     part = _part(valid)
     ticks = read(Other("", chosen, {}), part)
     scores = agreement(chosen, ticks, valid[part])
@@ -84,7 +84,7 @@ def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.nda
 
 
 def _part(valid: np.ndarray) -> slice:
-    """Return the part of a long log with the most flight, which is sufficient to check a map."""
+    """Return the part of a long log with the most flight data; it is sufficient to check a map."""
     if len(valid) <= PART:
         return slice(0, len(valid))
     flight = np.concatenate([[0], np.cumsum(valid)])

@@ -1,4 +1,4 @@
-"""Reads the quantities that a map names from a file: series in order of time, and the map that was used."""
+"""Reads the quantities in a map from a file: series in order of time, and the map that was used."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,9 +21,9 @@ READERS: dict[str, LogReader] = {
     ".csv": read_csv, ".tsv": read_csv, ".txt": read_csv, ".npz": read_npz, ".ulg": read_ulog, ".ulog": read_ulog,
     ".bag": read_bag, ".mcap": read_bag, ".db3": read_bag,
 }  # fmt: skip
-"""Readers by file suffix; a folder is a bag of ROS 2."""
+"""Readers by file suffix; a folder is a ROS 2 bag."""
 MOST_BYTES = 2 * 2**30, 256 * 2**20
-"""Maximum size of a log, and of a text log [bytes]."""
+"""Maximum sizes of a log and of a CSV log [bytes]."""
 CONVERTERS = {
     ".bbl": "blackbox_decode of blackbox-tools makes a CSV of it",
     ".bfl": "blackbox_decode of blackbox-tools makes a CSV of it",
@@ -39,9 +39,9 @@ FLAGS = ("valid", "resets")
 
 
 def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Series], LogMap, list[str]]:
-    """Return the series of a log, the map that it was read with, and notes.
+    """Return a log's series, the map that was used to read it, and notes.
 
-    In addition to the quantities, the series contain ``<quantity> valid <k>``, ``<quantity> resets <k>`` and
+    In addition to the quantities, the series include ``<quantity> valid <k>``, ``<quantity> resets <k>`` and
     ``landed <k>``, and a derived velocity if the log has none.
 
     Raises:
@@ -102,7 +102,7 @@ def _read(path: Path, reader: LogReader, log_map: LogMap | None) -> tuple[dict[s
 
 
 def _wanted(chosen: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]]:
-    """Return the fields of each quantity and mark, and the set of optional ones."""
+    """Return the fields of each quantity and mark, and the set of those that are optional."""
     wanted, optional = dict[str, tuple[str, ...]](), set[str]()
     marks = dict[str, tuple[str, ...]]()
     for name in QUANTITIES:

@@ -1,6 +1,7 @@
-"""Writes a flight as files for other programs: MCAP with messages of ROS 2, and NPZ with the same data.
+"""Writes a flight as files for other programs: MCAP with ROS 2 messages, and NPZ with the same data.
 
-Foxglove, PlotJuggler, rerun and ``ros2 bag`` open MCAP. It needs the extra ``mcap``. ``retrim replay`` reads both.
+Foxglove, PlotJuggler, rerun and ``ros2 bag`` open MCAP files. Writing MCAP needs the extra ``mcap``. ``retrim replay``
+reads both formats.
 """
 
 import tempfile
@@ -19,10 +20,10 @@ FRAME = "world"
 
 @dataclass(frozen=True)
 class Recording:
-    """Ticks and events of a flight; states are p [m], R row by row, v [m/s], world."""
+    """Ticks and events of a flight; a state consists of p [m], R row by row, and v [m/s], world."""
 
     t: np.ndarray
-    """Times since the start [s], (n,)."""
+    """Times from the start [s], (n,)."""
     measured: np.ndarray
     """States that the pilot received, (n, 15)."""
     true: np.ndarray
@@ -34,9 +35,9 @@ class Recording:
     error: np.ndarray
     """The task's error [m], (n,)."""
     target: np.ndarray | None = None
-    """Target position of the vehicle, world [m], (n, 3)."""
+    """The vehicle's target position, world [m], (n, 3)."""
     flown_by: Sequence[str] | None = None
-    """Controller that commanded the vehicle, (n,)."""
+    """Name of the controller that commanded the vehicle, (n,)."""
     policy_age: np.ndarray | None = None
     """Age of the flight data from which the policy was learned [s], (n,)."""
     events: Sequence[Event] = ()
@@ -54,10 +55,10 @@ def write_npz(path: Path, flight: Recording) -> None:
 
 
 def write_mcap(path: Path, flight: Recording) -> None:
-    """Write messages of ROS 2; the file appears once it is complete.
+    """Write ROS 2 messages; the file appears once it is complete.
 
-    Times are those of the flight. If the first states were measured before its beginning, all times are shifted to
-    later ones. Stamps are then not negative, and not zero, which readers of ROS treat as a missing stamp.
+    Times are those of the flight. If the first states were measured before the flight began, all times are shifted
+    later. Stamps are then neither negative nor zero; ROS readers treat zero as a missing stamp.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -79,7 +80,7 @@ def write_mcap(path: Path, flight: Recording) -> None:
             later = 0.0 if first == 0.0 else 1e-9 - first
             for k, t in enumerate((flight.t + later).tolist()):
                 x, truth, u = flight.measured[k], flight.true[k], flight.command[k]
-                seen = t - float(flight.age[k])  # the header has the time of the state, the log that of its arrival
+                seen = t - float(flight.age[k])  # the header has the time of the state, and the log that of its arrival
                 add("/measured/pose", t, make.pose(seen, x, turned[0][k]))
                 add("/measured/velocity", t, make.twist(seen, x[12:15], np.zeros(3)))
                 add("/true/pose", t, make.pose(t, truth, turned[1][k]))
@@ -98,7 +99,7 @@ def write_mcap(path: Path, flight: Recording) -> None:
 
 
 def quaternions(x: np.ndarray) -> np.ndarray:
-    """Return the attitudes of states as quaternions x, y, z, w, (n, 4)."""
+    """Return the states' attitudes as quaternions x, y, z, w, (n, 4)."""
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
     result: np.ndarray = Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat()
@@ -106,7 +107,7 @@ def quaternions(x: np.ndarray) -> np.ndarray:
 
 
 class _Messages:
-    """Builds messages of ROS 2; a command has the thrust in linear.z [m/s^2] and body rates in angular [rad/s]."""
+    """Builds ROS 2 messages; a command has the thrust in linear.z [m/s^2] and the body rates in angular [rad/s]."""
 
     def __init__(self, types: Any) -> None:
         self._types = types

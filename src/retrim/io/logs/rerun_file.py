@@ -1,6 +1,6 @@
-"""Writes a flight as a file of the rerun viewer: the vehicle in 3-D, and plots of error, commands and events.
+"""Writes a flight as a file for the rerun viewer: the vehicle in 3-D, and plots of errors, commands and events.
 
-It needs the extra ``rerun``. All data are on one timeline, ``flight``, in seconds since its start.
+It needs the extra ``rerun``. All data are on one timeline, ``flight``, in seconds from the start of the flight.
 """
 
 import tempfile
@@ -69,7 +69,7 @@ def _write(rr: Any, stream: Any, flight: Recording) -> None:
 
 
 def _told(flight: Recording) -> list[tuple[float, str]]:
-    """Return the events, and each change of the active controller, in order of time [s]."""
+    """Return the events and each change of the active controller, with times [s], in order."""
     told = [(event.t, f"{event.kind}: {event.note}") for event in flight.events]
     flown_by = flight.flown_by or ()
     before: str | None = None

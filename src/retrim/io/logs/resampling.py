@@ -1,10 +1,10 @@
-"""Resamples series to one clock: states are interpolated, commands are held until the next sample."""
+"""Resamples series to one clock: states are interpolated, and commands are held until the next sample."""
 
 import numpy as np
 
 from .series import Series
 
-GAP = 2.5  # periods without a sample after which a quantity is not known
+GAP = 2.5  # number of periods without a sample after which a quantity is unknown
 
 
 def period(series: Series) -> float:
@@ -16,10 +16,10 @@ def known(series: Series, grid: np.ndarray, dt: float, *, held: float = 0.0) -> 
     """Return where on a grid a series is known: between samples that are not far apart.
 
     Args:
-        series: Samples.
+        series: The samples.
         grid: Times [s].
         dt: Period of the grid [s].
-        held: For a command: minimum time for which it is held without a new sample [s].
+        held: Minimum time for which a command is held without a new sample [s].
     """
     longest = max(GAP * max(period(series), dt), held)
     after = np.searchsorted(series.t, grid, side="right")
@@ -31,17 +31,17 @@ def known(series: Series, grid: np.ndarray, dt: float, *, held: float = 0.0) -> 
 
 
 def interpolated(series: Series, grid: np.ndarray) -> np.ndarray:
-    """Return the values at the times of a grid, linear between samples."""
+    """Return the values at grid times, interpolated linearly between samples."""
     return np.stack([np.interp(grid, series.t, column) for column in series.values.T], axis=1)
 
 
 def held(series: Series, grid: np.ndarray) -> np.ndarray:
-    """Return the last value before or at each time of a grid."""
+    """Return the last value at or before each grid time."""
     return series.values[np.clip(np.searchsorted(series.t, grid, side="right") - 1, 0, None)]
 
 
 def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
-    """Return the mean of a command over each tick that begins at a grid time; each value is held until the next."""
+    """Return the mean of a command over the tick after each grid time; each value is held until the next."""
     steps = np.diff(series.t)[:, None]
     total = np.concatenate([np.zeros((1, series.values.shape[1])), np.cumsum(series.values[:-1] * steps, axis=0)])
     end = series.t[-1] + 2.0 * dt
@@ -52,7 +52,7 @@ def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
 
 
 def turned(t: np.ndarray, R: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return attitudes at the times of a grid, interpolated along the shortest rotation between samples."""
+    """Return the attitudes at grid times, interpolated along the shortest rotation between samples."""
     from scipy.spatial.transform import Rotation, Slerp  # local, because it takes as long to import as all of retrim
 
     inside = np.clip(grid, t[0], t[-1])
@@ -60,13 +60,13 @@ def turned(t: np.ndarray, R: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def derivative(values: np.ndarray, dt: float) -> np.ndarray:
-    """Return the derivative of columns on a grid, from five points; two rows at each end repeat their neighbour."""
+    """Return the five-point derivative of columns on a grid; two rows at each end repeat their neighbour."""
     inner = (values[:-4] - 8.0 * values[1:-3] + 8.0 * values[3:-1] - values[4:]) / (12.0 * dt)
     return np.concatenate([inner[:1], inner[:1], inner, inner[-1:], inner[-1:]])
 
 
 def smoothed(x: np.ndarray, rows: int) -> np.ndarray:
-    """Return the centred mean of a column over about ``rows`` rows; fewer at the ends."""
+    """Return the centred mean of a column over about ``rows`` rows, and over fewer at the ends."""
     kernel = np.ones(min(rows, len(x)))
     return np.asarray(np.convolve(x, kernel, mode="same") / np.convolve(np.ones(len(x)), kernel, mode="same"))
 
@@ -78,7 +78,7 @@ def around(valid: np.ndarray, reach: int) -> np.ndarray:
 
 
 def runs(flags: np.ndarray, length: int) -> np.ndarray:
-    """Return where flags belong to a run of at least that length."""
+    """Return where flags belong to a run of at least ``length`` rows."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     result = np.zeros(len(flags), dtype=bool)
     for first, last in zip(edges[::2], edges[1::2], strict=True):

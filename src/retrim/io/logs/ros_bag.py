@@ -1,7 +1,7 @@
-"""Reads bags of ROS 1 and ROS 2, and MCAP files with messages of ROS. Needs the extra ``logs``.
+"""Reads ROS 1 and ROS 2 bags, and MCAP files with ROS messages. Needs the extra ``logs``.
 
 A field is a topic and a path in its messages, for example ``/odom.pose.pose.position``. Vectors and quaternions are
-read as a whole; ``[0]`` selects an element of an array. ``*`` in a topic matches any characters.
+read as a whole; ``[0]`` selects an array element. ``*`` in a topic matches any characters.
 """
 
 import re
@@ -32,9 +32,9 @@ class Place(NamedTuple):
 def read_bag(
     path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
-    """Read topics of a bag; see :class:`~retrim.io.logs.series.LogReader`.
+    """Read topics from a bag; see :class:`~retrim.io.logs.series.LogReader`.
 
-    Times come from the map's time field, the header, the stamps of PX4 messages, or otherwise the recording.
+    Times come from the map's time field, the header or the stamps of PX4 messages, and otherwise from the recording.
     """
     if find_spec("rosbags") is None:
         raise LogError(f"{path}: a bag needs rosbags: pip install 'retrim[logs]'")
@@ -81,7 +81,7 @@ def _read(
 def _places(
     path: Path, wanted: Mapping[str, Sequence[str]], known: Sequence[str], optional: Collection[str]
 ) -> dict[str, list[Place]]:
-    """Return the locations of the fields of each quantity."""
+    """Return the locations of each quantity's fields."""
     places = dict[str, list[Place]]()
     for what, fields in wanted.items():
         try:
@@ -115,7 +115,7 @@ def _check_fields(
     taken: dict[Place, list[list[float]]],
     optional: Collection[str],
 ) -> None:
-    """Remove the optional quantities that the messages of a topic do not contain."""
+    """Remove the optional quantities that a topic's messages do not contain."""
     for what in [what for what, result in places.items() if what in optional and result[0].topic == topic]:
         try:
             for place in places[what]:
@@ -128,7 +128,7 @@ def _check_fields(
 
 
 def _numbers(path: Path, place: Place, message: Any) -> list[float]:
-    """Return the numbers of a field."""
+    """Return the numbers in a field."""
     name = f"{place.topic}.{place.inner}"
     parsed = re.fullmatch(r"([\w.]+)(?:\[(\d+)\])?", place.inner, re.ASCII)
     if parsed is None:
@@ -151,5 +151,5 @@ def _numbers(path: Path, place: Place, message: Any) -> list[float]:
 
 
 def _fields(message: Any) -> list[str]:
-    """Return the names of the fields of a message."""
+    """Return the names of a message's fields."""
     return [name for name in getattr(message, "__dataclass_fields__", {}) if not name.startswith("__")]

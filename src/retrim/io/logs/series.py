@@ -1,4 +1,4 @@
-"""Columns of a log with their recorded times."""
+"""Columns from a log with their recorded times."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ MANY = 30  # maximum number of names in an error message
 
 @dataclass(frozen=True)
 class Series:
-    """Samples of one quantity."""
+    """The samples of one quantity."""
 
     t: np.ndarray
     """Times [s], (n,)."""
@@ -27,7 +27,7 @@ class Series:
 
 @runtime_checkable
 class LogReader(Protocol):
-    """Reads one format of log files."""
+    """Reads one log file format."""
 
     def __call__(
         self,
@@ -39,10 +39,10 @@ class LogReader(Protocol):
         """Read the requested quantities.
 
         Args:
-            path: The file, or the folder of a bag.
-            wanted: Field names of each quantity, in the notation of the format. A field may hold several numbers. A
+            path: The file, or a bag's folder.
+            wanted: Field names for each quantity, in the format's notation. A field may contain several numbers. A
                 minus sign may precede its name, and alternatives may follow it; see :func:`first_of`.
-            time: Field of times; None for the times of the format.
+            time: Time field; None for the format's own times.
             optional: Quantities that are left out if the log does not contain them.
 
         Returns:
@@ -56,7 +56,7 @@ class LogReader(Protocol):
 
 @dataclass(frozen=True)
 class Clock:
-    """The field of times."""
+    """The time field."""
 
     field: str
     scale: float
@@ -64,10 +64,10 @@ class Clock:
 
 
 def first_of(name: str, look: Callable[[str], T]) -> T:
-    """Return the result of ``look`` for the first existing alternative of a field, ``a|b``.
+    """Return the result of ``look`` for the first existing alternative in a field such as ``a|b``.
 
     Raises:
-        LogError: No alternative exists; the message is that of the first.
+        LogError: No alternative exists; the message refers to the first.
     """
     errors = list[LogError]()
     for each in name.removeprefix("-").split("|"):
@@ -79,7 +79,7 @@ def first_of(name: str, look: Callable[[str], T]) -> T:
 
 
 def sign_of(name: str) -> float:
-    """Return minus one for a field with a leading minus sign, otherwise one."""
+    """Return minus one for a field with a leading minus sign, and one otherwise."""
     return -1.0 if name.startswith("-") else 1.0
 
 

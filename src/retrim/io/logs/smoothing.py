@@ -1,4 +1,4 @@
-"""Differentiates positions of a log to velocities: local cubics in centred windows, without a lag."""
+"""Derives velocities from a log's positions with local cubics in centred windows, without a lag."""
 
 from pathlib import Path
 
@@ -10,21 +10,21 @@ from .on_one_clock import SHORTEST
 from .resampling import GAP
 from .series import Series
 
-FEWEST, WIDEST = 2, 0.15  # half width of a window: smallest number of samples, and largest time [s]
-QUIET = 0.3  # noise of the second derivative at which a window is wide enough [m/s^2]
-PROBES, CHUNK = 2000, 4096  # samples used to choose the window, and samples that are fitted at a time
+FEWEST, WIDEST = 2, 0.15  # half-width of a window: smallest number of samples, and longest time [s]
+QUIET = 0.3  # noise in the second derivative at which a window is wide enough [m/s^2]
+PROBES, CHUNK = 2000, 4096  # number of samples to choose the window with, and number that are fitted at a time
 
 
 def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
-    """Return the derivative of positions and a note on its window and noise.
+    """Return the derivative of positions, and a note on its window and noise.
 
     A cubic is fitted to the samples around each sample. The window is centred, so that the derivative has no lag. It is
-    as short as the noise of the positions permits: the noise of the second derivative is at most ``QUIET``, or the
-    window extends by ``WIDEST`` to each side.
+    the shortest window for which the noise in the second derivative is at most ``QUIET``, but it extends by at most
+    ``WIDEST`` to each side.
 
     Args:
-        path: File of the log, for messages.
-        position: Positions in the unit of the log.
+        path: The log file, for messages.
+        position: Positions in the log's unit.
         metres: Metres per unit.
 
     Raises:
@@ -62,7 +62,7 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
 def _cubics(
     t: np.ndarray, p: np.ndarray, pieces: np.ndarray, rows: np.ndarray, half: int, tick: float
 ) -> tuple[np.ndarray, float, float]:
-    """Return slopes at some samples, NaN where a piece ends, and the noise of slopes and second derivatives."""
+    """Return slopes at some samples, NaN where a piece ends, and the noise in slopes and second derivatives."""
     k = rows[:, None] + np.arange(-half, half + 1)
     whole = pieces[k[:, 0]] == pieces[k[:, -1]]
     x = np.where(whole[:, None], (t[k] - t[rows][:, None]) / (half * tick), np.linspace(-1.0, 1.0, 2 * half + 1))

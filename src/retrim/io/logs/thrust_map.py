@@ -1,4 +1,4 @@
-"""Converts the thrust of a log to that of the model: mass-normalised, with the acceleration at full thrust."""
+"""Converts a log's thrust to the model's: mass-normalised, with the acceleration at full thrust."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from ...physics.state import STANDARD_GRAVITY
 from .log_map import Thrust
 from .on_one_clock import UP, Ticks
 
-LEAST = 1e-9  # share of thrust below which a number is not a command
+LEAST = 1e-9  # thrust share below which a number is not a command
 
 
 def mass_normalised(
@@ -18,7 +18,7 @@ def mass_normalised(
     """Return the thrust [m/s^2], the acceleration at full thrust if the thrust was a share, and notes.
 
     Raises:
-        LogError: The thrust at hover in the log is not positive.
+        LogError: The thrust is zero throughout, acts against the acceleration, or is not positive at hover.
     """
     if spec.scale is not None:
         return spec.scale * ticks.thrust, None, []

@@ -1,4 +1,4 @@
-"""Checks times of samples: drops impossible, late and repeated ones, and reports several flights in one file."""
+"""Checks sample times: drops impossible, late and repeated ones, and reports several flights in one file."""
 
 import math
 from bisect import bisect_right
@@ -10,18 +10,19 @@ import numpy as np
 from ...errors import LogError
 from .series import Series
 
-LATE_S = 0.5  # [s] by which a sample may be older than the previous one; a larger step indicates another flight
-LARGEST = 1e15  # in any unit: larger values are damaged
+LATE_S = 0.5  # time by which a sample may be older than the previous one [s]; a larger step indicates another flight
+LARGEST = 1e15  # in any unit; larger values are damaged
 RARE = 0.05  # largest share of samples with an impossible time
-FAR_S, FAR = 60.0, 3.0  # least distance of such a time from all others, in [s] and in lengths of the log
-FEWEST = 50  # least number of samples among which one time may be impossible
+FAR_S, FAR = 60.0, 3.0  # minimum distance between such a time and all others, in [s] and in lengths of the log
+FEWEST = 50  # minimum number of samples among which a time may be impossible
 
 
 def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
     """Return a series with increasing times and finite values, and notes on excluded samples.
 
     Messages are logged when they arrive. A state is logged again until a newer one arrives, and errors in reading the
-    clock can give it an older time. Two threads overtake each other; a stamp is never set. Such samples are left out.
+    clock can give it an older time. One thread may overtake another, and a stamp may never be set. Samples with such
+    faults are left out.
 
     Raises:
         LogError: Times decrease or are constant, or no sample remains.
@@ -54,7 +55,10 @@ def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
 
 
 def impossible(t: np.ndarray) -> np.ndarray:
-    """Return times that are far from their neighbours, for example a stamp of zero in the middle; few or none."""
+    """Return a mask of times that are far from their neighbours, for example a zero stamp in the middle.
+
+    If too many times are far away, none of them is marked.
+    """
     none, most = np.zeros(len(t), dtype=bool), math.ceil(RARE * len(t))
     if len(t) < FEWEST:
         return none
@@ -71,13 +75,13 @@ def impossible(t: np.ndarray) -> np.ndarray:
 
 
 def late(t: np.ndarray) -> np.ndarray:
-    """Return times that are older than a previous one, but not old enough for another flight."""
+    """Return a mask of times that are older than an earlier sample's, but not old enough for another flight."""
     newest = np.concatenate([[-np.inf], np.fmax.accumulate(t)[:-1]])
     return np.asarray((t < newest) & (t > newest - LATE_S))
 
 
 def repeated(t: np.ndarray) -> np.ndarray:
-    """Return times that equal the previous one."""
+    """Return a mask of times that equal the previous one."""
     return np.concatenate([[False], np.diff(t) == 0.0])
 
 

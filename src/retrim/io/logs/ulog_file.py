@@ -1,7 +1,7 @@
-"""Reads logs of PX4 (ULog). Needs the extra ``logs``.
+"""Reads PX4 logs (ULog). Needs the extra ``logs``.
 
-A field is ``topic.field``, for example ``vehicle_local_position.vx``. ``vehicle_attitude.q`` is a whole array, and
-``topic#1.field`` selects the second instance of a topic.
+A field is written ``topic.field``, for example ``vehicle_local_position.vx``. ``vehicle_attitude.q`` is a whole array,
+and ``topic#1.field`` selects the second instance of a topic.
 """
 
 import contextlib
@@ -23,9 +23,10 @@ MICROSECOND = 1e-6
 def read_ulog(
     path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
-    """Read topics of a ULog; see :class:`~retrim.io.logs.series.LogReader`.
+    """Read topics from a ULog; see :class:`~retrim.io.logs.series.LogReader`.
 
-    Times come from the map's time field, if the topic has it, or from the topic: the sample's time if available.
+    Times come from the map's time field if the topic has it. Otherwise they are the topic's sample times, if available,
+    or its message times.
     """
     if find_spec("pyulog") is None:
         raise LogError(f"{path}: a ULog needs pyulog: pip install 'retrim[logs]'")
@@ -56,7 +57,7 @@ def read_ulog(
 
 
 def _times(path: Path, topic: Any, time: Clock | None) -> np.ndarray:
-    """Return the times of the samples of a topic [s]."""
+    """Return the times of a topic's samples [s]."""
     own = [] if time is None else [(time.field, time.scale)]
     for stamp, scale in (*own, ("timestamp_sample", MICROSECOND), ("timestamp", MICROSECOND)):
         if stamp in topic.data and np.any(topic.data[stamp]):
@@ -78,7 +79,7 @@ def _parsed(path: Path) -> Any:
 
 
 def _field(path: Path, name: str, topics: Mapping[str, Any]) -> tuple[Any, list[str]]:
-    """Return the topic of a field and its columns."""
+    """Return a field's topic and its columns."""
     topic, _, field = name.partition(".")
     if topic not in topics:
         raise missing_field(path, topic, sorted(topics))

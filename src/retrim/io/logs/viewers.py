@@ -1,4 +1,4 @@
-"""Recordings for other viewers, by file suffix."""
+"""Recordings for external viewers, by file suffix."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -12,11 +12,11 @@ from .rerun_file import write_rrd
 
 
 class Viewer(NamedTuple):
-    """A format of recordings."""
+    """A recording format."""
 
     write: Callable[[Path, Recording], None]
     package: str
-    """Import name of the package that writes it."""
+    """Import name of the package that writes the format."""
     extra: str
     """Extra of retrim that installs the package."""
 
@@ -28,7 +28,7 @@ VIEWERS: Mapping[str, Viewer] = {
 
 
 def check_recording(path: Path | None) -> None:
-    """Check the file of a recording before a flight; None for no recording.
+    """Check a recording's file before a flight; None means that there is no recording.
 
     Raises:
         ConfigError: The file cannot be written, or the package that writes it is not installed.
@@ -47,10 +47,10 @@ def check_recording(path: Path | None) -> None:
 
 
 def can_record(path: Path) -> bool:
-    """Return whether the package for recordings of that name is installed."""
+    """Return whether the package that writes a recording with this suffix is installed."""
     return find_spec(VIEWERS[path.suffix].package) is not None
 
 
 def record(path: Path, flight: Recording) -> None:
-    """Write a flight in the format of the file suffix; the file appears once it is complete."""
+    """Write a flight in the format that the file suffix gives; the file appears once it is complete."""
     VIEWERS[path.suffix].write(path, flight)

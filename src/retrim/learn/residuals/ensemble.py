@@ -17,12 +17,12 @@ from .targets import Targets
 class EnsembleResidual(eqx.Module):
     """Mean of ``members`` ReLU networks 19-128-128-3 on x and u, in the world frame [m/s^2].
 
-    ``offset`` and ``scale`` bring the 19 inputs to order one: positions relative to the task's origin, thrust
-    mass-normalised. They are the same in fitting, simulation and flight, and are never trained.
+    ``offset`` and ``scale`` bring the 19 inputs to order one. Positions are relative to the task's origin, and thrust
+    is mass-normalised. Offset and scale are the same in fitting, simulation and flight, and are never trained.
     """
 
     layers: tuple[tuple[eqx.nn.Linear, ...], ...]
-    """members x layers"""
+    """Layers of each member, members x layers."""
     offset: Float[Array, "19"]
     scale: Float[Array, "19"]
 
@@ -92,17 +92,17 @@ class EnsembleState(eqx.Module):
 
 
 class EnsembleModel(eqx.Module):
-    """The ensemble as a :class:`retrim.learn.ResidualModel`: Adam, whose moments are carried from fit to fit."""
+    """The ensemble as a :class:`retrim.learn.ResidualModel`, fitted by Adam with moments carried from fit to fit."""
 
     origin: Float[Array, "3"]
-    """Origin of the task, world [m]; positions enter relative to it."""
+    """Task origin, world [m]; positions are taken relative to it."""
     omega_max: Float[Array, "3"]
     """Largest body rates [rad/s]; rates are divided by them."""
     learning_rate: Float[Array, ""]
     spectral_weight: Float[Array, ""]
     """Weight of the spectral penalty."""
     steps: int = eqx.field(static=True, default=100)
-    """Optimiser steps of one fit."""
+    """Optimiser steps per fit."""
     hidden: tuple[int, ...] = eqx.field(static=True, default=(128, 128))
     """Hidden layers of each member."""
 
@@ -117,7 +117,7 @@ class EnsembleModel(eqx.Module):
         return EnsembleState.of(fresh, self._optimiser())
 
     def fit(self, state: EnsembleState, rows: Targets) -> tuple[EnsembleState, Float[Array, ""]]:
-        """Fit, starting from the last fit; also return the error before the last step [m/s^2]."""
+        """Fit, starting from the previous fit; also return the error before the last step [m/s^2]."""
         fitted, errors = fit_ensemble(
             state, rows, optimiser=self._optimiser(), steps=self.steps, spectral_weight=self.spectral_weight
         )
@@ -145,13 +145,13 @@ def fit_ensemble(
 ) -> tuple[EnsembleState, Float[Array, " steps"]]:
     """Minimise, for each member, mean |a_res - f|^2 + w sum_l sigma_max(W_l)^2 on the full batch.
 
-    The spectral norm comes from one power-iteration step per optimiser step, its vector kept as state; the gradient of
-    sigma^2 is 2 sigma u v^T.
+    The spectral norm comes from one power-iteration step per optimiser step, and its vector is kept as state. The
+    gradient of sigma^2 is 2 sigma u v^T.
 
     Args:
         state: Networks, optimiser state and power-iteration vectors to start from.
         rows: Data of the fit.
-        optimiser: The optimiser that made ``state.optimiser``.
+        optimiser: The optimiser that created ``state.optimiser``.
         steps: Number of optimiser steps.
         spectral_weight: Weight w of the spectral penalty.
 

@@ -1,4 +1,4 @@
-"""The ensemble on the remainder of the closed form, weighted by the share of its prediction that flight confirms."""
+"""An ensemble on the remainder of the closed form, weighted by the share of its prediction that flight confirms."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ DOUBT = 1.0  # [m^2/s^4], prior evidence for a share of zero, before any flight
 
 
 class LayeredState(eqx.Module):
-    """Both states, and how well the ensemble has predicted the remainder of the closed form."""
+    """The states of both layers, and how well the ensemble has predicted the remainder of the closed form."""
 
     first: RegressionState
     second: EnsembleState
@@ -27,7 +27,7 @@ class LayeredState(eqx.Module):
     foretold: Float[Array, ""]
     """Sum, with exponential forgetting, of the squared prediction [m^2/s^4]."""
     smooth: Float[Array, ""]
-    """Share of the remainder in the last window that is not noise from tick to tick."""
+    """Share of the remainder in the last window that is not tick-to-tick noise."""
 
     @property
     def share(self) -> Float[Array, ""]:
@@ -40,18 +40,18 @@ class LayeredModel(eqx.Module):
 
     The ensemble is fitted to the remainder of the closed form, and only to rows since the last change. Before each fit,
     its prediction for the newest rows, which were not in its training data, is compared with their remainder. The
-    coefficient of a regression of the remainder on the prediction, between 0 and 1, is the share of the prediction that
-    is used. So an ensemble that was fitted across a change, or without useful data, does not make the layer below
-    worse. Noise could pass this test, since the noise of a velocity enters both the input and the target. But noise
-    jumps from tick to tick, and the share decreases with the part of the remainder that jumps. Where members disagree,
-    the mean is shrunk, per axis, by mean^2 / (mean^2 + spread^2).
+    remainder is regressed on the prediction; the coefficient, between 0 and 1, is the share of the prediction that is
+    used. An ensemble that was fitted across a change, or without useful data, therefore does not make the layer below
+    worse. Noise could pass this test, since velocity noise enters both the input and the target. But noise jumps from
+    tick to tick, and the share decreases with the part of the remainder that jumps. Where members disagree, the mean is
+    shrunk, per axis, by the factor mean^2 / (mean^2 + spread^2).
     """
 
     first: RegressionModel
     second: EnsembleModel
 
     def init(self, key: Key[Array, ""]) -> LayeredState:
-        """Return the prior of the closed form and fresh networks of the ensemble; the key is consumed."""
+        """Return the prior of the closed form and fresh networks for the ensemble; the key is consumed."""
         nothing = jnp.zeros(())
         return LayeredState(self.first.init(key), self.second.init(key), nothing, nothing, nothing)
 
@@ -75,11 +75,11 @@ class LayeredModel(eqx.Module):
         return where(jnp.any(weight > 0.0), fitted, state), jnp.sqrt(mean_square)
 
     def predict(self, state: LayeredState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the prediction of the closed form plus the share of that of the ensemble [m/s^2]."""
+        """Return the closed form's prediction plus the used share of the ensemble's [m/s^2]."""
         return self.first.predict(state.first, x, u) + state.share * self._certain(state.second, x, u)
 
     def spread(self, state: LayeredState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the standard deviation of the prediction, both layers together [m/s^2]."""
+        """Return the standard deviation of the joint prediction of both layers [m/s^2]."""
         of_first, of_second = self.first.spread(state.first, x, u), self.second.spread(state.second, x, u)
         return jnp.sqrt(of_first**2 + (state.share * of_second) ** 2)
 

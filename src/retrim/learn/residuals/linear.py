@@ -9,7 +9,7 @@ from ...physics.state import STANDARD_GRAVITY, Command, State, where
 from .targets import Targets
 
 SIZE = 19
-"""Features: one (1), velocity (3), attitude (9), thrust beyond hover along its axis (3), body rates (3)."""
+"""Number of features: one (1), velocity (3), attitude (9), thrust beyond hover along its axis (3), body rates (3)."""
 STEEP = 3.0 / STANDARD_GRAVITY  # [s^2/m], scales thrust beyond hover to the size of the other features
 
 
@@ -17,23 +17,23 @@ class LinearState(eqx.Module):
     """Information from all rows so far, with exponential forgetting, and the resulting posterior."""
 
     precision: Float[Array, "19 19"]
-    """Precision of the weights in units of their prior, without that of the prior."""
+    """Precision of the weights in units of their prior, excluding the precision of the prior itself."""
     moment: Float[Array, "19 3"]
     weights: Float[Array, "19 3"]
     """Weights of the features, for each axis."""
     covariance: Float[Array, "19 19"]
     """Covariance of the weights of one axis; the same for all three."""
     fits: Int[Array, ""]
-    """Number of fits so far: the first uses its whole window, each later one only the new rows."""
+    """Number of fits so far. The first uses its whole window; each later one uses only the new rows."""
 
 
 class LinearModel(eqx.Module):
-    """Ridge regression on 19 features, carried along the flight, as a :class:`retrim.learn.ResidualModel`.
+    """Ridge regression on 19 features, continued throughout the flight, as a :class:`retrim.learn.ResidualModel`.
 
-    The weights of a wind that depends on the attitude, of drag and of an error of the thrust map can only be
-    distinguished by flight in many attitudes, which takes longer than a window. So the information from a window is
-    added to that from earlier ones. The model predicts seconds ahead; for a recent change use the closed form of
-    :class:`~retrim.learn.residuals.regression.RegressionModel`, whose memory is short.
+    The weights of attitude-dependent wind, drag and thrust-map errors can only be distinguished by flight in many
+    attitudes, which takes longer than a window. The information from each window is therefore added to that from
+    earlier ones. The model predicts seconds ahead. For a recent change, use the closed form of
+    :class:`~retrim.learn.residuals.regression.RegressionModel`, which has a short memory.
     """
 
     prior: Float[Array, "19"]
@@ -41,7 +41,7 @@ class LinearModel(eqx.Module):
     noise: Float[Array, ""]
     """Standard deviation of one row of targets [m/s^2]."""
     memory: Float[Array, ""]
-    """Time after which the weight of a row is 1/e of that of the newest [s]."""
+    """Age at which a row's weight is 1/e of that of the newest row [s]."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
     every: float = eqx.field(static=True)
@@ -67,7 +67,7 @@ class LinearModel(eqx.Module):
         return self._solved(nothing, nothing[:, :3], jnp.zeros((), dtype=jnp.int32))
 
     def fit(self, state: LinearState, rows: Targets) -> tuple[LinearState, Float[Array, ""]]:
-        """Add the new rows of ``rows``, the newest last; also return the root mean square error over all valid rows."""
+        """Add the new rows in ``rows`` (newest last); also return the root mean square error over all valid rows."""
         features = jax.vmap(features_of)(rows.x, rows.u) * self.prior[None]
         age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
         new = (age < round(self.every / self.dt)) | (state.fits == 0)
@@ -99,12 +99,12 @@ class LinearModel(eqx.Module):
         return features_of(x, u) @ state.weights
 
     def spread(self, state: LinearState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the standard deviation of the prediction, without the noise of a row; the same for all axes."""
+        """Return the standard deviation of the prediction, without row noise; it is the same for all axes."""
         features = features_of(x, u)
         return jnp.broadcast_to(jnp.sqrt(features @ state.covariance @ features), (3,))
 
 
 def features_of(x: State, u: Command) -> Float[Array, "19"]:
-    """Return the features, all of about order one in flight."""
+    """Return the features, which are all of about order one in flight."""
     thrust = STEEP * (u.c - STANDARD_GRAVITY) * x.R[:, 2]
     return jnp.concatenate([jnp.ones(1, dtype=x.p.dtype), x.v, x.R.reshape(9), thrust, u.omega])

@@ -16,9 +16,9 @@ class ResidualModel(Protocol):
     """A model of the residual. It is an ``eqx.Module`` that holds settings; the learned parameters are its *state*.
 
     Every method is pure and traceable. The state is a pytree of arrays with fixed shapes. A model that also identifies
-    bias and lag of the body rates has a method ``turning``, from its state to a
-    :class:`~retrim.learn.residuals.rates.RateFit`. A model that knows its uncertainty has a method ``spread``, with the
-    arguments of ``predict``, that returns one standard deviation per axis [m/s^2].
+    the bias and lag of the body rates has a method ``turning``, which maps its state to a
+    :class:`~retrim.learn.residuals.rates.RateFit`. A model that quantifies its uncertainty has a method ``spread``,
+    which takes the arguments of ``predict`` and returns one standard deviation per axis [m/s^2].
     """
 
     def init(self, key: Key[Array, ""]) -> Any:
@@ -26,7 +26,7 @@ class ResidualModel(Protocol):
         ...
 
     def fit(self, state: Any, rows: Targets) -> tuple[Any, Float[Array, ""]]:
-        """Fit to ``rows`` from ``state``.
+        """Fit to ``rows``, starting from ``state``.
 
         Returns:
             The new state, and the root mean square of the error over the valid rows [m/s^2].
@@ -46,7 +46,7 @@ class FittedResidual(eqx.Module):
 
     @property
     def turning(self) -> RateFit | None:
-        """Identified bias and lag of the body rates; None from a model of the acceleration alone."""
+        """Identified bias and lag of the body rates; None for a model of the acceleration alone."""
         turning: Callable[[Any], RateFit] | None = getattr(self.model, "turning", None)
         return None if turning is None else turning(self.state)
 

@@ -1,9 +1,9 @@
 """The bias of the body rates and the lag of their loop, identified from a window of flight.
 
-An error of the body rates is not an acceleration, so a model of the acceleration cannot express it. The mean rates of
-each tick are compared with the commands after a first-order lag, for a grid of time constants. For each time constant
-the bias has a normal posterior, and the time constant is weighted by how well they explain the flight. The commands do
-not have noise, so noisy attitudes do not make the lag look shorter, as they do in a regression on measured rates.
+An error of the body rates is not an acceleration, so an acceleration model cannot express it. The mean rates of each
+tick are compared with the commands after a first-order lag, for a grid of time constants. For each time constant the
+bias has a normal posterior, and the time constant is weighted by how well both explain the flight. The commands are
+free of noise, so noisy attitudes do not make the lag appear shorter, as they would in a regression on measured rates.
 """
 
 import equinox as eqx
@@ -28,8 +28,8 @@ class RateFit(eqx.Module):
     deviation: Float[Array, "3"]
     """Standard deviation of the bias [rad/s]."""
     tau: Float[Array, "3"]
-    """Time constants of the lag between commanded and actual rates [s]. Roll and pitch, which thrust differences drive,
-    have the same one; yaw, which the drag of the rotors drives, may be far slower."""
+    """Time constants of the lag between commanded and actual rates [s]. Roll and pitch, driven by thrust differences,
+    share one time constant; yaw, driven by rotor drag, may be far slower."""
 
 
 class RateModel(eqx.Module):
@@ -42,9 +42,9 @@ class RateModel(eqx.Module):
     tau_spread: Float[Array, ""]
     """Standard deviation of the logarithms of the time constants."""
     noise: Float[Array, ""]
-    """Smallest standard deviation of the mean rate of a tick [rad/s]; that of a noisier flight is estimated."""
+    """Smallest standard deviation of a tick's mean rate [rad/s]; that of a noisier flight is estimated."""
     memory: Float[Array, ""]
-    """Time after which the weight of a row is 1/e of that of the newest [s]."""
+    """Age at which a row's weight is 1/e of that of the newest row [s]."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
@@ -57,7 +57,7 @@ class RateModel(eqx.Module):
             memory: Time constant of forgetting [s].
             tau: Most likely time constants of the lag of roll, pitch and yaw [s].
         """
-        one = jnp.ones(())  # a fit has the same type, which avoids another compilation after the first fit
+        one = jnp.ones(())  # a fit has the same type, which avoids a recompilation after the first fit
         return cls(0.3 * one, jnp.array(tau), 0.7 * one, 0.05 * one, memory * one, dt)
 
     def init(self) -> RateFit:
@@ -65,7 +65,7 @@ class RateModel(eqx.Module):
         return RateFit(jnp.zeros(3), jnp.broadcast_to(self.bias_prior, (3,)), self.tau_prior)
 
     def fit(self, rows: Targets) -> RateFit:
-        """Return the posterior given ``rows``, the newest last; return the prior if no row is valid."""
+        """Return the posterior given ``rows`` (newest last); return the prior if no row is valid."""
         n = rows.valid.shape[0]
         age = jnp.arange(n - 1, -1, -1, dtype=rows.omega.dtype)
         counts = rows.valid & (jnp.cumsum(rows.valid) > round(UNSETTLED / self.dt))
@@ -97,6 +97,6 @@ class RateModel(eqx.Module):
 
 
 def _shared(each: Float[Array, "g 3"], times: float = 1.0) -> Float[Array, "g 3"]:
-    """Return ``times`` the mean of roll and pitch for both, since they share one lag, and yaw unchanged."""
+    """Return ``times`` the mean of roll and pitch for both axes, since they share one lag, and yaw unchanged."""
     both = 0.5 * times * (each[:, 0] + each[:, 1])
     return jnp.stack([both, both, each[:, 2]], axis=1)

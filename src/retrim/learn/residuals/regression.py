@@ -16,15 +16,15 @@ from .rates import RateFit, RateModel
 from .targets import Targets
 
 SIZE = 10
-"""Parameters: constant push (3), thrust gain (1), linear drag (3), quadratic drag (3)."""
+"""Number of parameters: constant push (3), thrust gain (1), linear drag (3), quadratic drag (3)."""
 BLOCK = 8
 """Number of rows that are compared at once in the search for a change."""
 TAIL = 4.0
 """Error in standard deviations beyond which a row loses weight (Huber's likelihood)."""
 PASSES = 2
-"""Passes of iteratively reweighted least squares. Gross errors are excluded before, so that few passes are enough."""
+"""Passes of iteratively reweighted least squares. Gross errors are excluded beforehand, so a few passes are enough."""
 SURPRISE = 21.1
-"""Threshold of a chi-squared variable with three degrees of freedom, exceeded once in 10,000."""
+"""Threshold of a chi-squared variable with three degrees of freedom, exceeded once in 10,000 times."""
 
 
 class Normal(NamedTuple):
@@ -46,14 +46,14 @@ class RegressionState(eqx.Module):
 class RegressionModel(eqx.Module):
     """The residual with ten physical parameters, as a :class:`retrim.learn.ResidualModel`.
 
-    a_res = d + R (k_c (c - g) e3 - k_1 v_b - k_2 |v_b| v_b), with v_b the velocity in the body frame and the products
-    per axis. The thrust gain k_c acts on the thrust beyond hover, since at hover it cannot be distinguished from a push
-    along z, which is part of d. A fit is exact, takes less than a millisecond, and depends on the window alone, not on
-    earlier fits.
+    a_res = d + R (k_c (c - g) e3 - k_1 v_b - k_2 |v_b| v_b), where v_b is the velocity in the body frame and the
+    products are per axis. The thrust gain k_c acts on the thrust beyond hover, since at hover it cannot be
+    distinguished from a push along z, which is part of d. A fit is exact, takes less than a millisecond, and depends on
+    the window alone, not on earlier fits.
 
-    Rows whose command is at a limit do not count: a gain that explains the output of a mixer there would reverse the
-    effect of thrust. The likelihood has heavy tails: a row with an error of more than four standard deviations counts
-    less, and a window without such rows has the fit of a normal likelihood.
+    Rows whose command is at a limit do not count: a gain that explains a mixer's output there would reverse the effect
+    of thrust. The likelihood has heavy tails: a row with an error of more than four standard deviations counts less. A
+    window without such rows has the same fit as with a normal likelihood.
     """
 
     prior: Float[Array, "10"]
@@ -61,7 +61,7 @@ class RegressionModel(eqx.Module):
     noise: Float[Array, ""]
     """Standard deviation of one row of targets [m/s^2]."""
     memory: Float[Array, ""]
-    """Time after which the weight of a row is 1/e of that of the newest [s]."""
+    """Age at which a row's weight is 1/e of that of the newest row [s]."""
     rates: RateModel
     """Model of the errors of the body rates, which are not accelerations and are identified separately."""
     dt: float = eqx.field(static=True)
@@ -85,7 +85,7 @@ class RegressionModel(eqx.Module):
         Args:
             dt: Control tick [s].
             memory: Time constant of forgetting [s].
-            noise: Standard deviation of one row of targets [m/s^2]: noise of the sensors, and unmodelled effects.
+            noise: Standard deviation of one row of targets [m/s^2], due to sensor noise and unmodelled effects.
             thrust_prior: Standard deviation of the thrust gain [-].
             tau: Most likely time constants of the body rates [s].
             limits: Smallest and largest command; None if commands are not limited.
@@ -99,11 +99,11 @@ class RegressionModel(eqx.Module):
         return RegressionState(jnp.zeros_like(self.prior), jnp.diag(self.prior**2), self.rates.init())
 
     def fit(self, state: RegressionState, rows: Targets) -> tuple[RegressionState, Float[Array, ""]]:
-        """Return the posterior given ``rows``, the newest last; also the weighted error [m/s^2].
+        """Return the posterior given ``rows`` (newest last), and the weighted error [m/s^2].
 
         The precision is diag(1 / prior^2) + sum_i w_i Phi_i^T Phi_i / noise^2. w_i falls exponentially with age, and is
-        zero for rows before a change. To find a change, the newest block of rows predicts each older block; the first
-        block that it does not explain (99.99 %) and all older ones do not count.
+        zero for rows before a change. To find a change, the newest block of rows predicts each older block. The first
+        block that it does not explain (at 99.99 %) and all older ones do not count.
         """
         fitted, rms, _ = self.fit_weighted(state, rows)
         return fitted, rms
@@ -111,7 +111,7 @@ class RegressionModel(eqx.Module):
     def fit_weighted(
         self, state: RegressionState, rows: Targets
     ) -> tuple[RegressionState, Float[Array, ""], Float[Array, " n"]]:
-        """Fit as :meth:`fit`; also return the weight of each row: zero if it is invalid or before a change."""
+        """Fit like :meth:`fit`; also return each row's weight, which is zero for invalid rows and before a change."""
         if self.limits is not None:
             followed = jax.vmap(partial(is_followed, limits=self.limits))(rows.u)
             rows = dataclasses.replace(rows, valid=rows.valid & followed)
@@ -162,7 +162,7 @@ class RegressionModel(eqx.Module):
         valid: Float[Array, " n"],
         block: Int[Array, " n"],
     ) -> Float[Array, " n"]:
-        """Return one for rows since the last change, zero before; ``block`` counts blocks of rows from the newest."""
+        """Return one for rows since the last change, else zero; ``block`` counts blocks of rows from the newest."""
         blocks = -(-target.shape[0] // BLOCK)
         count = jax.ops.segment_sum(valid, block, blocks)
         per = jnp.maximum(count, 1.0)
@@ -184,7 +184,7 @@ class RegressionModel(eqx.Module):
         return state.rates
 
     def spread(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the standard deviation of the prediction, without the noise of a row [m/s^2]."""
+        """Return the standard deviation of the prediction, without row noise [m/s^2]."""
         features = features_of(x, u)
         return jnp.sqrt(jnp.sum((features @ state.covariance) * features, axis=1))
 

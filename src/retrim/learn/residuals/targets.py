@@ -17,7 +17,7 @@ ROUNDING = 0.01  # ticks, rounding error of an age that is a whole number of tic
 
 
 class Targets(eqx.Module):
-    """Rows of a residual fit: inputs, the acceleration that the model misses, and which rows count."""
+    """Rows of a residual fit: inputs, the acceleration that the model misses, and a mask of the rows that count."""
 
     x: State
     """State at the start of each tick (leading axis n)."""
@@ -38,15 +38,14 @@ def residual_targets(
     a_gt: Float[Array, "n 3"] | None = None,
     consistent: Bool[Array, " steps"] | None = None,
 ) -> Targets:
-    """Compute a_res = a_gt - a_hat of each tick.
+    """Compute a_res = a_gt - a_hat for each tick.
 
-    a_gt is the forward difference of velocity over the tick, a_hat that of the nominal model from the same state. Both
-    are under the command that was acting: the one accepted ``delay_ticks`` before, and earlier by the measurement's
-    age.
+    a_gt is the forward difference of velocity over the tick; a_hat is that of the nominal model from the same state.
+    Both are under the command that was acting: the one accepted ``delay_ticks`` plus the measurement's age before.
 
-    A row does not count if its time step, or a step between its command and it, is not one tick (a gap in the
-    measurements). It does not count either while the hidden state of the model (an actuator lag) still depends on the
-    assumed hover start.
+    A row does not count if its time step, or a step between its command and the row, is not one tick long (a gap in the
+    measurements). Nor does it count while the model's hidden state (an actuator lag) still depends on the assumed hover
+    start.
 
     Args:
         window: n ticks of flight.
@@ -121,7 +120,7 @@ def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Ar
 
 
 def _regular(window: Window, dt: float, delay_ticks: int, before: Int[Array, " rows"]) -> Bool[Array, " rows"]:
-    """Return whether all steps from the row's command to its next velocity are one tick long, to a quarter of a tick.
+    """Return whether all steps from a row's command to its next velocity are one tick long, within a quarter tick.
 
     Steps are checked on the clock of commands and at the times at which the states were true. The command of an old
     measurement is found at row ``before`` by counting rows, so every step from that row on must be regular.

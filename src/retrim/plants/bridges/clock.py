@@ -1,4 +1,4 @@
-"""Mapping from the clock of another machine to the clock of this machine."""
+"""Mapping from a remote machine's clock to this machine's clock."""
 
 from collections import deque
 
@@ -13,7 +13,9 @@ WINDOW_S = 2.0  # [s] in which at least one message is assumed to arrive without
 
 
 class RemoteClock:
-    """Estimates the offset and the rate of a clock from repeated exchanges. Simulated clocks do not run in real time.
+    """Estimates the offset and rate of a remote clock from repeated exchanges.
+
+    The rate is estimated because simulated clocks do not run in real time.
 
     The weight of an exchange is the inverse square of its round-trip time, which bounds its error.
     """
@@ -27,9 +29,9 @@ class RemoteClock:
         """Record one exchange.
 
         Args:
-            asked: Time of the request, our clock [s].
-            remote: Time in the answer, other clock [s].
-            answered: Time of arrival of the answer, our clock [s].
+            asked: Time of the request, on our clock [s].
+            remote: Time in the answer, on the other clock [s].
+            answered: Arrival time of the answer, on our clock [s].
         """
         known = self.here(remote) if len(self._exchanges) >= ENOUGH else None
         slipped = known is not None and abs(0.5 * (asked + answered) - known) > 0.5 * (answered - asked) + SLIP
@@ -46,7 +48,7 @@ class RemoteClock:
         self._line = centre, height
 
     def here(self, remote: float) -> float | None:
-        """Return the time of our clock at time ``remote`` of the other clock [s]; None before the first exchange."""
+        """Return the time on our clock at time ``remote`` on the other clock [s]; None before the first exchange."""
         if self._line is None:
             return None
         centre, height = self._line
@@ -54,7 +56,7 @@ class RemoteClock:
 
 
 class ArrivalClock:
-    """Estimates the offset of a clock from the arrival times of its messages; the quickest recent messages count.
+    """Estimates a remote clock's offset from the arrival times of its messages; the quickest recent message counts.
 
     The transmission time of these messages remains unknown.
     """
@@ -69,5 +71,5 @@ class ArrivalClock:
         self._arrived.append((now, now - remote))
 
     def here(self, remote: float) -> float | None:
-        """Return the time of our clock at time ``remote`` of the other clock [s]; None before the first message."""
+        """Return the time on our clock at time ``remote`` on the other clock [s]; None before the first message."""
         return remote + min(offset for _, offset in self._arrived) if self._arrived else None

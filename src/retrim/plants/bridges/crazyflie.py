@@ -18,7 +18,7 @@ ADDRESS = "udp:127.0.0.1:19850"  # of a simulated Crazyflie, or a bridge to the 
 ANSWERS_S, READY_S, STILL_S, ARM_S, GO_S, LANDING_S = 5.0, 20.0, 2.0, 5.0, 20.0, 15.0  # [s]
 AGAIN_S = 1.0  # [s] after which an order without effect is sent again
 LOST_S = 2.0  # [s] of silence; by then it has stopped its motors
-WANDERS = 0.1  # [m], largest change of the estimated position while it stands
+WANDERS = 0.1  # [m], largest change in the estimated position while it stands still
 SPEED, RISE_S = 0.5, 2.0  # [m/s] during the flight to the start; [s] of a take-off
 THRUST_S = 2.0  # [s] over which the thrust at hover is identified
 GROUND = 0.1  # [m] above its take-off height
@@ -26,14 +26,14 @@ WRONG = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crt
 
 
 class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
-    """A Crazyflie, by CRTP over UDP: thrust and body rates as its manual setpoint, states from its log.
+    """A Crazyflie that receives thrust and body rates as manual setpoints by CRTP over UDP, and logs its state.
 
-    World and body frame are its own, which are also ours. Thrust per mass is its thrust command times g over the thrust
-    command at hover; adaptation compensates for battery and thrust map.
+    The world and body frames are the Crazyflie's own, which are also ours. Thrust per mass is the thrust command times
+    g, divided by the thrust command at hover. Adaptation compensates for the battery and the thrust map.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray) -> None:
-        """Build a plant; it does not send packets before it connects.
+        """Build a plant; it does not send packets until it connects.
 
         Args:
             address: ``udp:HOST:PORT`` that it listens on.
@@ -73,7 +73,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             self._stands_still(keep_on)
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Let it fly to a position by its own commander, and identify its thrust command at hover."""
+        """Let its own commander fly it to a position, and identify its thrust command at hover."""
         link, x = self.link, self.reading()
         if not self._is(crtp.FLYING):
             self._floor = float(x.p[2])
@@ -104,11 +104,11 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
-        """Let its commander hold the position of the take-off."""
+        """Let its commander hold the take-off position."""
         self.link.pump(until)
 
     def read(self) -> VehicleState:
-        """Return the newest state of its log."""
+        """Return the newest state in its log."""
         link = self.link
         link.pump(0.0)
         now = time.monotonic()
@@ -132,7 +132,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.link.pump(until)
 
     def land(self) -> None:
-        """Let its commander land it, and disarm it; a vehicle that does not answer any more is ignored."""
+        """Let its commander land it, and disarm it; a vehicle that no longer answers is ignored."""
         link, self._link = self._link, None
         if link is None:
             return
@@ -145,7 +145,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             link.close()
 
     def _sink(self, link: CrazyflieLink) -> None:
-        """Land, with repeated orders, since orders may be lost."""
+        """Land with repeated orders, since orders may be lost."""
         reading = link.reading
         assert reading is not None
         until = time.monotonic() + LANDING_S
@@ -188,7 +188,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
 
 
 def check_address(address: str) -> str:
-    """Return an address of a Crazyflie; the default for an empty address.
+    """Return a Crazyflie's address, or the default for an empty address.
 
     Raises:
         ConfigError: The text is not an address, or its kind is not UDP.

@@ -16,12 +16,12 @@ from .endpoint import Endpoint, pump
 from .polling import KeepOn, insisting, wait_until
 from .vehicle_state import Reading
 
-STATES, STATUSES = 1, 2  # numbers of our blocks of the log
+STATES, STATUSES = 1, 2  # numbers of our log blocks
 STATE_S, STATUS_S = 0.01, 0.05  # [s] between two states and between two statuses
 ECHO_S = 0.1  # [s] between two measurements of the round-trip time
 AGAIN_S = 0.2  # [s] after which an unanswered request is repeated
 WRAP_MS = 1 << 24  # [ms], period after which its time wraps around
-LATE_S, EARLY_S = 0.5, 1.0  # [s] by which its time may go back and ahead of ours, from one message to the next
+LATE_S, EARLY_S = 0.5, 1.0  # [s] by which its time may go back, and run ahead of ours, between two messages
 # [m], largest plausible jump between two states; [s] for which the last state is used for this check; [m/s]
 LEAP, LEAPS_S, FASTEST = 1.0, 0.5, 20.0
 
@@ -43,11 +43,11 @@ class CrazyflieLink:
         self._awaited: Packet | None = None
         self._answer: bytes | None = None
         self.version = 0
-        """Version of its protocol; 0 before it was requested."""
+        """Version of its protocol; 0 until it is requested."""
         self.reading: Reading | None = None
         self.status: crtp.Status | None = None
         self.thrusts: deque[float] = deque(maxlen=100)
-        """Thrust commands of its controller, 0 to 65535."""
+        """Thrust commands from its controller, 0 to 65535."""
         self.console = ""
         """End of its console output."""
         self.heard = -math.inf
@@ -56,7 +56,7 @@ class CrazyflieLink:
         """Number of packets that were damaged, implausible or from other senders."""
 
     def pump(self, until: float) -> None:
-        """Read received packets and send periodic ones, until an instant of the monotonic clock [s]."""
+        """Read received packets and send periodic ones until an instant of the monotonic clock [s]."""
         pump(self._endpoint, until, self._chores, self._take)
 
     def send(self, packet: Packet) -> None:
@@ -70,13 +70,13 @@ class CrazyflieLink:
             question: The request; its answer comes from the same port and channel.
             same: Number of leading bytes of the request that the answer repeats.
             patience: Time limit [s].
-            keep_on: Called repeatedly; False gives up.
+            keep_on: Called repeatedly; the wait is given up when it returns False.
 
         Returns:
             The bytes after the repeated ones.
 
         Raises:
-            PlantError: There is no answer, or the flight was given up.
+            PlantError: The Crazyflie does not answer, or the flight was given up.
         """
         self._awaited, self._answer = question._replace(body=question.body[:same]), None
         asking = insisting(lambda: self.send(question), lambda: self._answer is not None, AGAIN_S)
@@ -91,7 +91,7 @@ class CrazyflieLink:
         """Request states and statuses for the duration of the connection.
 
         Raises:
-            PlantError: The Crazyflie does not answer, or does not have a variable.
+            PlantError: The Crazyflie does not answer, or does not have a required variable.
         """
         self.version = self.ask(Packet(crtp.PLATFORM, 1, b"\0"), 1, patience, keep_on)[0]
         self.ask(Packet(crtp.LOG, crtp.CONTROL, bytes([crtp.RESET])), 1, patience, keep_on)
@@ -113,7 +113,7 @@ class CrazyflieLink:
         self._endpoint.close()
 
     def _numbers(self, wanted: set[str], patience: float, keep_on: KeepOn) -> dict[str, int]:
-        """Return the numbers of variables from its table of contents."""
+        """Return the numbers of the wanted variables from its table of contents."""
         about = self.ask(Packet(crtp.LOG, crtp.TOC, bytes([crtp.INFO])), 1, patience, keep_on)
         length, result = int.from_bytes(about[:2], "little"), dict[str, int]()
         for number in range(length):
@@ -191,6 +191,6 @@ class CrazyflieLink:
             self.reading = Reading(stamp, *x)
 
     def said(self) -> str:
-        """Return its console output, as a suffix of an error message."""
+        """Return its console output, as a suffix for an error message."""
         words = " ".join(self.console.split())
         return f"; it said: {words}" if words else ""

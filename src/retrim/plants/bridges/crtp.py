@@ -1,7 +1,7 @@
-"""CRTP, the protocol of a Crazyflie: packets of a port, a channel and up to 30 bytes, little endian.
+"""CRTP, the Crazyflie protocol: little-endian packets with a port, a channel and up to 30 bytes.
 
-Its world frame (x, y and z up) and its body frame (forward, left, up) equal ours. Its positive pitch is nose up, which
-is a negative rotation about our y axis.
+The Crazyflie's world frame (x, y and z up) and its body frame (forward, left, up) equal ours. Its positive pitch is
+nose up, which is a negative rotation about our y axis.
 """
 
 import math
@@ -29,7 +29,7 @@ STATE_LOG = {
     "stateEstimateZ.quat": "I",
     **{f"stateEstimateZ.{name}": "h" for name in ("rateRoll", "ratePitch", "rateYaw")},
 }
-"""Variables of a block of states and their types [mm, mm/s, packed quaternion, mrad/s]."""
+"""Variables in a block of states and their types [mm, mm/s, packed quaternion, mrad/s]."""
 STATUS_LOG = {"stabilizer.thrust": "f", "supervisor.info": "H", "pm.vbat": "f"}
 LOG_TYPES = {"B": 1, "H": 2, "I": 3, "b": 4, "h": 5, "i": 6, "f": 7}
 _STATE, _STATUS = (struct.Struct("<" + "".join(block.values())) for block in (STATE_LOG, STATUS_LOG))
@@ -38,7 +38,7 @@ _BITS, _HALF = 511, math.sqrt(0.5)
 
 
 class Packet(NamedTuple):
-    """A received packet, or one to send."""
+    """A received packet, or a packet to send."""
 
     port: int
     channel: int
@@ -50,7 +50,7 @@ class Packet(NamedTuple):
 
 
 def unpacked(data: bytes) -> Packet:
-    """Return the packet of a datagram.
+    """Return the packet in a datagram.
 
     Raises:
         MessageError: The datagram is empty or too long.
@@ -104,14 +104,14 @@ def arm(yes: bool, version: int) -> Packet:
 
 
 def new_block(number: int, variables: list[tuple[str, int]]) -> list[Packet]:
-    """Return the orders to create a block of a log from types and numbers of variables."""
+    """Return the orders that create a log block from the types and numbers of its variables."""
     listed = [struct.pack("<BH", LOG_TYPES[kind], item) for kind, item in variables]
     parts = [b"".join(listed[k : k + LISTED]) for k in range(0, len(listed), LISTED)]
     return [Packet(LOG, CONTROL, bytes([APPEND if k else CREATE, number]) + part) for k, part in enumerate(parts)]
 
 
 def start_block(number: int, period: float) -> Packet:
-    """Return the order to send a block with a period [s]."""
+    """Return the order to send a block at a period [s]."""
     return Packet(LOG, CONTROL, bytes([START, number, max(1, round(1e3 * period / LOG_MS))]))
 
 
@@ -119,17 +119,17 @@ class StateRow(NamedTuple):
     """A state in a log."""
 
     p: np.ndarray
-    """World [m]."""
+    """Position, world [m]."""
     R: np.ndarray
-    """Body to world."""
+    """Attitude, body to world."""
     v: np.ndarray
-    """World [m/s]."""
+    """Velocity, world [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
 
 
 def state_of(values: bytes) -> StateRow:
-    """Return the state in a block of STATE_LOG.
+    """Return the state in a STATE_LOG block.
 
     Raises:
         MessageError: The block has a wrong length, or its attitude is invalid.
@@ -142,27 +142,27 @@ def state_of(values: bytes) -> StateRow:
 
 
 def state_values(p: np.ndarray, R: np.ndarray, v: np.ndarray, omega: np.ndarray) -> bytes:
-    """Return a block of STATE_LOG; the inverse of :func:`state_of`."""
+    """Return a STATE_LOG block; the inverse of :func:`state_of`."""
     rows = [np.clip(np.round(1e3 * x), -32_768, 32_767).astype(int).tolist() for x in (p, v, _PITCH_UP * omega)]
     return _STATE.pack(*rows[0], *rows[1], quaternion_of(R), *rows[2])
 
 
 class Status(NamedTuple):
-    """Status of the vehicle in a log."""
+    """Vehicle status in a log."""
 
     thrust: float
-    """Thrust command of its controller, 0 to 65535."""
+    """Thrust command from the vehicle's controller, 0 to 65535."""
     info: int
-    """Bits of its supervisor: CAN_ARM, ARMED and so on."""
+    """Bits from the vehicle's supervisor: CAN_ARM, ARMED and so on."""
     battery: float
     """Battery voltage [V]."""
 
 
 def status_of(values: bytes) -> Status:
-    """Return the status in a block of STATUS_LOG.
+    """Return the status in a STATUS_LOG block.
 
     Raises:
-        MessageError: The block has a wrong length, or is not finite.
+        MessageError: The block has a wrong length, or its values are not finite.
     """
     if len(values) != _STATUS.size:
         raise MessageError(f"{len(values)} bytes are no status, which has {_STATUS.size}")
@@ -173,15 +173,15 @@ def status_of(values: bytes) -> Status:
 
 
 def status_values(status: Status) -> bytes:
-    """Return a block of STATUS_LOG; the inverse of :func:`status_of`."""
+    """Return a STATUS_LOG block; the inverse of :func:`status_of`."""
     return _STATUS.pack(*status)
 
 
 def attitude_of(packed: int) -> np.ndarray:
-    """Return an attitude, body to world, from 32 bits: index of the largest element, and sign and size of the others.
+    """Return an attitude, body to world, from 32 bits: the largest element's index, and the others' signs and sizes.
 
     Raises:
-        MessageError: The others are too large for a unit quaternion.
+        MessageError: The other elements are too large for a unit quaternion.
     """
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 

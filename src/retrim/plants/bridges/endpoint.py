@@ -1,4 +1,4 @@
-"""Endpoints for the bytes of an autopilot: a UDP port, or a serial line."""
+"""Endpoints for an autopilot's bytes: a UDP port or a serial line."""
 
 import contextlib
 import select
@@ -16,7 +16,7 @@ NAP_S = 0.02  # [s], longest time between two calls of the periodic work
 
 @runtime_checkable
 class Endpoint(Protocol):
-    """One end of a link. Its methods do not block."""
+    """One end of a link, whose methods do not block."""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when data has arrived."""
@@ -27,11 +27,11 @@ class Endpoint(Protocol):
         ...
 
     def send(self, data: bytes, to: Any) -> None:
-        """Send data to a sender of received data; data that cannot be sent is lost, as on any link."""
+        """Send data to the sender of earlier data; data that cannot be sent is lost, as on any link."""
         ...
 
     def close(self) -> None:
-        """Close the port. Idempotent."""
+        """Close the port; idempotent."""
         ...
 
 
@@ -60,7 +60,7 @@ class UdpEndpoint:
         """Return a datagram and its sender."""
         try:
             return self._socket.recvfrom(LONGEST)
-        except OSError:  # no data, or the receiver of an earlier datagram does not exist any more
+        except OSError:  # no data, or the receiver of an earlier datagram no longer exists
             return None
 
     def send(self, data: bytes, to: Any) -> None:
@@ -138,10 +138,10 @@ def address_of(text: str) -> tuple[str, str, int]:
 
 
 def address_towards(host: str, port: int) -> str:
-    """Return the address of this machine on the route to another host, without sending data.
+    """Return this machine's address on the route to a host, without sending data.
 
-    A socket on only this address is not reachable from other networks. It is the loopback address for a vehicle on this
-    machine, and the address of the radio for a vehicle on a radio.
+    A socket bound only to this address cannot be reached from other networks. For a vehicle on this machine, it is the
+    loopback address; for a vehicle on a radio, it is the radio's address.
 
     Raises:
         PlantError: There is no route to the host.
@@ -166,12 +166,12 @@ def open_endpoint(address: str) -> Endpoint:
 
 
 def pump(endpoint: Endpoint, until: float, chores: Callable[[float], None], take: Callable[[bytes, Any], None]) -> None:
-    """Read received data and call the periodic work, until an instant of the monotonic clock [s].
+    """Read received data and do periodic work until an instant of the monotonic clock [s].
 
     Args:
         endpoint: Source of the data.
-        until: Time of the end; data that has already arrived is read even if this time has passed.
-        chores: Periodic work; called with the time.
+        until: End time; data that has already arrived is read even if this time has passed.
+        chores: Periodic work; called with the current time.
         take: Called with the data of one read, and its sender.
     """
     while True:

@@ -1,7 +1,7 @@
-"""Frames of autopilots and ours.
+"""Conversions between the frames of autopilots and ours.
 
-An autopilot's world is north, east, down (NED) and its body forward, right, down (FRD); ours are east, north, up (ENU)
-and forward, left, up (FLU), as in ROS. Each change of frame is its own inverse.
+An autopilot's world frame is north, east, down (NED), and its body frame is forward, right, down (FRD). Our frames are
+east, north, up (ENU) and forward, left, up (FLU), as in ROS. Each conversion is its own inverse.
 """
 
 import numpy as np
@@ -13,19 +13,19 @@ BODY = np.array([1.0, -1.0, -1.0])
 
 
 def turned_world(vector: np.ndarray) -> np.ndarray:
-    """Return a world vector of the other frame: NED for ENU, ENU for NED."""
+    """Convert a world vector to the other frame: NED to ENU, or ENU to NED."""
     out: np.ndarray = WORLD @ vector
     return out
 
 
 def turned_body(vector: np.ndarray) -> np.ndarray:
-    """Return a body vector of the other frame: FRD for FLU, FLU for FRD."""
+    """Convert a body vector to the other frame: FRD to FLU, or FLU to FRD."""
     out: np.ndarray = BODY * vector
     return out
 
 
 def turned_heading(yaw: float) -> float:
-    """Return a heading of the other frame [rad]: from north clockwise, or from east counter-clockwise."""
+    """Convert a heading to the other frame [rad]: clockwise from north, or counter-clockwise from east."""
     return float(np.pi / 2 - yaw)
 
 
@@ -33,7 +33,7 @@ def attitude_of(q: np.ndarray) -> np.ndarray:
     """Return the attitude, body FLU to world ENU.
 
     Args:
-        q: Quaternion w, x, y, z, body FRD to world NED; of any non-zero length.
+        q: Quaternion w, x, y, z from body FRD to world NED, of any non-zero length.
     """
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
@@ -48,7 +48,7 @@ def quaternion_of(R: np.ndarray) -> np.ndarray:
         R: Body FLU to world ENU.
 
     Returns:
-        Unit quaternion w, x, y, z, body FRD to world NED, w >= 0.
+        Unit quaternion w, x, y, z from body FRD to world NED, with w >= 0.
     """
     from scipy.spatial.transform import Rotation  # local for the same reason
 
@@ -57,5 +57,5 @@ def quaternion_of(R: np.ndarray) -> np.ndarray:
 
 
 def heading_of(R: np.ndarray) -> float:
-    """Return the direction of the nose, from east counter-clockwise [rad]."""
+    """Return the direction of the nose, counter-clockwise from east [rad]."""
     return float(np.arctan2(R[1, 0], R[0, 0]))

@@ -13,10 +13,10 @@ from .vehicle_state import Reading
 
 @runtime_checkable
 class VehicleLink(Protocol):
-    """Attributes of every link."""
+    """Attributes that every link provides."""
 
     reading: Reading | None
-    """Newest state; None before the first."""
+    """Newest state; None until the first one arrives."""
     heard: float
     """Time of the last received message, monotonic clock [s]."""
 
@@ -31,7 +31,7 @@ class LinkedPlant(VehiclePlant, Generic[L]):
         """Build a plant.
 
         Args:
-            address: Address of the vehicle; error messages contain it.
+            address: Address of the vehicle, which error messages contain.
             dt: Control period [s].
             low: Smallest command [c, omega] that is sent to the vehicle.
             high: Largest command [c, omega] that is sent to the vehicle.
@@ -42,7 +42,7 @@ class LinkedPlant(VehiclePlant, Generic[L]):
 
     @property
     def link(self) -> L:
-        """The connection.
+        """Link to the vehicle.
 
         Raises:
             PlantError: The plant is not connected.
@@ -52,10 +52,10 @@ class LinkedPlant(VehiclePlant, Generic[L]):
         return self._link
 
     def reading(self) -> Reading:
-        """Return the newest state that was received.
+        """Return the newest received state.
 
         Raises:
-            PlantError: A state was not received yet.
+            PlantError: A state has not been received yet.
         """
         if self.link.reading is None:
             raise PlantError(f"{self.address}: the vehicle has sent no state")
@@ -69,21 +69,21 @@ class ThrustScale:
         """Build a scale that is not identified yet.
 
         Args:
-            smallest: The smallest command that is sent.
-            largest: The largest command that is sent.
+            smallest: Smallest command that is sent.
+            largest: Largest command that is sent.
         """
         self._range = smallest, largest
         self.hover: float | None = None
-        """Command at hover; None before the vehicle has hovered."""
+        """Command at hover; None until the vehicle has hovered."""
 
     def learn(self, commands: Collection[float]) -> None:
         """Identify the scale.
 
         Args:
-            commands: Thrust commands of the autopilot at hover.
+            commands: The autopilot's thrust commands at hover.
 
         Raises:
-            PlantError: The commands are too few, or cannot be those of a hovering vehicle.
+            PlantError: There are too few commands, or they cannot come from a hovering vehicle.
         """
         shares = np.array(commands) / self._range[1]
         if len(shares) < 5 or not 0.05 < np.median(shares) < 0.95:
@@ -96,7 +96,7 @@ class ThrustScale:
         """Return the command for a thrust per mass [m/s^2], within the range.
 
         Raises:
-            PlantError: The vehicle has not hovered.
+            PlantError: The vehicle has not hovered yet.
         """
         return float(np.clip(c / self._step, *self._range))
 
@@ -104,7 +104,7 @@ class ThrustScale:
         """Return the thrust per mass of a command [m/s^2].
 
         Raises:
-            PlantError: The vehicle has not hovered.
+            PlantError: The vehicle has not hovered yet.
         """
         return command * self._step
 

@@ -1,4 +1,4 @@
-"""PX4 by MAVLink as a plant: it takes off by itself, hands over control, and lands when the flight is over."""
+"""PX4 over MAVLink as a plant: it takes off by itself, hands over control, and lands when the flight is over."""
 
 import math
 import time
@@ -24,17 +24,18 @@ UNUSED = ("HIGHRES_IMU", "ATTITUDE", "ALTITUDE", "VFR_HUD", "SERVO_OUTPUT_RAW", 
 HEARD_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0
 SWITCH_S, ARM_S, GO_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
 ASK_AGAIN_S = 1.0  # [s]
-LOST_S = 2.0  # [s] of silence, after which the failsafe of the autopilot has long taken over
+LOST_S = 2.0  # [s] of silence, after which the autopilot's failsafe has long taken over
 THRUST_S = 2.0  # [s] over which the thrust at hover is identified
 TELL_EVERY_S = 0.05  # [s] between two position setpoints
 
 
 class MavlinkPlant(LinkedPlant[MavlinkLink]):
-    """A vehicle with PX4 in offboard mode: it receives thrust and body rates.
+    """A PX4 vehicle that receives thrust and body rates in offboard mode.
 
-    World: east, north, up from the origin of the autopilot's local frame. Thrust per mass is a share of the motors'
-    thrust times g over the share at hover, which is identified while the autopilot hovers before the hand-over.
-    Adaptation compensates for a non-linear thrust map (``THR_MDL_FAC``), a sagging battery or another load.
+    The world frame is east, north, up from the origin of the autopilot's local frame. Thrust per mass is the share of
+    the motors' thrust times g, divided by the share at hover. The share at hover is identified while the autopilot
+    hovers before the hand-over. Adaptation compensates for a non-linear thrust map (``THR_MDL_FAC``), a sagging battery
+    or a different load.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray) -> None:
@@ -90,7 +91,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         up = np.array([0.0, 0.0, 0.0 if link.armed else 1.0])
         self._place = x.p + up if p is None else np.asarray(p, dtype=float)
         self._heading = heading_of(x.R) if yaw is None else yaw
-        self.hold(time.monotonic() + 0.5)  # PX4 needs a setpoint before the change of mode
+        self.hold(time.monotonic() + 0.5)  # PX4 needs a setpoint before the mode change
         self._ask(self._offboard, SET_MODE, (1.0, *map(float, OFFBOARD)), SWITCH_S, keep_on, "offboard mode")
         self._engaged = True
         self._ask(lambda: link.armed, ARM_DISARM, (1.0,), ARM_S, keep_on, "to be armed")
@@ -104,7 +105,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
-        """Let PX4 hold the position of the take-off until an instant of the monotonic clock [s]."""
+        """Let PX4 hold the take-off position until an instant of the monotonic clock [s]."""
         while time.monotonic() < until:
             self._tell()
             self.link.pump(min(until, time.monotonic() + TELL_EVERY_S))
@@ -178,5 +179,5 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
 
     @property
     def notes(self) -> Sequence[str]:
-        """Kinds of ignored messages of the vehicle."""
+        """Kinds of ignored messages from the vehicle."""
         return () if self._link is None else tuple(self._link.notes)

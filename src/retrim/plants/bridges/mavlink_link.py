@@ -1,4 +1,4 @@
-"""One end of a MAVLink connection: it receives the state of the autopilot and sends commands.
+"""One end of a MAVLink connection: it receives the autopilot's state and sends commands.
 
 This module does not decide when to arm or which controller flies; :mod:`.mavlink` does.
 """
@@ -39,9 +39,9 @@ class MavlinkLink:
         """Build one end.
 
         Args:
-            endpoint: Endpoint for received and sent bytes. The link communicates with the first autopilot that it
-                receives a message from, and ignores all other senders.
-            datagrams: Whether every message arrives in one piece; a damaged datagram then does not affect the next.
+            endpoint: Endpoint for received and sent bytes. The link communicates with the first autopilot from which it
+                receives a message, and ignores all other senders.
+            datagrams: Whether every message arrives in one piece; a damaged datagram then does not affect the next one.
 
         Raises:
             PlantError: pymavlink is not installed.
@@ -56,21 +56,21 @@ class MavlinkLink:
         self._attitude: Any = None
         self._odometry_at = -math.inf
         self.system: tuple[int, int] | None = None
-        """System and component number of the autopilot; None before its first message."""
+        """System and component number of the autopilot; None until its first message."""
         self.autopilot, self.mode, self.armed, self.ready = -1, (0, 0), False, False
         self.reading: Reading | None = None
         self.truth: Reading | None = None
-        """True state from the autopilot's own simulator, if it reports it; the origin is its first position."""
+        """True state from the autopilot's own simulator, if it is reported; its origin is the first position."""
         self.thrusts: deque[float] = deque(maxlen=50)
-        """Thrust commands of the autopilot to its motors, as a share of their thrust."""
+        """The autopilot's thrust commands to its motors, as shares of their thrust."""
         self.texts: deque[str] = deque(maxlen=20)
-        """Text messages of the autopilot."""
+        """Text messages from the autopilot."""
         self.heard = -math.inf
         """Time of its last message, monotonic clock [s]."""
         self.ignored = 0
         """Number of messages that were damaged, implausible or from other senders."""
         self.notes: list[str] = []
-        """Kinds of ignored messages of the autopilot, each once."""
+        """Kinds of ignored messages from the autopilot, each listed once."""
         self._origin: tuple[float, float, float] | None = None
         self._takes: dict[str, Callable[[Any, float], None]] = {
             "HEARTBEAT": self._heartbeat, "SYS_STATUS": self._sys_status, "TIMESYNC": self._timesync,
@@ -80,11 +80,11 @@ class MavlinkLink:
         }  # fmt: skip
 
     def pump(self, until: float) -> None:
-        """Read received messages and send periodic ones, until an instant of the monotonic clock [s]."""
+        """Read received messages and send periodic ones until an instant of the monotonic clock [s]."""
         pump(self._endpoint, until, self._chores, self._take)
 
     def command(self, number: int, *parameters: float) -> None:
-        """Send COMMAND_LONG. Its first answer only confirms its arrival; the autopilot's state shows its effect."""
+        """Send COMMAND_LONG; its first answer only confirms its arrival, and the autopilot's state shows its effect."""
         padded = (*parameters, *([0.0] * (7 - len(parameters))))
         if self.system is not None:
             self._send(self._sender.command_long_encode(*self.system, number, 0, *padded))
@@ -203,7 +203,7 @@ class MavlinkLink:
         self.ready = bool(message.onboard_control_sensors_health & PREARM)
 
     def _timesync(self, message: Any, now: float) -> None:
-        if message.tc1 == 0:  # a request of the autopilot
+        if message.tc1 == 0:  # a request from the autopilot
             self._send(self._sender.timesync_encode(int(now * 1e9), message.ts1))
         elif 0.0 <= (trip := now - 1e-9 * message.ts1) < 1.0:
             self._clock.exchanged(now - trip, 1e-9 * message.tc1, now)
@@ -265,7 +265,7 @@ class MavlinkLink:
         self.texts.append(str(message.text))
 
     def _hil_state(self, message: Any, now: float) -> None:
-        """Read the true state of PX4's own simulator, on a plane that touches the earth at its first position."""
+        """Read the true state from PX4's own simulator, on a plane that touches the earth at its first position."""
         q = np.array(message.attitude_quaternion)
         if not np.isfinite(q).all() or not 0.5 < q @ q < 2.0:
             self.ignored += 1

@@ -1,4 +1,4 @@
-"""Waiting for conditions of a vehicle, with a time limit."""
+"""Waiting until a vehicle satisfies a condition, with a time limit."""
 
 import math
 import time
@@ -17,11 +17,11 @@ def wait_until(done: KeepOn, patience: float, keep_on: KeepOn, wait: Callable[[f
     Args:
         done: Returns whether the condition holds.
         patience: Longest time to wait [s].
-        keep_on: Called repeatedly; False gives up.
+        keep_on: Called repeatedly; the wait is given up when it returns False.
         wait: Keeps the link alive until an instant of the monotonic clock [s].
 
     Raises:
-        PlantError: ``keep_on`` returns False: the flight was given up.
+        PlantError: ``keep_on`` returned False, so the flight was given up.
     """
     until = time.monotonic() + patience
     while time.monotonic() < until:

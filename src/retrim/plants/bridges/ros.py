@@ -1,4 +1,4 @@
-"""A vehicle behind ROS 1 as a plant: another pilot takes off, hands over, and takes back control."""
+"""A vehicle behind ROS 1 as a plant: another pilot takes off, hands over control, and takes it back."""
 
 import math
 import re
@@ -21,19 +21,19 @@ HEADING = math.radians(20.0)
 
 
 class RosPlant(LinkedPlant[RosLink]):
-    """A vehicle whose states and targets are topics of ROS 1.
+    """A vehicle whose states and targets are ROS 1 topics.
 
-    World and body frame are those of ROS, which are also ours. The other pilot (mavros, a pilot of a flight stack)
-    takes off, flies the vehicle to the start, follows our targets while they are published, and takes back control when
-    they stop. Thrust per mass is converted to a share of the motors' thrust with the vehicle's mass and largest thrust;
-    adaptation compensates for errors of these.
+    The world and body frames are those of ROS, which are also ours. The other pilot (mavros, or a flight stack's pilot)
+    takes off, flies the vehicle to the start, and follows our targets while they are published. It takes back control
+    when they stop. Thrust per mass is converted to a share of the motors' thrust with the vehicle's mass and largest
+    thrust; adaptation compensates for errors in these.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
         """Build a plant; it joins the ROS network when it connects.
 
         Args:
-            address: ``HOST:PORT`` of the rosmaster, with ``/NAMESPACE`` of the topics or without.
+            address: ``HOST:PORT`` of the rosmaster, optionally with the ``/NAMESPACE`` of the topics.
             dt: Control period [s].
             low: Smallest command [c, omega].
             high: Largest command [c, omega].
@@ -106,7 +106,7 @@ class RosPlant(LinkedPlant[RosLink]):
 
 
 def parts_of(address: str) -> tuple[str, str]:
-    """Return HOST:PORT of a rosmaster and the namespace of the topics; the defaults for an empty address.
+    """Return the HOST:PORT of a rosmaster and the topic namespace, or the defaults for an empty address.
 
     Raises:
         ConfigError: The text is not an address.

@@ -1,4 +1,4 @@
-"""A node of ROS 1 that receives the state of a vehicle and publishes attitude targets, on the topics of mavros.
+"""A ROS 1 node that receives a vehicle's state and publishes attitude targets on the mavros topics.
 
 This module does not decide which pilot flies; :mod:`.ros` does.
 """
@@ -60,14 +60,14 @@ def attitude_target() -> Any:
 
 
 class RosLink:
-    """Subscribes to odometry and poses, and publishes attitude targets; callbacks run in threads of rospy."""
+    """Subscribes to odometry and poses, and publishes attitude targets; callbacks run in rospy threads."""
 
     def __init__(self, master: str, namespace: str) -> None:
         """Join the ROS network.
 
         Args:
             master: Address of the rosmaster, for example ``http://127.0.0.1:11311``.
-            namespace: Prefix of the names of topics, for example ``/mavros``.
+            namespace: Prefix of the topic names, for example ``/mavros``.
 
         Raises:
             ConfigError: ROS is not installed, or the master is not running.
@@ -159,7 +159,7 @@ class RosLink:
 
 
 def _pose(pose: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return position and attitude of geometry_msgs/Pose; None if it is invalid."""
+    """Return the position and attitude in a geometry_msgs/Pose; None if it is invalid."""
     from scipy.spatial.transform import Rotation  # local for the same reason
 
     p, q = pose.position, pose.orientation

@@ -19,9 +19,11 @@ THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s]: limits for a vehicle t
 
 
 class VehiclePlant(Plant, abc.ABC):
-    """A link to one vehicle. A live flight uses it tick by tick; :meth:`step` makes it a plant like the others.
+    """A link to one vehicle.
 
-    Missed ticks are not repeated; the times of the measurements show them.
+    A live flight uses the link tick by tick; :meth:`step` makes it a plant like the others.
+
+    Missed ticks are not repeated; the measurement times show them.
     """
 
     def __init__(self, dt: float, low: np.ndarray, high: np.ndarray) -> None:
@@ -35,36 +37,35 @@ class VehiclePlant(Plant, abc.ABC):
         self.dt = dt
         self.low, self.high = low, high
         self.lost: float | None = None
-        """Time that the simulation of a vehicle on this machine lost because the machine was busy [s]; None for other
-        vehicles."""
+        """Time that a simulated vehicle on this machine lost because of a busy machine [s]; None for other vehicles."""
         self._tick: int | None = None
         self._began = 0.0
         self._thrust = STANDARD_GRAVITY
 
     @property
     def notes(self) -> Sequence[str]:
-        """Descriptions of the kinds of ignored messages of the vehicle, each once."""
+        """Descriptions of the kinds of ignored messages from the vehicle, each listed once."""
         return ()
 
     @abc.abstractmethod
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
-        """Connect, and wait until the vehicle can be armed; return immediately if this was already so.
+        """Connect, and wait until the vehicle can be armed; return immediately if it already can.
 
         Args:
-            keep_on: Called repeatedly; False gives up.
+            keep_on: Called repeatedly; the wait is given up when it returns False.
 
         Raises:
-            PlantError: The vehicle cannot be armed. The error contains the reason that it reported.
+            PlantError: The vehicle cannot be armed; the error contains the reason that the vehicle reported.
         """
 
     @abc.abstractmethod
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Take off, and wait until the vehicle hovers by its autopilot and is ready for commands.
+        """Take off, and wait until the vehicle hovers under its autopilot and is ready for commands.
 
         Args:
-            p: Position of the hover, world [m]; None for its current position, or a metre above the ground.
-            yaw: Heading of the hover [rad]; None for its current heading.
-            keep_on: Called repeatedly; False gives up.
+            p: Hover position, world [m]; None for the current position, or one metre above the ground.
+            yaw: Heading at hover [rad]; None for the current heading.
+            keep_on: Called repeatedly; the wait is given up when it returns False.
 
         Raises:
             PlantError: The vehicle does not arm, or does not reach the position.
@@ -80,11 +81,11 @@ class VehiclePlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def hold(self, until: float) -> None:
-        """Let the autopilot hold the position of the take-off until an instant of the monotonic clock [s]."""
+        """Let the autopilot hold the take-off position until an instant of the monotonic clock [s]."""
 
     @abc.abstractmethod
     def transmit(self, u: np.ndarray) -> np.ndarray:
-        """Send a command [c, omega] within the limits immediately; return the command that the vehicle accepts."""
+        """Immediately send a command [c, omega] within the limits, and return the command that the vehicle accepts."""
 
     def send(self, u: np.ndarray) -> np.ndarray:
         """Clip a command [c, omega], send it immediately, and return the command that the vehicle accepts."""
@@ -105,15 +106,15 @@ class VehiclePlant(Plant, abc.ABC):
         """Keep the link alive until an instant of the monotonic clock [s]."""
 
     def until(self, done: KeepOn, patience: float, keep_on: KeepOn) -> bool:
-        """Keep the link alive until a condition holds, for ``patience`` [s] at most; return whether it holds.
+        """Keep the link alive until a condition holds, for at most ``patience`` [s]; return whether it holds.
 
         Raises:
-            PlantError: ``keep_on`` returns False: the flight was given up.
+            PlantError: ``keep_on`` returned False, so the flight was given up.
         """
         return wait_until(done, patience, keep_on, self.wait)
 
     def staying(self, place: np.ndarray, meanwhile: Callable[[], object] = lambda: None) -> KeepOn:
-        """Return a function that checks whether the vehicle has been at a position [m] for a while.
+        """Return a function that checks whether the vehicle has stayed at a position [m] for a while.
 
         Args:
             place: Position, world [m].
@@ -133,12 +134,12 @@ class VehiclePlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def land(self) -> None:
-        """Let the autopilot land the vehicle, unless another pilot has taken over. Idempotent."""
+        """Let the autopilot land the vehicle unless another pilot has taken over; idempotent."""
 
     def reset(self, x0: State | None) -> Measurement:
-        """Take off if the vehicle stands, fly to the position and heading of ``x0``, and begin to send commands there.
+        """Take off if necessary, fly to the position and heading of ``x0``, and begin to send commands there.
 
-        Attitude and velocity of ``x0`` are ignored, since they cannot be set on a vehicle.
+        The tilt and velocity of ``x0`` are ignored, since they cannot be set on a vehicle.
         """
         self.connect()
         if x0 is None:

@@ -6,18 +6,18 @@ import numpy as np
 
 from ...physics.state import STANDARD_GRAVITY
 
-LONGEST_S = 0.05  # [s], limit of the extrapolation of a state; beyond it the state is too old to be useful
+LONGEST_S = 0.05  # [s], limit of a state's extrapolation; an older state is not useful
 
 
 class VehicleState(NamedTuple):
     """A state in NumPy, and its age."""
 
     p: np.ndarray
-    """World [m]."""
+    """Position, world [m]."""
     R: np.ndarray
-    """Body to world."""
+    """Attitude, body to world."""
     v: np.ndarray
-    """World [m/s]."""
+    """Velocity, world [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
     age: float
@@ -25,23 +25,23 @@ class VehicleState(NamedTuple):
     truth: "VehicleState | None" = None
     """True state, if a simulator behind the autopilot reports it."""
     carried: float = 0.0
-    """Time of extrapolation [s]; the reported state is older than ``age`` by this time."""
+    """Extrapolated time [s]; the reported state is older than ``age`` by this amount."""
 
     @property
     def news(self) -> float:
-        """Age of the state as the vehicle reported it [s]."""
+        """Age of the state that the vehicle reported [s]."""
         return self.age + self.carried
 
     def carried_on(self, c: float) -> "VehicleState":
         """Return the state extrapolated to now with constant thrust, gravity and body rates; its age is the remainder.
 
-        The autopilot chooses the times of its states, and they arrive 5 to 20 ms old. If they were used as current
-        states, they would have a delay that is not part of any model, and the intervals between them would not be
-        ticks. A controller compensates for the reported age, so this age must not include the time that is compensated
-        for here.
+        The autopilot chooses when it sends states, and they are 5 to 20 ms old when they arrive. If they were used as
+        current states, they would add a delay that is not part of any model, and the intervals between them would not
+        be ticks. A controller compensates for the reported age, so this age must not include the time that is already
+        compensated for here.
 
         Args:
-            c: Thrust per mass that was commanded last [m/s^2].
+            c: Last commanded thrust per mass [m/s^2].
         """
         from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
@@ -56,19 +56,19 @@ class VehicleState(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """A state that a link has received, in our frames."""
+    """A state received by a link, in our frames."""
 
     stamp: float
-    """Time at which it was valid, monotonic clock of this machine [s]."""
+    """Time at which the state was valid, on this machine's monotonic clock [s]."""
     p: np.ndarray
-    """World [m]."""
+    """Position, world [m]."""
     R: np.ndarray
-    """Body to world."""
+    """Attitude, body to world."""
     v: np.ndarray
-    """World [m/s]."""
+    """Velocity, world [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
 
     def at(self, now: float) -> VehicleState:
-        """Return the reading as a state with its age at an instant of the same clock [s]."""
+        """Return the reading as a state, with its age at an instant of the same clock [s]."""
         return VehicleState(self.p, self.R, self.v, self.omega, max(0.0, now - self.stamp))
