@@ -6,7 +6,7 @@ CUT = " ... "
 
 
 class RetrimError(Exception):
-    """Base class of all errors of this package. The message states the mistake and the correct input."""
+    """Base class of all errors in this package. The message states the mistake and the correct input."""
 
     def __init__(self, message: str = "") -> None:
         """Build an error; ``message`` becomes a printable line of limited length."""
@@ -64,7 +64,7 @@ class JobError(RetrimError, RuntimeError):
 
 
 class MessageError(RetrimError, ValueError):
-    """Bytes that must not be used: they are truncated or damaged, have the wrong kind, or are not finite."""
+    """A message that must not be used: it is truncated or damaged, has the wrong kind, or holds non-finite numbers."""
 
 
 class CheckpointError(RetrimError, ValueError):
@@ -76,4 +76,4 @@ class LogError(RetrimError, ValueError):
 
 
 class TrainingError(RetrimError, RuntimeError):
-    """Training failed because its loss is not a number."""
+    """Training failed because the loss was not a number."""

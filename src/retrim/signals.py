@@ -1,4 +1,4 @@
-"""Signals that end a command and keep its results: Ctrl-C, SIGTERM, and SIGHUP from a closed terminal."""
+"""Handle the signals that end a command but keep its results: Ctrl-C, SIGTERM, and SIGHUP from a closed terminal."""
 
 import contextlib
 import os
@@ -22,7 +22,7 @@ def ending_signals() -> list[signal.Signals]:
 
 @contextlib.contextmanager
 def handled_by(handler: Handler) -> Iterator[None]:
-    """Call a function on each signal that ends a command; outside the main thread, this has no effect."""
+    """Call a function on each signal that ends a command; outside the main thread, do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -41,7 +41,7 @@ def handled_by(handler: Handler) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stopped_by(stop: threading.Event) -> Iterator[None]:
-    """Make ending signals set ``stop`` and raise KeyboardInterrupt; it stays set if JAX swallows the exception."""
+    """Make ending signals set ``stop`` and raise KeyboardInterrupt; ``stop`` stays set if JAX swallows the error."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()

@@ -1,6 +1,7 @@
-"""The paper "Learning on the Fly" with retrim: its tables, ablations, learned baselines and the demonstration.
+"""Reproduces the paper "Learning on the Fly" with retrim: tables, ablations, learned baselines and a demonstration.
 
-retrim never imports this package. It finds the commands, and the methods ``datt`` and ``raptor``, through entry points.
+retrim never imports this package. retrim finds the commands, and the methods ``datt`` and
+``raptor``, through entry points.
 """
 
 COMMANDS = {

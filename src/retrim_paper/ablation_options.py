@@ -1,4 +1,4 @@
-"""Components of an ablation: each is one difference between our presets and those of the paper."""
+"""Defines the components of an ablation; each is one difference between our presets and those of the paper."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,4 +1,4 @@
-"""Conditions of the gauntlet: changes in flight, and differences between training and flight."""
+"""Defines the gauntlet's conditions: changes in flight, and differences between training and flight."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Demonstration of the whole loop in a minute: pretrain, push, adapt, and fly a second vehicle."""
+"""Demonstrates the whole loop in a minute: pretrain, push, adapt, and fly a second vehicle."""
 
 from dataclasses import replace
 from pathlib import Path

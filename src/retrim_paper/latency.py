@@ -1,4 +1,4 @@
-"""Latency of messages between two processes.
+"""Measures the latency of messages between two processes.
 
 ``python -m retrim_paper.latency`` runs the sending process.
 """
@@ -24,7 +24,7 @@ SIZES = {"a measurement": 500, "the policy of hover/retrim": 74_000, "the policy
 COUNT = 200  # number of messages of each size
 EVERY = 0.02  # [s], time between two messages
 TOPICS = {"message": 2_000_000}
-FIRST = 10  # number of first messages that do not count, since connections are still being made
+FIRST = 10  # number of messages at the start that do not count, since connections are still being made
 JOINED = 0.5  # [s], time in which both ends find each other
 LONGEST, ANSWERS = 60.0, 20.0  # [s], time limits for all messages of a size, and for a rosmaster's answer
 
@@ -67,7 +67,7 @@ def write(bus: Bus, size: int) -> None:
 
 
 def free_port() -> int:
-    """Return an unused port at the loopback address."""
+    """Return an unused port on the loopback address."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])
 

@@ -1,4 +1,4 @@
-"""Comparison of the blade-element plant's figures with published ones."""
+"""Compares the blade-element plant's figures with published ones."""
 
 from typing import Any
 

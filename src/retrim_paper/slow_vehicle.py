@@ -1,4 +1,4 @@
-"""Second part of the demonstration: a quadrotor with a 100 ms rate loop, which is unknown to the methods."""
+"""Flies the second part of the demonstration: a quadrotor with a 100 ms rate loop, unknown to the methods."""
 
 from collections.abc import Sequence
 from dataclasses import replace

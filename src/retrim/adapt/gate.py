@@ -1,4 +1,4 @@
-"""The gate: to fly, a re-trained policy must be finite and not worse than the current one."""
+"""The gate, which admits a re-trained policy only if it is finite and not worse than the current one."""
 
 from typing import Any
 

@@ -35,11 +35,11 @@ VEHICLES = 2**30 + 5  # folded into the keys of starts to draw the vehicles at t
 
 
 class OnlineLearner(eqx.Module):
-    """Learner from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array.
+    """Learns from a window of flight (paper, Sec. IV-A.3). Every number that may change is an array.
 
     A custom learner is a subclass. It overrides :meth:`retrain`, which trains in the corrected model, or
-    :meth:`worker`, for a learner that JAX cannot trace. A function of a :class:`~retrim.LearnerRequest` builds it, and
-    the preset names this function in ``adapt.learner``.
+    :meth:`worker`, for a learner that JAX cannot trace. The preset names, in ``adapt.learner``, a function that takes a
+    :class:`~retrim.LearnerRequest` and builds the learner.
 
     Example::
 
@@ -57,7 +57,7 @@ class OnlineLearner(eqx.Module):
     optimiser: AbstractPolicyOptimiser
     """Optimiser that re-trains the policy."""
     plant_delay_ticks: int = eqx.field(static=True)
-    """Declared command delay of the plant [ticks], to pair accelerations with the commands that caused them."""
+    """Declared command delay of the plant [ticks]; it pairs accelerations with the commands that caused them."""
     num_updates: int = eqx.field(static=True)
     """Optimiser steps per policy update."""
     num_envs: int = eqx.field(static=True)
@@ -90,7 +90,7 @@ class OnlineLearner(eqx.Module):
     def fit_residual(self, state: Any, window: Window) -> tuple[Any, FitReport]:
         """Fit the residual model to a window, starting from the previous fit.
 
-        Measurements that contradict each other are left out. If they make up more than half, the fit is not accepted.
+        Measurements that contradict each other are left out. If more than half contradict, the fit is not accepted.
 
         Args:
             state: State of the residual model.

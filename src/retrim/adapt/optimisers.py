@@ -1,4 +1,4 @@
-"""The optimiser of a policy update: the state it keeps between updates, and the decay of its rate."""
+"""Optimisers of policy updates, with the state kept between updates and the decay of the learning rate."""
 
 import abc
 from typing import Any
@@ -13,7 +13,7 @@ from ..learn.bptt import PolicyState
 
 
 class AbstractPolicyOptimiser(eqx.Module):
-    """Optimiser of policy updates. Every number is an array, so that a new value does not trigger a recompilation."""
+    """Optimiser of policy updates. Every number is an array, so a new value does not trigger a recompilation."""
 
     rate: eqx.AbstractVar[Float[Array, ""]]
     max_grad_norm: eqx.AbstractVar[Float[Array, ""]]
@@ -28,7 +28,7 @@ class AbstractPolicyOptimiser(eqx.Module):
 
 
 class FreshAdam(AbstractPolicyOptimiser):
-    """A fresh Adam for each update, whose rate decays to zero with a cosine schedule (as in the paper)."""
+    """A fresh Adam for each update, with a rate that decays to zero on a cosine schedule (as in the paper)."""
 
     rate: Float[Array, ""]
     """Learning rate at the start of an update."""

@@ -1,4 +1,4 @@
-"""Starts of an update's roll-outs."""
+"""Choose the starts of an update's roll-outs."""
 
 import abc
 from collections.abc import Callable
@@ -24,10 +24,10 @@ class AbstractStarts(eqx.Module):
 
 
 class TaskStarts(AbstractStarts):
-    """The starts of pretraining (as in the paper)."""
+    """Uses the starts of pretraining (as in the paper)."""
 
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
-        """Draw from the task."""
+        """Draw the starts from the task."""
         return random_starts(task, key, updates, envs)
 
 
@@ -43,7 +43,7 @@ class FlownStarts(AbstractStarts):
     """Number of environments per step whose starts are drawn from the task."""
 
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
-        """Draw from the window and from the task."""
+        """Draw the starts from the window and from the task."""
         k_task, k_rows, k_p, k_v = random.split(key, 4)
         far = min(self.from_task, envs)
         shape = (updates, envs - far)

@@ -1,6 +1,6 @@
-"""The trim: the command of a re-trained policy at the point where the vehicle should come to rest.
+"""Correct the command of a re-trained policy at the point where the vehicle should come to rest.
 
-An update improves a policy over the next few seconds, but moves its rest point by a millimetre, each time in a
+An update improves a policy over the next few seconds, but moves the policy's rest point by a millimetre, each time in a
 different direction. The rest point does not need training: it is the point where the policy commands hover.
 """
 
@@ -26,13 +26,13 @@ class AbstractTrim(eqx.Module):
 
         Args:
             policy: The re-trained policy.
-            env: The corrected model in which it was trained.
-            window: The flight for which it was trained.
+            env: The corrected model in which the policy was trained.
+            window: The flight for which the policy was trained.
         """
 
 
 class Untrimmed(AbstractTrim):
-    """No correction (as in the paper)."""
+    """Leaves the policy unchanged (as in the paper)."""
 
     def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:
         """Return the policy unchanged."""
@@ -43,7 +43,7 @@ class RestTrim(AbstractTrim):
     """Shifts the policy's output so that it commands hover at rest at home, with the heading of the flight.
 
     In the frame of the effective gravity, this command keeps the vehicle there even under a disturbance. Use this trim
-    for tasks that rest at home and leave the heading free: the vehicle keeps its present heading.
+    for tasks in which the vehicle rests at home with any heading: the vehicle keeps its present heading.
     """
 
     def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:

@@ -1,4 +1,4 @@
-"""Messages from learners to pilots: frozen and typed, with conversion to bytes and back."""
+"""Frozen, typed messages from learners to pilots, with conversion to bytes and back."""
 
 import json
 import math
@@ -22,7 +22,7 @@ class ResidualUpdate:
     """Message that a residual was fitted."""
 
     computed_from: float
-    """Time of the newest measurement from which it was learned [s]."""
+    """Time of the newest measurement from which the residual was learned [s]."""
     rms_error: float
     """Root mean square of the fit's error [m/s^2]."""
     state: Any
@@ -41,11 +41,11 @@ class PolicyUpdate:
     """Message that a policy was re-trained and admitted."""
 
     computed_from: float
-    """Time of the newest measurement from which it was learned [s]."""
+    """Time of the newest measurement from which the policy was learned [s]."""
     cost: float
     """Cost of the new policy on the gate's roll-outs."""
     incumbent_cost: float
-    """Cost of the policy that it replaces."""
+    """Cost of the policy that the new one replaces."""
     state: PolicyState
     """The new policy and its optimiser state."""
 

@@ -1,4 +1,4 @@
-"""The vehicle in a window of flight: that of the model, or a member of a family, identified from the window."""
+"""The vehicle in a window of flight: the model's vehicle, or a family member that is identified from the window."""
 
 import abc
 import dataclasses
@@ -29,7 +29,7 @@ class AbstractVehicles(eqx.Module):
 
     @abc.abstractmethod
     def identify(self, window: Window) -> "Identification | None":
-        """Identify the vehicle from a window; return None if the vehicle is that of the model.
+        """Identify the vehicle from a window; return None if it is the model's vehicle.
 
         Args:
             window: Ticks of flight.
@@ -55,7 +55,7 @@ class AbstractVehicles(eqx.Module):
 
 
 class OwnVehicle(AbstractVehicles):
-    """The vehicle of the model, with the declared delay."""
+    """The model's vehicle, with the declared delay."""
 
     def identify(self, window: Window) -> None:
         """Return None."""

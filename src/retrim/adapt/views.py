@@ -43,7 +43,7 @@ class GravityView(AbstractView):
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
     def __call__(self, env: Env, residual: Residual) -> Env:
-        """Add the residual to the model; the controller compensates for it with the frame, and also for a rate bias."""
+        """Add the residual to the model; the controller compensates for it (with the frame) and for a rate bias."""
         env = with_lag(env, turning_of(residual))
         return dataclasses.replace(env.with_residual(residual), frame_disturbance=NormLimited(residual, self.limit))
 
@@ -89,7 +89,7 @@ class Same(eqx.Module):
     """A disturbance that is independent of state and command."""
 
     d: Float[Array, "3"]
-    """Disturbance, world [m/s^2]."""
+    """Disturbance in the world frame [m/s^2]."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the disturbance."""

@@ -1,4 +1,4 @@
-"""Interface of a worker: one learning layer, independent of clock and process."""
+"""Interface of a worker, which computes one learning layer and is independent of clock and process."""
 
 import abc
 from typing import Any
@@ -11,7 +11,7 @@ class Worker(abc.ABC):
     """Computation of one learning layer on one window.
 
     A worker's state advances only when the worker receives its own update after publication. A result that is dropped
-    on the way (because of a new flight or a lost message) therefore never becomes the base of the next one.
+    on the way (because of a new flight or a lost message) therefore never becomes the base of the next result.
     """
 
     layer: Layer
@@ -25,7 +25,7 @@ class Worker(abc.ABC):
         """Receive a published update of this or another layer."""
 
     def follow(self, learner: Any) -> None:
-        """Continue on a different reference.
+        """Continue with a different reference.
 
         Args:
             learner: Online learner of the new reference.

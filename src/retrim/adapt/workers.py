@@ -99,7 +99,7 @@ class PolicyWorker(Worker):
         return policy_update(float(window.t[-1]), trained, verdict)
 
     def receive(self, update: Update) -> None:
-        """Continue from a published policy, and with the model of a published residual."""
+        """Continue from a published policy, or with a published residual in the model."""
         if isinstance(update, PolicyUpdate):
             self._policy = update.state
         elif isinstance(update, ResidualUpdate):

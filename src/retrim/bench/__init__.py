@@ -1,1 +1,1 @@
-"""Measures time and memory of each benchmark on this machine."""
+"""Measure the run time and memory of each benchmark on this machine."""

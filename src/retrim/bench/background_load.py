@@ -1,4 +1,4 @@
-"""Measures policy updates per second during a real-time flight: learner on one core, plant and pilot on another."""
+"""Measure policy updates per second on one core, during a real-time flight on another core."""
 
 import json
 import os
@@ -24,10 +24,10 @@ PRESET = "hover/retrim"
 
 
 def policies() -> dict[str, Any]:
-    """Fit and re-train as fast as one core permits, during a flight at 50 Hz on another; return the table row.
+    """Fit and re-train as fast as one core permits, during a 50 Hz flight on another core; return the table row.
 
     Raises:
-        OSError: The flight did not begin or did not continue, or the system does not let a process choose its core.
+        OSError: The flight did not begin or ended early, or the system does not let a process choose its core.
     """
     command = [*PYTHON, "retrim.bench.background_load"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as flight:
@@ -56,7 +56,7 @@ def policies() -> dict[str, Any]:
 
 
 def _fly() -> None:
-    """Fly in real time until the standard input is closed, and print the result."""
+    """Fly in real time until standard input is closed, and print the result."""
     on_core(0)
     setup = Setup.from_preset(load(PRESET))
     pilot = setup.pilot(setup.new_policy(random.key(0)), "base-do")
@@ -84,7 +84,7 @@ def _fly() -> None:
 
 
 def _over() -> bool:
-    """Return whether the standard input has been closed."""
+    """Return whether standard input has been closed."""
     try:
         return os.read(sys.stdin.fileno(), 1) == b""
     except BlockingIOError:

@@ -29,7 +29,7 @@ Update = Callable[[Key[Array, ""]], tuple[PolicyState, Verdict]]
 
 
 def eight_flights() -> dict[str, Any]:
-    """Time eight flights of 30 s on bem: plant and policy are one program, and two threads run four flights each."""
+    """Time eight 30 s flights on ``bem``: two threads run four flights each, with plant and policy in one program."""
     setup = Setup.from_preset("hover/fast")
     controller = PolicyController(setup.flight_task.observation_in_flight, setup.new_policy(random.key(0)))
     simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
@@ -48,17 +48,17 @@ def eight_flights() -> dict[str, Any]:
 
 
 def one_after_another() -> dict[str, Any]:
-    """Time eight updates in one program that makes them in turn; return the table row."""
+    """Time one program that makes eight policy updates in turn; return the table row."""
     return _as_one(lambda one, keys: lax.map(one, keys))
 
 
 def side_by_side() -> dict[str, Any]:
-    """Time eight updates in one program that makes them all at once; return the table row."""
+    """Time one program that makes eight policy updates at once; return the table row."""
     return _as_one(lambda one, keys: jax.vmap(one)(keys))
 
 
 def on_threads() -> dict[str, Any]:
-    """Time eight updates by one program on two threads; return the table row."""
+    """Time eight policy updates on two threads, with one program; return the table row."""
     learner, policy, fitted, window = _learnt()
     keys = random.split(random.key(0), FLEET)
 
@@ -86,7 +86,7 @@ def _as_one(together: Callable[[Update, Key[Array, " n"]], Any]) -> dict[str, An
 
 
 def _learnt() -> tuple[OnlineLearner, PolicyState, Any, Window]:
-    """Return the inputs of an update: the learner, a policy, a fitted residual and the window of the fit."""
+    """Return the inputs of a policy update: the learner, a policy, a fitted residual and the window of the fit."""
     learner, state, window = learner_in_flight()
     fitted, _ = learner.fit_residual(state.residual, window)
     return learner, state.policy, fitted, window

@@ -1,4 +1,4 @@
-"""Provides the inputs of a learner in flight for benchmarks."""
+"""Provide the inputs of an in-flight learner for benchmarks."""
 
 from jax import random
 
@@ -11,7 +11,7 @@ from ..learn.window import Window
 
 
 def learner_in_flight(name: str = "hover/paper") -> tuple[OnlineLearner, LearnerState, Window]:
-    """Return a learner, its state before the first fit, and a full flight window under the large disturbance."""
+    """Return a learner, its state before the first fit, and a full flight window with the large disturbance."""
     setup = Setup.from_preset(load(name))
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     return setup.learner, state, full_window(setup)

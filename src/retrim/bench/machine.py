@@ -1,4 +1,4 @@
-"""Measures the machine's own rate, so that relative figures can be compared between machines."""
+"""Measure the machine's own rate, so that relative figures can be compared between machines."""
 
 import os
 import statistics
@@ -12,11 +12,12 @@ from jax import lax
 
 ROWS, WIDTH, STEPS = 10, 512, 1000
 UNIT_FLOP = 2.0 * ROWS * WIDTH * WIDTH * STEPS
-"""Operations in a unit: a scan of 1,000 products of 10 rows and a 512 x 512 matrix, the main part of a roll-out."""
+"""Number of operations in a unit: a scan of 1,000 products of 10 rows and a 512 x 512 matrix. Such products dominate a
+roll-out."""
 
 
 def on_core(i: int) -> None:
-    """Keep this process, and the threads that JAX will start, on one of the cores available to it.
+    """Keep this process and the threads that JAX will start on one of the cores available to the process.
 
     Args:
         i: Index of the core; -1 for the last core.
@@ -53,7 +54,7 @@ def unit() -> Callable[[], float]:
 
 
 def rates() -> dict[str, float]:
-    """Return the machine's best rates for a large product, the product of a roll-out, and a memory copy."""
+    """Return the machine's rates for a large matrix product, the product of a roll-out, and a memory copy."""
     large, long = jnp.ones((2048, 2048)), jnp.ones(2**25)
     product, copy = jax.jit(lambda a: a @ a), jax.jit(lambda a: a + 1.0)
     return {

@@ -1,4 +1,4 @@
-"""Runs each benchmark in its own process, and writes a document with all results."""
+"""Run each benchmark in its own process, and write a document with all results."""
 
 import json
 import os
@@ -31,7 +31,7 @@ does not. paper: reported for an RTX 4090. peak: memory of the process, JAX incl
 
 
 def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) -> bool:
-    """Run benchmarks, and write ``bench.md`` and ``bench.json``.
+    """Run benchmarks and write ``bench.md`` and ``bench.json``.
 
     Returns:
         Whether all benchmarks ran.
@@ -105,7 +105,7 @@ def _measured(name: str, cache: Path) -> dict[str, Any]:
 
 
 def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, Any]:
-    """Return the result that a separate process prints.
+    """Run a benchmark in a separate process, and return the result that the process prints.
 
     On one core, the process has no accelerator; otherwise, it does not preallocate memory.
     """

@@ -1,4 +1,4 @@
-"""Defines and times a row of ``retrim bench``."""
+"""Define and time a row of ``retrim bench``."""
 
 import statistics
 import time
@@ -17,21 +17,21 @@ class Work:
     title: str
     goal: str
     do: Callable[[], dict[str, Any]]
-    """Function that returns compile_s, run_s and remarks."""
+    """Function that returns ``compile_s``, ``run_s`` and ``remarks``."""
     paper: str = "-"
     """Time reported in the paper, on an RTX 4090."""
     cached: bool = False
-    """Whether it uses the persistent compile cache of ``retrim bench``, which is empty at first."""
+    """Whether the benchmark uses the persistent compile cache of ``retrim bench``, which is empty at first."""
     one_core: bool = False
-    """Whether it also runs on one core."""
+    """Whether the benchmark also runs on one core."""
     two_cores: bool = False
-    """Whether it needs two cores and the right to choose between them."""
+    """Whether the benchmark needs two cores and the right to choose between them."""
 
 
 def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
-    """Return the median time of several runs, in seconds and in machine units, and the compile time.
+    """Return the median time of several runs in seconds and in machine units, and the compile time.
 
-    A unit is timed before and after each run, because other processes may load the machine.
+    The unit is timed before and after each run, because other processes may load the machine.
     """
     now = unit()
     units, took = [now()], []
@@ -45,7 +45,7 @@ def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]
 
 
 def compiled(jitted: Any, *arguments: Any) -> tuple[Any, float]:
-    """Return a jitted function that is compiled for its arguments, and the compile time [s]."""
+    """Return a jitted function, compiled for the given arguments, and the compile time [s]."""
     began = time.perf_counter()
     program = jitted.lower(*arguments).compile()
     return program, time.perf_counter() - began

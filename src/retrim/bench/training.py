@@ -1,4 +1,4 @@
-"""Benchmarks of pretraining."""
+"""Pretraining benchmarks."""
 
 from typing import Any
 

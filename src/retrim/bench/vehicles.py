@@ -1,4 +1,4 @@
-"""Benchmark of many live vehicles on one machine, with one process that learns for all of them."""
+"""Benchmark many live vehicles on one machine, with one process that learns for all of them."""
 
 import json
 import subprocess
@@ -40,7 +40,7 @@ PUSH = "small"
 
 
 def live_fleet(n: int) -> dict[str, Any]:
-    """Fly ``n`` vehicles in real time on one core while one process learns for all on another; return the table row.
+    """Fly ``n`` vehicles in real time on one core, with one learning process on another; return the table row.
 
     Raises:
         OSError: The vehicles did not complete the flight.
@@ -59,7 +59,7 @@ def live_fleet(n: int) -> dict[str, Any]:
 
 
 class Air:
-    """The vehicles: their simulations in one program, and a bus and a control loop for each vehicle."""
+    """All vehicles: one program that simulates them, and a bus and a control loop for each vehicle."""
 
     def __init__(self, n: int, place: Path) -> None:
         setup = Setup.from_preset(load(PRESET))
@@ -135,9 +135,9 @@ def _step(simulations: Simulation, flown: SimState, u: Array, tick: Array) -> tu
 
 
 def main() -> None:
-    """Fly the number of vehicles on the command line, and print the result."""
+    """Fly the number of vehicles that the command line states, and print the result."""
     n, learning = int(sys.argv[1]), last_core()
-    on_core(0)  # before JAX starts its threads, so that they stay on this core
+    on_core(0)  # before JAX starts its threads, which then stay on this core
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)

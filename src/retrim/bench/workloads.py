@@ -1,4 +1,4 @@
-"""The benchmarks; ``python -m retrim.bench.workloads NAME`` runs one and prints its result as JSON."""
+"""Define the benchmarks; ``python -m retrim.bench.workloads NAME`` runs one and prints its result as JSON."""
 
 import json
 import resource
@@ -30,7 +30,7 @@ from .vehicles import live_fleet
 
 
 def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
-    """Time a policy update; it needs three products per training step and one per tick of the gate."""
+    """Time a policy update, which needs three products per training step and one per tick of the gate."""
     learner, state, window = learner_in_flight(name)
     if lora:
         policy = Setup.from_preset(load(name)).low_rank(state.policy.policy, random.key(2))
@@ -50,7 +50,7 @@ def _residual(name: str = "hover/paper") -> dict[str, Any]:
 
 
 def _programs() -> dict[str, Any]:
-    """Trace and compile, or load, all programs of a flight: policy, plant, residual fit and policy update."""
+    """Trace and compile (or load) all programs of a flight: policy, plant, residual fit and policy update."""
     watch, preset = Stopwatch(), load("hover/fast")
     policy = Setup.from_preset(preset).new_policy(random.key(0))
     Fleet(preset, policy, [Scenario("large")], starts=1, seconds=3.0).warm_up()
@@ -70,7 +70,7 @@ def _tick() -> dict[str, Any]:
 
 
 def _bem_tick() -> dict[str, Any]:
-    """Time a step of the blade-element plant."""
+    """Time one step of the blade-element plant."""
     plant, u = Scenario().make(), Command.hover()
     began = time.perf_counter()
     plant.reset(None)
@@ -98,7 +98,7 @@ def _demo() -> dict[str, Any]:
 
 
 def _with_latency(title: str, name: str) -> Work:
-    """Return an update whose goal is the latency that a preset assumes for it."""
+    """Return a policy-update benchmark whose goal is the latency that the preset assumes for an update."""
     return Work(title, f"{load(name).adapt.update_latency:g} s, its latency", lambda: _update(name))
 
 

@@ -1,4 +1,4 @@
-"""``python -m retrim.cli``."""
+"""Run the command line as ``python -m retrim.cli``."""
 
 from .main import main
 

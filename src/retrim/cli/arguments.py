@@ -1,4 +1,4 @@
-"""Options of the commands: weights, presets and references, from files and names, checked for consistency."""
+"""Load and check the options of the commands: weights, presets and references, from files and names."""
 
 import dataclasses
 from collections.abc import Collection
@@ -28,7 +28,7 @@ from .options import listed, option
 def loaded(
     policy: Path | None, resume: Path | None, delta: Path | None = None, *, trust: Collection[str] = ()
 ) -> tuple[AbstractPolicy, Preset, LearnerState | None]:
-    """Return the weights, the preset, and the learner state of an earlier flight or None.
+    """Return the weights, the preset, and the learner state of an earlier flight (or None).
 
     Args:
         policy: A policy, or the folder that contains one.
@@ -87,7 +87,7 @@ RESIDUAL = f"Residual model: {listed(RESIDUALS)}, or module:name; by default tha
 
 @dataclasses.dataclass(frozen=True)
 class FlightArguments:
-    """Conditions of a flight, as command-line options."""
+    """The conditions of a flight, as command-line options."""
 
     disturbance: Annotated[str | None, option(DISTURBANCE, optional=True)] = None
     plant: Annotated[str, option(PLANT)] = "bem"
@@ -120,7 +120,7 @@ class FlightArguments:
 
 
 def with_residual(preset: Preset, residual: str | None, state: LearnerState | None) -> Preset:
-    """Return the preset with the given residual model, or unchanged if none is given.
+    """Return the preset with the given residual model; without one, return the preset unchanged.
 
     Raises:
         ConfigError: The residual model does not exist, or the flight resumes a learner state, which has its own model.
@@ -160,7 +160,7 @@ def same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
     """Return ``changed_one``, unless it changes a value that the weights depend on.
 
     Raises:
-        ConfigError: It changes such a value.
+        ConfigError: ``changed_one`` changes such a value.
     """
     for name in ("task", "vehicle", "dt", "axes", "command_history", "family", "pretrain"):
         before, after = (_without_excitation(getattr(each, name)) for each in (trained, changed_one))
@@ -198,11 +198,11 @@ def training_preset(
         task: Name of a task.
         preset: Name of a preset; by default the task's own.
         config: TOML file with values that replace those of the preset.
-        vehicle: Vehicle to train for; overrides preset and file.
-        reference: Reference to track; overrides preset and file.
-        residual: Residual model for later adaptation; overrides preset and file.
+        vehicle: Vehicle to train for; overrides the preset and the file.
+        reference: Reference to track; overrides the preset and the file.
+        residual: Residual model for later adaptation; overrides the preset and the file.
         trust: Python names that the file may contain, e.g. ``mine:task``.
-        **pretrain: Values of the table ``pretrain``; they override preset and file, and None leaves a value unchanged.
+        **pretrain: Values for the table ``pretrain`` that override the preset and the file; None changes nothing.
 
     Raises:
         ConfigError: A name, key or value is invalid.

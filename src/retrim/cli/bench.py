@@ -1,4 +1,4 @@
-"""``retrim bench``."""
+"""``retrim bench``: measure run times."""
 
 import threading
 from collections.abc import Callable
@@ -14,8 +14,8 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Cal
     """Measure the run times of the paper's and this project's workloads, each in its own process.
 
     Args:
-        works: Workloads to measure; all by default.
-        out: Folder for bench.json and bench.md; a new one under runs/ by default.
+        works: Workloads to measure; by default, all.
+        out: Folder for bench.json and bench.md; by default, a new one under runs/.
     """
 
     def ordered(stop: threading.Event) -> int:

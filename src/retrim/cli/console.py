@@ -1,4 +1,4 @@
-"""Output of the commands: text and progress, for terminals and log files."""
+"""Print the text and progress of the commands, to terminals and log files."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ from ..runkit.run import Run
 
 console = Console(highlight=False)
 Trust = tyro.conf.UseAppendAction[tuple[str, ...]]  # `--trust a:b --trust c:d`
-LINE_EVERY = 10.0  # [s]: interval of progress lines if the output is not a terminal
+LINE_EVERY = 10.0  # [s]: interval between progress lines if the output is not a terminal
 
 
 class RichReporter:
@@ -58,7 +58,7 @@ def _lines(title: str) -> Advance:
 
 
 def started(run: Run) -> Run:
-    """Print a message if a run resumes or overwrites an earlier one, and return the run."""
+    """Print a message if a run resumes or overwrites an earlier run, and return the run."""
     if said := run.of_earlier():
         console.print(said, markup=False, soft_wrap=True)
     return run

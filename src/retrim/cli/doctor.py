@@ -13,7 +13,7 @@ from .console import console
 
 
 def doctor() -> Callable[[threading.Event], int]:
-    """Print versions, devices and cache, and check dependencies for known faults; exit with code 1 if one is found."""
+    """Print versions, devices and cache, and check dependencies for known faults; exit with code 1 if any is found."""
     return lambda stop: _doctor()
 
 

@@ -1,4 +1,4 @@
-"""``retrim export``."""
+"""``retrim export``: export a policy."""
 
 import threading
 from collections.abc import Callable
@@ -20,7 +20,7 @@ def export(
         policy: A policy.safetensors, or the folder that contains one.
         to: Format: npz (arrays, with a runner that needs only NumPy), onnx, c (one C99 header, without allocation), or
             delta (only a low-rank delta, for the runner).
-        delta: A low-rank delta.safetensors, to add to the policy.
+        delta: A low-rank delta.safetensors to add to the policy.
         trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
         out: File to write; by default policy.npz, policy.onnx, policy.h or delta.npz in the current folder.
     """

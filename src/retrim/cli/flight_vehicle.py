@@ -1,4 +1,4 @@
-"""The option ``--save-vehicle`` of the flight commands."""
+"""Implement the option ``--save-vehicle`` of the flight commands."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def check_vehicle_file(path: Path | None) -> None:
 
 
 def save_flight_vehicle(flight: Flight, setup: Setup, path: Path | None) -> tuple[list[Path], int]:
-    """Write the vehicle that was identified from a flight; return the written files and the exit code.
+    """Write the vehicle identified from a flight; return the written files and the exit code.
 
     Args:
         flight: Flight to identify the vehicle from.

@@ -1,4 +1,4 @@
-"""``retrim fly``."""
+"""``retrim fly``: fly a policy."""
 
 import threading
 from collections.abc import Callable
@@ -42,12 +42,12 @@ def fly(
     trust: Trust = (),
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Fly a policy on a plant, unchanged and, with --adapt full or lora, re-trained in flight.
+    """Fly a policy on a plant, unchanged and, with --adapt full or lora, also with re-training in flight.
 
     Args:
         policy: A policy.safetensors, or the folder that contains one.
-        resume: A learner_state.safetensors of an earlier flight, from which to continue; used instead of a policy.
-        delta: A low-rank delta.safetensors of an earlier flight, to add to the policy.
+        resume: A learner_state.safetensors from an earlier flight, from which to continue; used instead of a policy.
+        delta: A low-rank delta.safetensors from an earlier flight, to add to the policy.
         flight: Plant, vehicle and disturbances of the flight.
         adapt: Method of the flight; full and lora re-train the policy in flight.
         residual: Residual model of the learners.
@@ -57,7 +57,7 @@ def fly(
         seconds: Length of each flight; by default 30 s for hover and 60 s for tracking.
         starts: Number of flights, each from a different start.
         seed: Seed of the starts, the learners and the random parts of the scenario, 0 to 4294967295.
-        save_vehicle: Vehicle file (TOML) to write, with the vehicle identified in the last flight, for pretraining.
+        save_vehicle: Vehicle file (TOML) to write for pretraining, with the vehicle identified in the last flight.
         trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
         out: Folder for results.json, events.jsonl, logs/, learned parameters and the picture; a new one under runs/ by
             default.

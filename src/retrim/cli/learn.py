@@ -1,4 +1,4 @@
-"""``retrim learn``."""
+"""``retrim learn``: learn for flights on other machines."""
 
 import signal
 import threading
@@ -17,7 +17,7 @@ from .console import RichReporter, Trust, console
 def learn(
     addresses: tyro.conf.Positional[tuple[str, ...]], key: Path | None = None, trust: Trust = ()
 ) -> Callable[[threading.Event], int]:
-    """Learn for flights on other machines, which are started there by `retrim live --learners ADDRESS`.
+    """Learn for flights that `retrim live --learners ADDRESS` starts on other machines.
 
     One process can learn for several flights. Ctrl-C ends it; the flights continue with their last policies.
 

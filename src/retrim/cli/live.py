@@ -1,4 +1,4 @@
-"""``retrim live``."""
+"""``retrim live``: fly and learn in real time."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ from .console import RichReporter, Trust, console, refuse, show_paths, show_tabl
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 from .options import option
 
-LINE_EVERY = 5.0  # [s]: interval of status lines if the output is not a terminal
+LINE_EVERY = 5.0  # [s]: interval between status lines if the output is not a terminal
 
 
 def live(
@@ -65,12 +65,12 @@ def live(
 
     Args:
         policy: A policy.safetensors, or the folder that contains one; by default, a policy is trained first.
-        resume: A learner_state.safetensors of an earlier flight, from which to continue.
+        resume: A learner_state.safetensors from an earlier flight, from which to continue.
         preset: Preset to train with if there is neither --policy nor --resume.
         flight: Plant, vehicle and disturbances of the flight.
         adapt: Method of the flight; full and lora re-train the policy in flight.
         residual: Residual model of the learners.
-        seconds: Length of the flight; until Ctrl-C by default.
+        seconds: Length of the flight [s]; by default, until Ctrl-C.
         fence: Distance from the reference along any axis at which the fallback controller takes over [m].
         policy_age: Age of a learned policy's flight data at which the fallback controller takes over [s]; by default
             unlimited.
@@ -82,11 +82,11 @@ def live(
         page: Show the flight in a browser, with controls. Without `--seconds`, this is the default.
         no_page: Show the flight in the terminal only.
         page_host: Address that the page listens on. The printed address contains a token, which every request needs.
-        page_port: Port of the page; the next free port if it is in use.
+        page_port: Port of the page; if it is in use, the next free port.
         record: FILE.mcap for Foxglove and PlotJuggler, or FILE.rrd for rerun; by default flight.mcap in the folder.
-        save_vehicle: Vehicle file (TOML) to write, with the vehicle identified in the flight, for pretraining.
+        save_vehicle: Vehicle file (TOML) to write for pretraining, with the vehicle identified in the flight.
         trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
-        out: Folder for the results of the flight; a new one under runs/ by default.
+        out: Folder for the results of the flight; by default, a new one under runs/.
     """
 
     def ordered(stop: threading.Event) -> int:
@@ -121,7 +121,7 @@ def live(
 
 
 def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None) -> int:
-    """Run one flight, and show its results."""
+    """Run one flight and show its results."""
     done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
         return INTERRUPTED
@@ -143,7 +143,7 @@ def _open_page(url: str, folder: Path) -> None:
 
 @contextmanager
 def _display(events: LiveEvents) -> Iterator[Callable[[Status, list[Event]], None]]:
-    """Show a flight as a table in a terminal or as periodic lines elsewhere, and events when they occur."""
+    """Show a flight as a table in a terminal or as periodic lines elsewhere, and show events when they occur."""
     last = float("-inf")
 
     def show(status: Status, new: list[Event]) -> None:

@@ -1,6 +1,6 @@
-"""Entry point of the command line: it selects the command, and turns errors into a one-line message and an exit code.
+"""Select and run the command, and turn an error into a one-line message and an exit code.
 
-Command modules are imported only when they are needed, so that --help is fast.
+Command modules are imported only when they are needed, so --help is fast.
 """
 
 import os
@@ -37,7 +37,7 @@ def commands() -> dict[str, tuple[str, str]]:
 
 
 def describe(known: Mapping[str, tuple[str, str]]) -> str:
-    """Return the help of the command line.
+    """Return the help text of the command line.
 
     Args:
         known: Help text and module of every command, by name.
@@ -66,7 +66,7 @@ def main(words: Sequence[str] | None = None) -> None:
     from before an interruption are kept.
 
     Args:
-        words: Command and options; ``sys.argv`` by default.
+        words: Command and options; by default, ``sys.argv``.
     """
     if words is not None:
         sys.argv = ["retrim", *words]  # results record this command line
@@ -98,7 +98,7 @@ def _run(words: list[str]) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # pipe is closed: avoid errors at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the pipe is closed: avoid errors at exit
         return 1
 
 
@@ -140,7 +140,7 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
 
 
 def _message_of(error: Exception, words: list[str]) -> str | None:
-    """Return the line that describes an error; None for a fault of this package, whose traceback is needed."""
+    """Return the line that describes an error; None for a fault in this package, whose traceback is needed."""
     from ..config.registry import describe_user_error
     from ..errors import RetrimError
 

@@ -1,4 +1,4 @@
-"""Help texts of options: placeholders instead of types, names from the registries, and no default if it is None."""
+"""Build the help texts of options, with placeholders for types, names from the registries, and no default None."""
 
 import functools
 import inspect
@@ -13,7 +13,7 @@ PLACEHOLDERS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return names for a help text, separated by commas."""
+    """Return names separated by commas, for a help text."""
     return ", ".join(names)
 
 
@@ -29,10 +29,10 @@ def option(text: str, *, optional: bool = False) -> Any:
 
 
 def readable(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command whose optional options show a placeholder and no default.
+    """Return a command whose help shows placeholders and no defaults for optional options.
 
     Args:
-        command: Function whose arguments are the options; None is the default of an optional one.
+        command: Function whose arguments are the options; an optional option has the default None.
     """
     hints = get_type_hints(command, include_extras=True)
     signature = inspect.signature(command)
@@ -54,7 +54,7 @@ def readable(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _of_hint(hint: Any) -> dict[str, Any]:
-    """Return the settings of an option whose type includes None; empty for any other type."""
+    """Return the settings of an option whose type includes None; for any other type, return an empty dictionary."""
     if get_origin(hint) not in (Union, types.UnionType) or type(None) not in get_args(hint):
         return {}
     rest = [each for each in get_args(hint) if each is not type(None)]

@@ -1,4 +1,4 @@
-"""``retrim pretrain``."""
+"""``retrim pretrain``: train a policy from scratch."""
 
 import threading
 from collections.abc import Callable
@@ -41,9 +41,9 @@ def pretrain(
         config: TOML file with values that replace those of the preset, for example a table [pretrain].
         updates: Number of optimiser steps; by default that of the preset.
         envs: Number of starts per step; by default that of the preset.
-        seed: Seed of the initial weights and of the starts, 0 to 4294967295.
+        seed: Seed of the initial weights and the starts, 0 to 4294967295.
         trust: Python name that a file may contain, such as mine:task; its code is run. Repeat the option for each name.
-        out: Folder for policy.safetensors and results.json; a new one under runs/ by default.
+        out: Folder for policy.safetensors and results.json; by default, a new one under runs/.
     """
 
     def ordered(stop: threading.Event) -> int:

@@ -1,4 +1,4 @@
-"""``retrim replay``."""
+"""``retrim replay``: replay a flight log."""
 
 import threading
 from collections.abc import Callable
@@ -19,12 +19,12 @@ def replay(
     asked: tyro.conf.OmitArgPrefixes[tyro.conf.UseAppendAction[Replay]] = Replay(),  # noqa: B008
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
-    """Read a flight log, report the nominal model's error and how well it is predicted, and identify or adapt.
+    """Read a flight log, report the nominal model's error and its predictability, and identify or adapt.
 
     Args:
         log: Log file: CSV, NPZ, PX4 ULog, ROS 1 or 2 bag, or MCAP; the last three need the extra `logs`.
         asked: Options of the replay.
-        out: Folder for the report, its picture, vehicle.toml and the policy; a new one under runs/ by default.
+        out: Folder for the report, its picture, vehicle.toml and the policy; by default, a new one under runs/.
     """
 
     def ordered(stop: threading.Event) -> int:

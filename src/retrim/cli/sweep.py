@@ -1,4 +1,4 @@
-"""``retrim sweep``."""
+"""``retrim sweep``: fly every combination of a sweep file."""
 
 import threading
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""NumPy expressions for the operations of a trace, by name.
+"""Provide NumPy expressions for the operations of a trace, by name.
 
 Each expression is a function of the equation and the names of its operands.
 """

@@ -1,9 +1,9 @@
-"""Conversion of controllers to NumPy source, so that the control process does not need JAX.
+"""Convert controllers to NumPy source, so that the control process does not need JAX.
 
 A controller is traced once, before take-off. Each operation of the trace becomes one line of NumPy. Values that depend
 only on constants are computed during the conversion. Values that depend on parameters but not on inputs are computed
-when the parameters change. All other values are computed each tick. Controllers thus fly in real time with the
-same definition that trains in JAX, whether they are learned or classical, built-in or user-defined.
+when the parameters change. All other values are computed each tick. Controllers, whether learned or classical,
+built-in or user-defined, thus fly in real time with the same definition that is trained in JAX.
 """
 
 import re
@@ -39,7 +39,7 @@ def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) ->
         inputs: Example of the inputs, which are new at every call.
 
     Raises:
-        ConfigError: The function has an operation without a NumPy form in this module.
+        ConfigError: The function contains an operation without a NumPy form in this module.
     """
     closed = jax.make_jaxpr(function)(parameters, inputs)
     writer = _Writer()

@@ -1,6 +1,6 @@
-"""Classical baseline controllers. They receive the declared delay, lag and limits of the vehicle.
+"""Classical baseline controllers, which receive the declared delay, lag and limits of the vehicle.
 
-``retrim reproduce tuning`` tuned their settings with separate pushes, starts and seeds, once for a measured state and
+``retrim reproduce tuning`` tuned their settings on separate pushes, starts and seeds: once for a measured state and
 once for a pose estimated from keypoints. See docs/results/tuning.md and tuning_keypoints.md.
 """
 
@@ -26,8 +26,8 @@ from .command_paths import ACTUATOR_LAG, declared_path, lag_of
 if TYPE_CHECKING:
     from .setup import Setup
 
-INTEGRAL_LIMIT = 6.0  # [m/s^2]: same as the largest disturbance that the observer of the policies compensates
-HORIZON = 0.8  # [s]: horizon of MPPI
+INTEGRAL_LIMIT = 6.0  # [m/s^2]: same as the largest disturbance that the policies' observer compensates
+HORIZON = 0.8  # [s]: MPPI horizon
 L1_POLE = -0.2  # [1/s], as in the hardware flights of DATT; its size matters little if it is small compared to 1 / dt
 
 Settings = Mapping[str, float]
@@ -38,20 +38,20 @@ class Baseline:
     """A controller without a policy, its settings, and their search ranges."""
 
     label: str
-    """Name in tables."""
+    """Name used in tables."""
     make: Callable[["Setup", Settings, Key[Array, ""]], AbstractController[Any]]
-    """Function of a set-up, settings and a random key that returns the controller."""
+    """Function that takes a set-up, settings and a random key, and returns the controller."""
     settings: Settings
     """Settings for a measured state."""
     settings_from_keypoints: Settings
-    """Settings for a pose estimated from keypoints. The estimate is late and noisy, so slower loops fly better."""
+    """Settings for a pose estimated from keypoints. The estimate is late and noisy, so slower loops work better."""
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest value of each setting in the search, which draws log-uniformly."""
     cost: int = 1
-    """Relative cost of a rollout; the tuning search divides its number of candidates by it."""
+    """Relative cost of a rollout; the tuning search divides the number of candidates by this cost."""
 
     def controller(self, setup: "Setup", key: Key[Array, ""] | None = None) -> AbstractController[Any]:
-        """Return the controller with its settings."""
+        """Return the controller with the settings that suit the set-up's observation."""
         return self.make(setup, self.settings_for(setup), random.key(0) if key is None else key)
 
     def settings_for(self, setup: "Setup") -> Settings:
@@ -61,7 +61,7 @@ class Baseline:
 
 
 def prediction_of(setup: "Setup") -> Prediction:
-    """Return the nominal model of a preset's vehicle."""
+    """Return the nominal model of the set-up's vehicle."""
     path = declared_path(setup.preset, setup.vehicle)
     if lag_of(setup.preset, setup.vehicle) is None:
         path = CommandPath(path.delay, ActuatorResponse.of(ACTUATOR_LAG, ACTUATOR_LAG))
@@ -69,7 +69,7 @@ def prediction_of(setup: "Setup") -> Prediction:
 
 
 def slowness(setup: "Setup") -> float:
-    """Return the ratio of command delay plus rate lag to its value in the tuning search; at least 1."""
+    """Return the ratio of command delay plus rate lag to the same sum in the tuning search; at least 1."""
     path = declared_path(setup.preset, setup.vehicle)
     delay, lag = float(path.delay), float(path.response.rate_lag[0])
     return max(1.0, (delay + lag) / (delay + ACTUATOR_LAG))
@@ -184,5 +184,6 @@ BASELINES: dict[str, Baseline] = {
     ),
 }  # fmt: skip
 """Baselines by method name. Units: position gains [1/s^2], velocity and attitude gains [1/s], integral gains [1/s^3],
-time constants of filter and estimator [s]. MPPI: noise of thrust [m/s^2] and rates [rad/s], its correlation time [s],
-the temperature, and costs per second of position [1/m], velocity [s/m] and attitude."""
+time constants of the filter and the estimator [s]. MPPI: noise of the thrust [m/s^2] and the rates [rad/s], the
+correlation time of this noise [s], the temperature, and the costs per second of position [1/m], velocity [s/m] and
+attitude."""

@@ -1,4 +1,4 @@
-"""Command paths of a preset: the path of its training model, and the declared path of the plant.
+"""Build the command paths of a preset: those of its training model and of its declared plant.
 
 | where | delay | lag |
 |---|---|---|
@@ -20,15 +20,15 @@ from .presets import Preset
 from .vehicle_file import VehicleSpec
 from .vehicles import is_published
 
-ACTUATOR_LAG = 0.033  # [s]: typical lag of small quadrotors, for presets without a declared lag
+ACTUATOR_LAG = 0.033  # [s]: typical lag of a small quadrotor, for presets without a declared lag
 
 
 def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
     """Return the time constants of the thrust and body rates [s], or None for a model without lag.
 
-    A vehicle with a known rate lag uses its own time constants. Published vehicles use those of the preset. For other
-    vehicles, the body rates use the rise times of the simulated rate loop, and the thrust uses the time constant of
-    the motors.
+    A vehicle with a known rate lag uses its own time constants. Published vehicles use the time constant of the
+    preset. For other vehicles, the body rates use the rise times of the simulated rate loop, and the thrust uses the
+    time constant of the motors.
     """
     if vehicle.rate_lag is not None:
         return Command(vehicle.motor_tau, vehicle.rate_lag)
@@ -39,7 +39,7 @@ def lag_of(preset: Preset, vehicle: Vehicle) -> Command | None:
 
 
 def response_of(preset: Preset, vehicle: Vehicle) -> ActuatorResponse | None:
-    """Return the response of thrust and rates to commands in a preset's model, or None for a model without lag."""
+    """Return the response of thrust and rates to commands in the preset's model, or None for a model without lag."""
     lag = lag_of(preset, vehicle)
     if lag is None:
         return None
@@ -48,10 +48,10 @@ def response_of(preset: Preset, vehicle: Vehicle) -> ActuatorResponse | None:
 
 
 def delayed(preset: Preset) -> Preset:
-    """Return the preset with the command delay of its vehicle file, if any, in the model and in the declared plant.
+    """Return the preset with the command delay from its vehicle file, if any, in the model and in the declared plant.
 
     Raises:
-        ConfigError: The delay has more ticks than a preset supports.
+        ConfigError: The delay exceeds the largest number of ticks that a preset supports.
     """
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None:
@@ -67,22 +67,22 @@ def delayed(preset: Preset) -> Preset:
 
 
 def model_path(preset: Preset, vehicle: Vehicle) -> CommandPath:
-    """Return the command path of the training model of a preset."""
+    """Return the command path of a preset's training model."""
     return CommandPath.of(_delay(preset, preset.delay_ticks), response_of(preset, vehicle))
 
 
 def declared_path(preset: Preset, vehicle: Vehicle) -> CommandPath:
-    """Return the command path of the plant, as declared by a preset."""
+    """Return the command path of the plant that a preset declares."""
     return CommandPath.of(_delay(preset, preset.plant_delay_ticks), response_of(preset, vehicle))
 
 
 def _delay(preset: Preset, ticks: int) -> float:
-    """Return the delay of the vehicle file, which need not be whole ticks, or the delay of the preset [s]."""
+    """Return the delay from the vehicle file, which need not be whole ticks, or the delay of the preset [s]."""
     vehicle = preset.vehicle
     stated = vehicle.command_delay if isinstance(vehicle, VehicleSpec) else None
     return ticks * preset.dt if stated is None else stated
 
 
 def longest_delay(preset: Preset) -> float:
-    """Return the longest delay that command queues can store [s]; it is the same for all usual presets."""
+    """Return the longest delay that command queues can store [s]; this value is the same for all usual presets."""
     return max(LONGEST_DELAY, preset.dt * max(preset.delay_ticks, preset.plant_delay_ticks))

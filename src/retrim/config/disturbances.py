@@ -14,9 +14,9 @@ from .registry import Registry
 from .sizes import name_and_size
 
 DisturbanceFactory = Callable[[Key[Array, ""], float | None], Disturbance]
-"""Function of a random key and a size (or None, the default size) that returns a disturbance."""
+"""Function that takes a random key and a size (or None for the default size), and returns a disturbance."""
 
-SEED_TAG = 2**30 + 3  # folded into seeds, so that disturbances do not share keys with starts, learners or sensors
+SEED_TAG = 2**30 + 3  # folded into seeds, to keep disturbances from sharing keys with starts, learners or sensors
 
 DISTURBANCES: Registry[DisturbanceFactory] = Registry("disturbance", example="sums as wind+payload=0.1, or module:name")
 register_disturbance = DISTURBANCES.register
@@ -76,7 +76,7 @@ def _fan(key: Key[Array, ""], size: float | None) -> Disturbance:
 
 _BUILT_IN: dict[str, DisturbanceFactory] = {
     "none": _push(0.0),
-    "small": _push(0.5),  # the paper's levels, m/s^2 per axis (Sec. IV-B)
+    "small": _push(0.5),  # the paper's levels [m/s^2] per axis (Sec. IV-B)
     "large": _push(2.0),
     "push": _push(None),
     "push-x": lambda key, size: Constant(  # Sec. IV-C of the paper
@@ -84,13 +84,13 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
     ),
     "step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(8.0)),
     "early-step": lambda key, size: Step(jnp.full(3, _bounded(size, 2.0, -10.0, 10.0, "m/s^2")), jnp.array(4.0)),
-    "kick": lambda key, size: Kick(  # size: speed gained within 0.1 s, horizontal and diagonal
+    "kick": lambda key, size: Kick(  # size: speed gained within 0.1 s along a horizontal diagonal
         10.0 * _diagonal(_bounded(size, 3.0, 0.0, 10.0, "m/s")), jnp.array(8.0), jnp.array(0.1)
     ),
     "reversing": lambda key, size: Reversing(  # Sec. IV-B.3
         jnp.full(3, _bounded(size, 0.5, -10.0, 10.0, "m/s^2")), jnp.array(15.0)
     ),
-    # The bounds, +-1 m/s^2, are those of the paper for the training of DATT.
+    # The bounds, +-1 m/s^2, are those that the paper uses to train DATT.
     "walk": lambda key, size: RandomWalk.of(_bounded(size, 0.5, 0.0, 10.0, "m/s^2"), 1.0, key=key),
     "wind": lambda key, size: SteadyWind(_diagonal(_bounded(size, 4.0, 0.0, 20.0, "m/s"))),
     "gusts": lambda key, size: Dryden.of(_diagonal(_bounded(size, 4.0, 0.5, 20.0, "m/s")), key=key),

@@ -1,4 +1,4 @@
-"""The vehicle family of a preset, and the flight components that only presets with a family use."""
+"""Build the vehicle family of a preset, and the flight components that only presets with a family use."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ from .tasks import find_task
 from .vehicle_file import VehicleSpec
 
 TRUST = 2.0  # assumed error factor of a delay or lag in a vehicle file
-# [m]: largest distance from the target in the policy's input. Farther away, it tilts more than a weak vehicle can lift.
+# [m]: largest distance from the target in the policy's input. Beyond it, a policy tilts too far for a weak vehicle.
 REACH = 0.5
 LEAST = 0.01  # [s]: assumed error of a short delay or lag
 
@@ -48,7 +48,7 @@ def make_family(preset: Preset) -> PathFamily | None:
 
 
 def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
-    """Return the belief about a vehicle before take-off; values in its file may be wrong by a factor of two.
+    """Return the prior belief about a vehicle, with an error factor of two for the values in the vehicle file.
 
     Args:
         preset: Preset whose vehicle may come from a vehicle file.
@@ -76,7 +76,7 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy
 
     Args:
         preset: Preset of the policy. For a family and a task without a reference, the observed distance from the target
-            is limited. If this task rests at home, the policy is also shifted so that it commands hover there.
+            is limited. If this task rests at home, the policy is also shifted so that it commands hover at home.
         task: Task of the flight.
         policy: Policy of the flight.
     """
@@ -89,7 +89,7 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy
 
 
 def track_actuators(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:
-    """Return a controller that receives the current thrust and body rates, if its preset is for a family of vehicles.
+    """Return a controller that receives the current thrust and body rates if its preset is for a family of vehicles.
 
     Args:
         controller: Controller of a policy.
@@ -104,7 +104,7 @@ def track_actuators(controller: AbstractController[Any], preset: Preset) -> Abst
 
 
 def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> IdentifiedFlight:
-    """Return a controller that receives the parameters of the vehicle, identified in flight.
+    """Return a controller that receives the vehicle's parameters, which are identified in flight.
 
     Args:
         controller: Controller of a policy for a family; see :func:`track_actuators`.
@@ -132,7 +132,7 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
 
 
 def declared_vehicle(preset: Preset) -> Float[Array, "2"] | None:
-    """Return the command delay and rate lag in the vehicle file [s], or None if the file does not state both."""
+    """Return the command delay and rate lag from the vehicle file [s], or None if the file does not state both."""
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None or vehicle.rate_lag is None:
         return None
@@ -144,7 +144,7 @@ def _lag(vehicle: VehicleSpec) -> float | None:
 
 
 def _interval(value: float | None) -> tuple[float, float]:
-    """Return the interval of a time constant from a vehicle file [s]; unbounded if the file does not state it."""
+    """Return the interval of a time constant from a vehicle file [s]; unbounded if the file states none."""
     if value is None:
         return 0.0, jnp.inf
     return min(value / TRUST, max(value - LEAST, 0.0)), max(value * TRUST, value + LEAST)

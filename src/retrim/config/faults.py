@@ -26,7 +26,7 @@ from .sizes import name_and_size
 NO_FAULT = "none"
 
 FaultFactory = Callable[[float | None], AbstractMeasurementFault | None]
-"""Function of a size (or None, the default size) that returns a fault."""
+"""Function that takes a size (or None for the default size) and returns a fault."""
 
 FAULTS: Registry[FaultFactory] = Registry("fault", example="module:name of a function of a size")
 register_fault = FAULTS.register

@@ -1,7 +1,7 @@
-"""Benchmark population of vehicles that are unknown to the methods, drawn from one size factor.
+"""Draw a benchmark population of vehicles that are unknown to the methods.
 
-Small vehicles turn fast and large ones turn slowly, so mass, inertia, delay and lags grow together. Independent ranges
-of these values would contain impossible vehicles.
+One size factor determines each vehicle: small vehicles turn fast and large ones turn slowly, so mass, inertia, delay
+and lags grow together. Independent ranges of these values would contain impossible vehicles.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from .scenario import Scenario
 from .vehicle_file import VehicleSpec
 
 LIGHTEST, HEAVIEST = 0.03, 3.0  # [kg]
-RATE_LAG = (0.015, 0.15)  # [s]: lightest and heaviest vehicle
+RATE_LAG = (0.015, 0.15)  # [s]: of the lightest and the heaviest vehicle
 DELAY = (0.0, 0.06)  # [s]
 THRUST_LAG = (0.01, 0.08)  # [s]
 SPREAD, DELAY_SPREAD = 0.2, 0.012  # standard deviations of the log-lags, and of the delay [s]

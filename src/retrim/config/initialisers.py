@@ -1,4 +1,4 @@
-"""Random objects of a set-up, apart from training: untrained policies, flight starts, and low-rank deltas."""
+"""Draw the random objects of a set-up outside training: untrained policies, flight starts, and low-rank deltas."""
 
 from functools import partial
 
@@ -16,13 +16,13 @@ from ..tasks.hover import Hover
 from ..tasks.observation import StateObs
 from ..tasks.task import TILT
 
-START_TAG = 2**30 + 1  # folded into the seed of flight starts, so that their keys differ from those of training
+START_TAG = 2**30 + 1  # folded into the seed of flight starts, to keep their keys different from training keys
 LOW_RANK_TAG = 2**30 + 4  # folded into the key of a learner, for its initial delta
 
 
 @partial(jax.jit, static_argnames=("size", "hidden"))
 def untrained(size: int, vehicle: Vehicle, key: Key[Array, ""], hidden: tuple[int, ...]) -> Policy:
-    """Return an untrained policy; set-ups with the same sizes share the compiled program.
+    """Return an untrained policy; set-ups with the same sizes share a compiled program.
 
     Args:
         size: Size of the observation.
@@ -34,10 +34,10 @@ def untrained(size: int, vehicle: Vehicle, key: Key[Array, ""], hidden: tuple[in
 
 
 def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:
-    """Return ``n`` starts: +- 1 m per axis from ``home``, 18 degrees about each axis, and 0.1 m/s.
+    """Return ``n`` starts within ±1 m of ``home`` and ±18 degrees per axis, with velocities of about 0.1 m/s per axis.
 
     Args:
-        home: Centre of the starts, world frame [m].
+        home: Centre of the starts, world [m].
         n: Number of starts.
         seed: Seed; the same seed gives the same starts.
     """
@@ -46,7 +46,7 @@ def flight_starts(home: Float[Array, "3"], n: int, seed: int) -> list[State]:
 
 
 def low_rank(policy: AbstractPolicy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
-    """Return ``policy`` with a new low-rank delta, unless it already has one.
+    """Return ``policy`` with a new low-rank delta, unless ``policy`` already has a delta.
 
     Args:
         policy: Full policy, or one with a delta.

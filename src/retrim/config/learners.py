@@ -1,4 +1,4 @@
-"""The nominal model, optimiser, online-learner settings and control frame of a preset."""
+"""Build the nominal model, optimiser, online-learner settings and control frame of a preset."""
 
 import functools
 import math
@@ -34,23 +34,23 @@ from .presets import Preset, Pretrain
 from .tasks import find_task
 
 OBSERVER_TAU = 0.05  # [s]: half this value is unstable if the plant's delay is 40 ms longer than declared
-WANDER = 4.0  # [m/s^2] in one second: random walk of the disturbance
-# The same for a family: its stiffer policy turns estimation noise into motion. Without noise, both are equal.
+WANDER = 4.0  # [m/s^2]: random walk of the disturbance in one second
+# The same for a family, whose stiffer policy turns estimation noise into motion. Without noise, both work equally well.
 FAMILY_WANDER = 1.0
 TILT_LIMIT = 6.0  # [m/s^2]: largest disturbance that rotates a frame, so that gravity keeps a downward component
 
 
 def nominal_model(preset: Preset, vehicle: Vehicle) -> AbstractDynamics[Any]:
-    """Return the point mass of Eq. (1) of the paper, with actuator lag if the preset or the vehicle has one."""
+    """Return the point mass of the paper's Eq. (1), with actuator lag if the preset or the vehicle has one."""
     model, response = PointMass(preset.dt), response_of(preset, vehicle)
     return model if response is None else Lagged(model, response)
 
 
 @functools.lru_cache(maxsize=32)
 def pretraining_optimiser(table: Pretrain) -> optax.GradientTransformation:
-    """Return the optimiser: gradient clipping, then Adam with a cosine schedule.
+    """Return the pretraining optimiser: gradient clipping, then Adam with a cosine schedule.
 
-    Equal tables give the same object, so that compiled programs are shared.
+    Equal tables give the same object, so compiled programs are shared.
     """
     rate = optax.cosine_decay_schedule(table.learning_rate, table.num_updates)
     return optax.chain(optax.clip_by_global_norm(table.max_grad_norm or math.inf), optax.adam(rate, b2=table.adam_b2))
@@ -59,15 +59,16 @@ def pretraining_optimiser(table: Pretrain) -> optax.GradientTransformation:
 def learner_settings(
     preset: Preset, env: Env, optimiser: Callable[[Array, Array], AbstractPolicyOptimiser]
 ) -> dict[str, Any]:
-    """Return the settings of an online learner, by field.
+    """Return the settings of an online learner by field name.
 
     Args:
-        preset: Preset with the parameters in its table [adapt].
+        preset: Preset whose table [adapt] contains the parameters.
         env: Environment of the flight.
-        optimiser: Function of a learning rate and a largest gradient norm that returns the optimiser of policy updates.
+        optimiser: Function that takes a learning rate and a largest gradient norm, and returns the optimiser of policy
+            updates.
 
     Raises:
-        ConfigError: The preset rotates the frame of a task that cannot be rotated, or trims a task that does not rest.
+        ConfigError: The preset rotates a task that cannot be rotated, or trims a task that does not rest at home.
     """
     a, family = preset.adapt, env.family
     if a.frame != "world":
@@ -97,10 +98,10 @@ def _view(preset: Preset, task: AbstractTask) -> AbstractView:
 
 
 def check_frame(preset: Preset, task: AbstractTask) -> None:
-    """Raise an error if a preset does not support the frame of effective gravity.
+    """Raise an error if a preset's task does not support the frame of effective gravity.
 
     Raises:
-        ConfigError: The task cannot be rotated, or its policy sees keypoints without a pose filter. The message names
+        ConfigError: The task cannot be rotated, or the policy sees keypoints without a pose filter. The message names
             the task and the part that cannot be rotated.
     """
     seen = task.observation_in_flight
@@ -118,13 +119,13 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 def effective_gravity_frame(
     controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known: FittedResidual | None = None
 ) -> GravityFrame | PoseFrame:
-    """Return a controller in the frame of effective gravity, which an observer or its own pose filter estimates.
+    """Return a controller in the frame of effective gravity, which an observer or a pose filter estimates.
 
     Args:
         controller: Controller that can be rotated into this frame.
         preset: Preset with the control period and the declared delay of the observer.
         vehicle: Vehicle with the command limits and the lag of the observer.
-        known: Learned residual, with the learned bias of the body rates. The observer estimates the remaining
+        known: Learned residual, including the learned body-rate bias. The observer estimates the remaining
             disturbance. A pose filter ignores the residual and estimates the whole disturbance.
     """
     limit = jnp.array(TILT_LIMIT)

@@ -1,6 +1,6 @@
 """Load presets by name and from TOML files, flags and JSON.
 
-Every mistake raises an error with a one-line message.
+Every mistake in them raises an error with a one-line message.
 """
 
 import dataclasses
@@ -58,7 +58,7 @@ def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> P
 
     Args:
         preset: Preset with the values to replace.
-        overlay: TOML file; the path of a vehicle file in it is relative to its folder.
+        overlay: TOML file; the path of a vehicle file in it is relative to the overlay's folder.
         trust: Python names that the file may contain, e.g. ``mine:task``.
 
     Raises:
@@ -72,7 +72,7 @@ def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> P
 
 
 def beside(above: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the values of a file, with the path of a vehicle file replaced by its content.
+    """Return the values of a file, with the path of a vehicle file replaced by that vehicle file's content.
 
     Args:
         above: Values of the file.
@@ -90,10 +90,10 @@ def beside(above: dict[str, Any], folder: Path) -> dict[str, Any]:
 def with_vehicle(preset: Preset, vehicle: str | VehicleSpec) -> Preset:
     """Return a preset for a vehicle.
 
-    The preset stores the content of a vehicle file, so that it is self-contained.
+    The preset stores the content of a vehicle file, so the preset is self-contained.
 
     Raises:
-        ConfigError: There is no such vehicle, or its file cannot be used.
+        ConfigError: There is no such vehicle, or the vehicle file cannot be used.
     """
     result = vehicle_from(vehicle)
     return changed(preset, vehicle=dataclasses.asdict(result) if isinstance(result, VehicleSpec) else result)
@@ -105,9 +105,9 @@ def values(preset: Preset) -> dict[str, Any]:
 
 
 def parse(text: str | bytes, *, source: str) -> Preset:
-    """Return a preset from JSON; this is the inverse of :func:`dump`.
+    """Return a preset from JSON, as the inverse of :func:`dump`.
 
-    Callers that read the JSON from a file or a message must check its names (:func:`retrim.config.trust.check_trust`).
+    Callers that read the JSON from a file or a message must check all names (:func:`retrim.config.trust.check_trust`).
 
     Raises:
         ConfigError: The text is not a valid preset.
@@ -116,7 +116,7 @@ def parse(text: str | bytes, *, source: str) -> Preset:
 
 
 def missing_defaults(preset: Preset, text: str | bytes) -> dict[str, Any]:
-    """Return the preset values that are missing in its JSON, and so are defaults of this release, by dotted name.
+    """Return, by dotted name, the values that are missing in a preset's JSON and therefore are this release's defaults.
 
     Args:
         preset: Result of :func:`parse` for the text.
@@ -138,7 +138,7 @@ def changed(preset: Preset, **tables: Any) -> Preset:
 
     Args:
         preset: Preset with the values to replace.
-        **tables: New values, and tables of new values.
+        **tables: New values, or tables of new values.
 
     Raises:
         ConfigError: A key or value is invalid.

@@ -1,4 +1,4 @@
-"""Registry of flight methods: an unchanged, compensated or re-trained policy, and controllers without a policy."""
+"""Registry of flight methods: unchanged, compensated or re-trained policies, and controllers without a policy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MethodRequest:
-    """Inputs from which a method builds a pilot."""
+    """The inputs from which a method builds a pilot."""
 
     setup: "Setup"
     policy: Any
-    """Policy, or the network of a method that has its own."""
+    """Policy, or the network of a method that uses its own network."""
     key: Key[Array, ""] | None = None
     """Random key of the method; None for a deterministic method."""
     latency: "Latency" = "fixed"
     state: LearnerState | None = None
-    """Learner state of an earlier flight, from which to continue; None for a new one."""
+    """Learner state of an earlier flight, from which to continue; None for a new learner state."""
 
     def controller(self) -> AbstractController[Any]:
         """Return the policy with the observation used in flight."""
@@ -62,7 +62,7 @@ class MethodRequest:
 
         Args:
             controller: Controller that needs the state.
-            called: Name of the method in error messages; by default the name of the controller class.
+            called: Name of the method in error messages; by default, the name of the controller class.
 
         Raises:
             ConfigError: The policy observes keypoints, and the preset has no pose filter.
@@ -90,23 +90,24 @@ class MethodRequest:
 
 
 Prepare = Callable[["Setup", AbstractPolicy, Key[Array, ""]], AbstractPolicy | LoraPolicy]
-"""Function of a set-up, a policy and a random key that returns the policy to train: the same, or one with a delta."""
+"""Function that takes a set-up, a policy and a random key, and returns the policy to train: the same policy, or one
+with a delta."""
 
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """A flight method; :func:`learning_method` makes the entry of a method that learns in flight."""
+    """A flight method; :func:`learning_method` builds the entry of a method that learns in flight."""
 
     make: Callable[[MethodRequest], Pilot]
     label: str
-    """Name in tables."""
+    """Name used in tables."""
     on_board: Callable[["Setup", Plant], Plant] | None = None
     """Function that adds an on-board motor controller to a plant; None if the method commands thrust and body rates."""
     learns: Prepare | None = None
     """Function that prepares the policy for the learners; None for a method that does not learn in flight."""
 
     def fitted(self, setup: "Setup", plant: Plant) -> Plant:
-        """Return the plant, modified as the method requires.
+        """Return the plant with the modifications that the method requires.
 
         Raises:
             ConfigError: The method does not support this plant.
@@ -135,7 +136,7 @@ def learning_method(label: str, learns: Prepare) -> MethodEntry:
     """Return the entry of a method that learns in flight, in lockstep and live.
 
     Args:
-        label: Name in tables.
+        label: Name used in tables.
         learns: Function that prepares the policy for the learners.
     """
 

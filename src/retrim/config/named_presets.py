@@ -1,4 +1,4 @@
-"""Named presets: those of the paper, one of the authors' code, and our own."""
+"""Named presets: those of the paper, one from the authors' code, and our own."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ RETRIM = dataclasses.replace(
     ),
 )  # fmt: skip
 
-# One policy for many vehicles: it observes the belief about its vehicle, which is identified in flight.
+# One policy for many vehicles: the policy observes the belief about the vehicle, which is identified in flight.
 ANY = dataclasses.replace(
     RETRIM,
     name="hover/any",
@@ -63,7 +63,7 @@ ANY = dataclasses.replace(
     pretrain=dataclasses.replace(
         RETRIM.pretrain, num_updates=1000, num_envs=64, learning_rate=5e-3, hidden_sizes=(256, 256)
     ),
-    adapt=dataclasses.replace(RETRIM.adapt, window=150, trim="free"),  # in flight, each tick shifts its output
+    adapt=dataclasses.replace(RETRIM.adapt, window=150, trim="free"),  # in flight, each tick shifts the output
 )
 
 FELT = Track(reference="circle+figure8+star", observation="flat", felt_copies=7)
@@ -111,7 +111,7 @@ VISION_RETRIM = dataclasses.replace(
     adapt=dataclasses.replace(RETRIM.adapt, trim="free"),  # a wrongly estimated pose is not at rest
 )
 
-# Starts within 10 cm as in the authors' code: with larger distances, the return dominates the gradient. Window: 5 s.
+# Starts within 10 cm, as in the authors' code: at larger distances, the return dominates the gradient. Window: 5 s.
 PAPER_TRACK = Preset(
     name="track/paper",
     task="track",
@@ -120,7 +120,7 @@ PAPER_TRACK = Preset(
 )
 
 PRESETS: dict[str, Preset] = {
-    # Ours: the frame of effective gravity compensates disturbances in a second; short learning bursts reduce the rest.
+    # Ours: the frame of effective gravity compensates disturbances within a second; short bursts reduce the rest.
     "hover/retrim": RETRIM,
     # The same for any vehicle of a family, which is identified in flight.
     "hover/any": ANY,
@@ -139,7 +139,7 @@ PRESETS: dict[str, Preset] = {
     # As printed: o = [p, R, v], no delay in the model, 300 x 100 x 150. The paper does not state the learning rates
     # of updates. At 1e-3 for all weights, the noise of ten starts changes the policy more than a small push does.
     "hover/paper": Preset(adapt=Adapt(learning_rate=5e-4, low_rank_learning_rate=1e-3)),
-    # hover/fast at 100 Hz: the same times, with twice as many ticks.
+    # hover/fast at 100 Hz: the same durations, with twice as many ticks.
     "hover/100hz": dataclasses.replace(
         FAST,
         name="hover/100hz",
@@ -163,7 +163,7 @@ PRESETS: dict[str, Preset] = {
     "vision/ideal": VISION,
     # The same, but points outside the image are not observed; pixels are noisy, and some points are missed.
     "vision/occluded": OCCLUDED,
-    # The same in the frame of effective gravity, estimated by its pose filter, with short bursts of learning.
+    # The same in the frame of effective gravity, estimated by a pose filter, with short bursts of learning.
     "vision/retrim": VISION_RETRIM,
     # The paper's sizes: raw pixels, 500 x 300, updates of 50 steps x 30 environments.
     "vision/paper": Preset(

@@ -1,6 +1,6 @@
-"""Valid characters of names.
+"""Check the characters of names.
 
-The names of presets, vehicles and tasks are written to pictures, pages and C headers.
+The names of presets, vehicles and tasks appear in pictures, pages and C headers.
 """
 
 import re
@@ -14,14 +14,14 @@ MOST = 64
 PLAIN = re.compile(rf"[\w./+ -]{{1,{MOST}}}", re.ASCII)
 PYTHON = re.compile(r"[\w.]{1,100}:\w{1,64}")
 LONGEST = 1024
-"""Maximum length of a path or of several joined names [characters]."""
+"""Maximum length of a path, or of several joined names [characters]."""
 
 
 def plain(name: str) -> str:
     """Return the name if it consists of letters, digits, ``_ . / + -`` and spaces.
 
     Raises:
-        ValueError: The name has other characters, is empty, or is too long.
+        ValueError: The name contains other characters, is empty, or is too long.
     """
     if not PLAIN.fullmatch(name):
         raise ValueError(f"{excerpt(name)} must be 1 to {MOST} characters: A-Z a-z 0-9 _ . / + - and spaces")
@@ -49,7 +49,7 @@ def printable(name: str) -> str:
 
 
 def plain_from(text: str) -> str:
-    """Return a plain name made from a text, with invalid characters replaced."""
+    """Return the text as a plain name, with invalid characters replaced."""
     return re.sub(r"[^\w./+ -]", ".", text, flags=re.ASCII)[:MOST] or "unnamed"
 
 

@@ -20,7 +20,7 @@ from .registry import Registry
 
 @dataclass(frozen=True)
 class NetworkRequest:
-    """Inputs from which an untrained network is built."""
+    """The inputs from which an untrained network is built."""
 
     preset: Preset
     size: int
@@ -28,7 +28,7 @@ class NetworkRequest:
     vehicle: Vehicle
     """Vehicle with the command limits."""
     key: Key[Array, ""]
-    """Random key, consumed."""
+    """Random key; consumed."""
 
     @property
     def hidden_sizes(self) -> tuple[int, ...]:
@@ -58,7 +58,7 @@ def make_policy(request: NetworkRequest) -> AbstractPolicy:
     A network that is not an :class:`~retrim.AbstractPolicy` becomes a :class:`~retrim.NetworkPolicy`.
 
     Raises:
-        ConfigError: There is no such network, or it does not map an observation to four numbers.
+        ConfigError: There is no such network, or the network does not map an observation to four numbers.
     """
     name = request.preset.pretrain.network
     network = find_network(name)(request)

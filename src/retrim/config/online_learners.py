@@ -1,4 +1,4 @@
-"""Registries of online learners, and of the optimisers of their policy updates."""
+"""Registries of online learners and of the optimisers for their policy updates."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ Rate = Float[Array, ""]
 
 @dataclass(frozen=True)
 class LearnerRequest:
-    """Inputs from which an online learner is built."""
+    """The inputs from which an online learner is built."""
 
     preset: Preset
     model: ResidualModel
@@ -37,7 +37,7 @@ class LearnerRequest:
             **settings: Values that replace those of the preset, and further fields of the subclass.
 
         Raises:
-            ConfigError: The preset names an unknown optimiser, or settings that its task does not permit.
+            ConfigError: The preset names an unknown optimiser, or contains settings that its task does not permit.
         """
         make = OPTIMISERS.find(self.preset.adapt.optimiser)
         result = learner_settings(self.preset, self.env, make)
@@ -56,7 +56,7 @@ def make_learner(request: LearnerRequest) -> OnlineLearner:
     """Build the online learner of a preset.
 
     Raises:
-        ConfigError: There is no such learner, or its function does not return an :class:`~retrim.OnlineLearner`.
+        ConfigError: There is no such learner, or the function does not return an :class:`~retrim.OnlineLearner`.
     """
     name = request.preset.adapt.learner
     learner = LEARNERS.find(name)(request)

@@ -32,12 +32,12 @@ from ..plants.sim import SimPlant
 from ..rospy_node import system_module
 from .registry import Registry
 
-DELAY = 0.02  # [s]: default command delay of plants whose delay a scenario can set
+DELAY = 0.02  # [s]: default command delay of plants with a configurable delay
 
 
 @dataclass(frozen=True)
 class PlantRequest:
-    """Parameters of a plant, taken from a scenario."""
+    """The parameters of a plant, taken from a scenario."""
 
     vehicle: Vehicle
     disturbance: Disturbance
@@ -50,9 +50,9 @@ class PlantRequest:
     delay: float = DELAY
     """Command delay [s]."""
     address: str = ""
-    """Address of the vehicle; if empty, the default address of its link."""
+    """Address of the vehicle; if empty, the default address of the link."""
     fault: AbstractMeasurementFault | None = None
-    """Fault of the measurements; None for a plant without faults."""
+    """Measurement fault; None for a plant without faults."""
 
 
 @dataclass(frozen=True)
@@ -63,26 +63,26 @@ class PlantEntry:
     about: str
     """Short description of the simulated system."""
     own_vehicle: str | None = None
-    """Name of its built-in vehicle; None if the plant can simulate any vehicle."""
+    """Name of the plant's built-in vehicle; None if the plant can simulate any vehicle."""
     has_sensors: bool = False
-    """Whether it supports sensor models."""
+    """Whether the plant supports sensor models."""
     has_faults: bool = False
-    """Whether it supports measurement faults."""
+    """Whether the plant supports measurement faults."""
     has_thrust_error: bool = False
-    """Whether it supports an error of the thrust map."""
+    """Whether the plant supports an error of the thrust map."""
     has_delay: bool = False
-    """Whether it supports a configurable command delay."""
+    """Whether the plant supports a configurable command delay."""
     is_vehicle: bool = False
-    """Whether it is a link to a vehicle, which runs in real time and whose world cannot be disturbed. An address may
-    follow its name, e.g. ``mavlink:udp:127.0.0.1:14540``. The plant is then a
+    """Whether the plant is a link to a vehicle, which runs in real time and whose world cannot be disturbed. An address
+    may follow the plant's name, e.g. ``mavlink:udp:127.0.0.1:14540``. Such a plant is a
     :class:`~retrim.plants.bridges.vehicle_plant.VehiclePlant`."""
     has_world: bool = False
-    """Whether retrim simulates the world around the vehicle, so that disturbances can be applied."""
+    """Whether retrim simulates the world around the vehicle, so disturbances can be applied."""
     check_address: Callable[[str], object] | None = None
     """Function that raises ConfigError if the address after a vehicle's name is invalid; None for no check."""
     needs: Callable[[], object] | None = None
-    """Function, called before training, that raises an error if a required program or package is missing; None if there
-    are no requirements."""
+    """Function that raises an error if a required program or package is missing, called before training; None if the
+    plant has no requirements."""
 
 
 PLANTS: Registry[PlantEntry] = Registry("plant", example="module:name of a PlantEntry")
@@ -114,7 +114,7 @@ def _second_order(r: PlantRequest) -> Plant:
 
 
 def find_plant(name: str) -> tuple[object, str]:
-    """Return the object that is registered under a name, and the address after the name.
+    """Return the object registered under a plant's name, and the address that follows the name.
 
     Raises:
         ConfigError: There is no such plant.

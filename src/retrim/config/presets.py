@@ -34,8 +34,8 @@ class Pretrain:
     horizon: Count = 150
     """Length of a roll-out [ticks]."""
     learning_rate: LearningRate = 5e-3
-    """Initial learning rate of Adam; a cosine schedule reduces it to zero. The paper does not state it; the authors'
-    code uses 5e-3."""
+    """Initial learning rate of Adam; a cosine schedule reduces it to zero. The paper does not state this rate; the
+    authors' code uses 5e-3."""
     adam_b2: float = Field(default=0.999, ge=0, lt=1, strict=True)
     """Second decay rate of Adam."""
     max_grad_norm: Positive | None = None
@@ -53,14 +53,14 @@ class Adapt:
     """Adaptation in flight (paper, Sec. IV-A.3)."""
 
     window: int = Field(default=100, ge=12, le=100_000, strict=True)
-    """Length of the flight window that is kept [ticks]."""
+    """Length of the stored flight window [ticks]."""
     residual: Printable = "ensemble"
     """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (a regression, and
-    an ensemble for its remaining error), linear (19 features, learned over the whole flight), or module:name."""
+    an ensemble for the remaining error), linear (19 features, learned over the whole flight), or module:name."""
     memory: Seconds = 0.5
-    """Regression: age at which the weight of a tick is 1/e of the newest tick's weight [s]."""
+    """Regression: age at which a tick's weight is 1/e of the newest tick's weight [s]."""
     thrust_prior: float = Field(default=0.05, gt=0, le=1.0, strict=True)
-    """Regression: prior standard deviation of the thrust gain [-]; one third more mass corresponds to -0.25."""
+    """Regression: prior standard deviation of the thrust gain [-]; a one-third larger mass corresponds to -0.25."""
     fit_every: Seconds = 3.0
     """Time between residual fits [s]."""
     fit_steps: Count = 100
@@ -68,7 +68,7 @@ class Adapt:
     fit_learning_rate: LearningRate = 1e-2
     """Learning rate of Adam for the fit."""
     spectral_weight: float = Field(default=1e-3, ge=0, le=1e6, allow_inf_nan=False, strict=True)
-    """Weight of the spectral penalty; the paper does not state it."""
+    """Weight of the spectral penalty; the paper does not state this weight."""
     update_every: Seconds = 5.0
     """Time between policy updates [s]."""
     num_updates: Count = 30
@@ -97,8 +97,8 @@ class Adapt:
     disturbance observer. For a policy that sees occluded keypoints, the pose filter provides this frame without a
     measured state."""
     trim: Literal["free", "rest"] = "free"
-    """Correction after an update. rest: the policy is shifted so that it commands hover when it is at rest at home;
-    free: no correction."""
+    """Correction after an update. rest: the policy is shifted so that it commands hover when the vehicle is at rest at
+    home; free: no correction."""
     fit_latency: Seconds = 0.2
     """Flight time until a fitted residual is used [s]."""
     update_latency: Seconds = 1.0
@@ -124,7 +124,7 @@ class Track:
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether the policy observes the future of its reference, so that one policy can follow several references."""
+        """Whether the policy observes the future of its reference, so one policy can follow several references."""
         return self.observation in ("preview", "flat")
 
 
@@ -141,17 +141,17 @@ class Vision:
     whiten_pixels: bool = Field(default=False, strict=True)
     """Whether pixels are whitened over random short motions; otherwise raw pixels are used."""
     encoder_steps: int = Field(default=0, ge=0, le=1_000_000, strict=True)
-    """Number of optimiser steps that pretrain the encoder, before the policy is trained."""
+    """Number of optimiser steps that pretrain the encoder before the policy is trained."""
     encoder_motions: Literal["near", "wild"] = "near"
-    """Synthetic motions for encoder pretraining. near: those of a hovering vehicle; wild: about as large as those of a
-    random policy. Pixels are whitened over the near motions."""
+    """Synthetic motions for encoder pretraining. near: those of a hovering vehicle; wild: motions about as large
+    as those of a random policy. Pixels are whitened over the near motions."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class Family:
-    """Family of vehicles that one policy is trained for, as ranges of command paths.
+    """Family of vehicles for which one policy is trained, given as ranges of command paths.
 
-    The policy observes the belief about its vehicle, which comes from a vehicle file and from identification in flight.
+    The policy observes the belief about the vehicle, which comes from a vehicle file and from in-flight identification.
     """
 
     delay: tuple[NotNegative, Positive] = (0.0, 0.1)
@@ -166,7 +166,7 @@ class Family:
     """Smallest natural frequency omega_n of a rate loop [rad/s]; slower rate loops have more damping."""
     excitation: bool = False
     """Whether a flight begins with small doublets of thrust and body rates, until the vehicle is identified. The
-    vehicle moves by a few centimetres. Live flights do not use it."""
+    doublets move the vehicle by a few centimetres. Live flights do not use doublets."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -188,7 +188,7 @@ class Preset:
     termination_box: Positive = 5.0
     """Largest distance from the goal or reference along any axis [m]; vehicles farther away are terminated."""
     axes: Literal["world", "heading"] = "world"
-    """Axes of the observed state. heading: axes that turn with the vehicle, so that a hover policy behaves the same at
+    """Axes of the observed state. heading: axes that turn with the vehicle, so a hover policy behaves the same at
     every heading."""
     command_history: int = Field(default=0, ge=0, le=50, strict=True)
     """Number of past commands in the observation."""
@@ -211,7 +211,7 @@ class Preset:
 
     @model_validator(mode="after")
     def _consistent(self) -> "Preset":
-        """Check that the tables belong to the task, and that the times fit the control period."""
+        """Check that the tables belong to the task and that the times fit the control period."""
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")

@@ -1,4 +1,4 @@
-"""Registry of references: built-in shapes, CSV files, custom functions, and families of these."""
+"""Registry of references: built-in shapes, CSV files, custom functions, and families of references."""
 
 import functools
 import math
@@ -30,7 +30,7 @@ FELT_SEED = 0
 """Seed of the pushes whose effective gravity transforms training references; the same for every policy seed."""
 
 LAPS = {"": None, "laps": True, "once": False}
-"""Suffixes of a CSV file after a colon: whether the trajectory repeats."""
+"""Suffixes after a CSV file and a colon, which state whether the trajectory repeats."""
 
 
 def make_reference(names: str) -> Reference:
@@ -38,18 +38,18 @@ def make_reference(names: str) -> Reference:
 
     Args:
         names: A registered name, ``module:name`` of a function that returns a reference, or a CSV file. A closed
-            trajectory in a file repeats as laps; any other trajectory ends after one pass. ``my.csv:laps`` requires
-            laps, and ``my.csv:once`` requires one pass. A built-in shape may have a top speed [m/s], e.g. ``circle=8``.
+            trajectory in a file repeats in laps; any other trajectory ends after one pass. ``my.csv:laps`` requires
+            laps, and ``my.csv:once`` requires one pass. A top speed [m/s] may follow a shape, e.g. ``circle=8``.
             Several names joined by ``+`` form a family.
 
     Raises:
-        ConfigError: There is no such reference, or its file cannot be used.
+        ConfigError: There is no such reference, or a CSV file cannot be used.
     """
     return _made(names, 0, 0.0)
 
 
 def make_training_reference(table: Track) -> Reference:
-    """Return the training reference: the named reference, and copies in the effective gravity of constant pushes.
+    """Return the training reference: the named reference, and copies of it in the effective gravity of pushes.
 
     Raises:
         ConfigError: As for :func:`make_reference`.

@@ -23,7 +23,7 @@ LIBRARIES = (
     *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
     "<",
 )
-"""Beginnings of the paths of files without user code."""
+"""Path prefixes of files without user code."""
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -33,7 +33,7 @@ class Registry(Mapping[str, T], Generic[T]):
         """Build an empty registry.
 
         Args:
-            kind: Kind of its objects, in the singular; the group of its entry points is ``retrim.<kind>s``.
+            kind: Kind of the objects, in the singular; the group of their entry points is ``retrim.<kind>s``.
             example: Example name of a custom object, for error messages.
         """
         self._kind, self._example, self._known = kind, example, dict[str, T]()
@@ -42,7 +42,7 @@ class Registry(Mapping[str, T], Generic[T]):
         """Add an object under a new name.
 
         Raises:
-            ConfigError: The name is already registered, or has forbidden characters.
+            ConfigError: The name is already registered, or contains forbidden characters.
         """
         if not name or any(sign in name for sign in ":+= \t\n"):
             raise ConfigError(f"{self._kind} name {name!r} must not be empty nor contain ':', '+', '=' or spaces")
@@ -94,7 +94,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 def describe_user_error(error: Exception, words: Sequence[str]) -> str | None:
-    """Return a one-line message for an error that involves a user's module, or None for other errors.
+    """Return a one-line message for an error that involves a user's module, or None for any other error.
 
     The module's author needs to see the mistake, not retrim's stack trace.
 

@@ -19,7 +19,7 @@ from .registry import Registry
 
 @dataclass(frozen=True)
 class ResidualRequest:
-    """Inputs from which a residual model is built."""
+    """The inputs from which a residual model is built."""
 
     preset: Preset
     vehicle: Vehicle
@@ -43,7 +43,7 @@ def make_residual(request: ResidualRequest) -> ResidualModel:
     return model
 
 
-SMALL = (32, 32)  # widths of an ensemble that learns only the error of a closed form, and runs in every burst
+SMALL = (32, 32)  # widths of an ensemble that learns only the error of a closed form and runs in every burst
 
 
 def _ensemble(request: ResidualRequest, hidden: tuple[int, ...] = (128, 128)) -> EnsembleModel:

@@ -1,4 +1,4 @@
-"""Scenario of a flight: plant, vehicle, sensors and disturbances."""
+"""The scenario of a flight: plant, vehicle, sensors and disturbances."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -19,7 +19,7 @@ THRUST_ERROR = 0.035  # default relative thrust error of the plants
 
 @dataclass(frozen=True)
 class Scenario:
-    """Plant, vehicle, sensors and disturbance of a flight, by name; validated on construction."""
+    """The plant, vehicle, sensors and disturbance of a flight, by name; validated on construction."""
 
     disturbance: str = "none"
     """Name, name with a size, or a sum such as ``wind=6+payload``."""
@@ -28,17 +28,17 @@ class Scenario:
     """Vehicle of the flight; by default the policy's training vehicle, or the plant's built-in vehicle."""
     sensors: str = "ideal"
     thrust_error: float = THRUST_ERROR
-    """Relative thrust error; 0.1 means 10 % more thrust than commanded. Only retrim's simulations support it."""
+    """Relative thrust error; 0.1 means 10 % more than commanded. Only retrim's simulations support this error."""
     reference: str | None = None
     """Reference of a tracking policy; by default the training reference."""
     delay: float = DELAY
-    """Command delay of the plant [s], unknown to the policy. Only retrim's simulations support it."""
+    """Command delay of the plant [s], which the policy does not receive. Only retrim's simulations support a delay."""
     fault: str = NO_FAULT
     """Measurement fault: a name, or a name with a size such as ``velocity-spikes=3``. Only retrim's simulations support
-    it."""
+    faults."""
 
     def __post_init__(self) -> None:
-        """Raise :class:`ConfigError` for an unknown name, and for an option that the plant does not support."""
+        """Raise :class:`ConfigError` for an unknown name or an option that the plant does not support."""
         entry = self.entry
         SENSORS.find(self.sensors)
         disturbance(self.disturbance)
@@ -97,7 +97,7 @@ class Scenario:
         )
 
     def without_numbers(self) -> tuple["Scenario", tuple[str, ...]]:
-        """Return the scenario without the numbers that do not change the program: vehicle, delay and thrust error.
+        """Return the scenario without the numbers that leave the program unchanged: vehicle, delay and thrust error.
 
         Returns:
             The scenario without these numbers, and the names of the values that the vehicle file states.
@@ -110,14 +110,14 @@ class Scenario:
         return replace(self, vehicle=vehicle, delay=DELAY, thrust_error=THRUST_ERROR), stated
 
     def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
-        """Return the name of the vehicle in the flight of a policy that was trained for ``trained_for``."""
+        """Return the name of the vehicle that a policy trained for ``trained_for`` flies."""
         return self.entry.own_vehicle or name_of(self.vehicle or trained_for)
 
     def make_vehicle(self, trained_for: str | VehicleSpec) -> Vehicle:
-        """Build the vehicle for the flight of a policy that was trained for ``trained_for``.
+        """Build the vehicle that a policy trained for ``trained_for`` flies.
 
-        A plant with a built-in vehicle does not report its limits. For such a plant, the result is the training
-        vehicle, whose limits the policy respects.
+        A plant with a built-in vehicle does not report the vehicle's limits. For such a plant, the result is the
+        training vehicle, whose limits the policy respects.
         """
         return make_vehicle(self.vehicle or trained_for)
 

@@ -1,4 +1,4 @@
-"""Objects built from the values of a preset."""
+"""Build all objects that a preset describes."""
 
 import dataclasses
 import math
@@ -52,7 +52,7 @@ from .tasks import TaskRequest, find_task, make_task
 from .vehicles import make_vehicle
 
 Latency = Literal["fixed", "measured"]
-"""Flight time that learning takes: fixed values from the preset, or the measured computing time."""
+"""Flight time that learning takes: a fixed value from the preset, or the measured computing time."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Setup:
     flight_task: AbstractTask
     """Task of the flight: the training task, with the reference of the flight."""
     learner: OnlineLearner
-    """In-flight learner; it re-trains on ``flight_task``."""
+    """In-flight learner, which re-trains the policy on ``flight_task``."""
     optimiser: optax.GradientTransformation
     """Pretraining optimiser: gradient clipping, then Adam with a cosine schedule."""
 
@@ -84,7 +84,7 @@ class Setup:
         Args:
             preset: Preset of the experiment, or its name.
             reference: Reference of a tracking flight, by name or as an object; by default the training reference.
-            residual_model: Residual model of the learner; by default the model that the preset names.
+            residual_model: Residual model of the learner; by default, the model that the preset names.
 
         Raises:
             ConfigError: A name does not exist, the task does not track a reference, or values are inconsistent.
@@ -133,7 +133,7 @@ class Setup:
         """Return the same set-up with a different reference for the flight and its learner.
 
         Args:
-            reference: New reference. Programs are compiled again if its array sizes differ from the current ones.
+            reference: New reference. Programs are compiled again if its array sizes differ from those of the old one.
         """
 
         def other(part: Any) -> Any:
@@ -159,10 +159,10 @@ class Setup:
         """Train a policy from scratch.
 
         Args:
-            seed: Seed of the weights and of the starts.
+            seed: Seed of the weights and the starts.
 
         Yields:
-            The policy after every few steps, and the losses of those steps. If the preset has encoder steps, the
+            The policy after every few steps and the losses of those steps. If the preset has encoder steps, the
             encoder is trained before the first value is yielded.
         """
         k_init, k_train = random.split(random.key(seed))
@@ -201,15 +201,15 @@ class Setup:
         """Return a pilot for ``policy``.
 
         Args:
-            policy: Policy of this preset, or the network of a method that has its own.
+            policy: Policy of this preset, or the network of a method that uses its own network.
             method: Registered name of a method. ``base`` flies the policy unchanged; ``full`` and ``lora`` re-train it
                 in flight.
-            key: Random key of the learners; consumed. Methods that do not learn do not need it.
+            key: Random key of the learners; consumed. Methods that do not learn need no key.
             latency: Flight time that learning takes.
             state: Learner state of an earlier flight, from which to continue.
 
         Raises:
-            ConfigError: There is no such method, or it does not suit the task.
+            ConfigError: There is no such method, or the method does not suit the task.
             ValueError: The method needs a key.
         """
         from .methods import MethodRequest, find_method  # imported here, because this module is imported there
@@ -220,7 +220,7 @@ class Setup:
         return pilot
 
     def controller(self, state: LearnerState) -> AbstractController[Any]:
-        """Return the controller of an adapting policy, with its observation and in the frame of the preset.
+        """Return the controller of an adapting policy, with the policy's observation and in the preset's frame.
 
         In the frame of effective gravity, a monitor reverts learned parameters that make the flight worse.
         """
@@ -242,7 +242,7 @@ class Setup:
         """
         try:
             return low_rank(policy, key)
-        except ValueError as error:  # the message of a traced function has several lines
+        except ValueError as error:  # an error message from a traced function has several lines
             raise ConfigError(f"preset {self.preset.name!r}: {str(error).splitlines()[0]}") from error
 
     def adaptive_pilot(
@@ -263,14 +263,14 @@ class Setup:
         return AdaptivePilot(self.controller, state, learners, dt=dt, window=a.window)
 
     def flight_starts(self, n: int, seed: int = 0) -> list[State]:
-        """Return ``n`` starts: +- 1 m per axis from the task's home, 18 degrees about each axis, and 0.1 m/s.
+        """Return ``n`` starts within ±1 m of home and ±18 degrees per axis, with velocities of about 0.1 m/s per axis.
 
-        They depend only on the seed and the home, so that all presets of a task use the same starts.
+        The starts depend only on the seed and the home, so all presets of a task use the same starts.
         """
         return flight_starts(self.flight_task.home(), n, seed)
 
     def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
-        """Describe the limits of a vehicle that the flight's reference exceeds; return None if it exceeds none.
+        """Describe the limits of a vehicle that the flight's reference exceeds; return None if there are none.
 
         Args:
             vehicle: Vehicle of the flight; by default the training vehicle.

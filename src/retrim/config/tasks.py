@@ -31,7 +31,7 @@ from .presets import Track as TrackTable
 from .presets import Vision as VisionTable
 from .registry import Registry
 
-LEAD = 0.04  # [s]: approximate time until commands act, from delay and motor lag
+LEAD = 0.04  # [s]: approximate time until a command acts: delay plus motor lag
 HOVER_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "stiff": StiffHover}
 VISION_REWARDS: dict[str, type[AbstractHover]] = {"paper": Hover, "l2": L2Hover, "view": ViewHover}
 TRACK_OBSERVATIONS: dict[str, Callable[["TaskRequest", Reference], AbstractObservation[Any]]] = {
@@ -46,7 +46,7 @@ TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "s
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """Inputs from which a task is built."""
+    """The inputs from which a task is built."""
 
     preset: Preset
     vehicle: Vehicle
@@ -59,11 +59,11 @@ class TaskRequest:
         return self.preset.options
 
     def state_observation(self) -> StateObs:
-        """Return the paper's observation, o = [p, R, v], and as many past commands as the preset has."""
+        """Return the paper's observation, o = [p, R, v], with as many past commands as the preset specifies."""
         return StateObs(jnp.array(self.preset.goal), *self.observed_commands())
 
     def of_vehicle(self, observation: AbstractObservation[Any]) -> AbstractObservation[Any]:
-        """Return an observation that also includes the vehicle, if the preset is for a family of vehicles."""
+        """Return an observation that also includes the vehicle if the preset is for a family of vehicles."""
         if self.preset.family is None:
             return observation
         return VehicleObs.of(observation, self.vehicle.omega_max, PathBelief.unknown())
@@ -72,9 +72,9 @@ class TaskRequest:
         """Return a hover task with the settings of the preset.
 
         Args:
-            reward: Function of goal [m], state and command; by default the reward of the preset.
-            goal: Function of time [s] that returns the position of a moving goal, world [m]; by default the goal of the
-                preset.
+            reward: Function of the goal [m], the state and the command; by default, the reward of the preset.
+            goal: Function that takes a time [s] and returns the position of a moving goal, world [m]; by default, the
+                goal of the preset.
 
         Example::
 
@@ -98,7 +98,7 @@ class TaskRequest:
         return hover if goal is None else MovingGoal(hover, goal)
 
     def observed_commands(self) -> tuple[Float[Array, "3"], int]:
-        """Return the scale of the observed body rates [rad/s], and the number of observed past commands."""
+        """Return the scale of the observed body rates [rad/s] and the number of observed past commands."""
         return self.vehicle.omega_max, self.preset.command_history
 
 
@@ -118,7 +118,7 @@ register_task = TASKS.register
 
 
 def find_task(name: str) -> TaskEntry:
-    """Return the entry of a task by name; ``module:name`` may be a function of a :class:`TaskRequest`.
+    """Return the entry of a task by name; ``module:name`` may be a function that takes a :class:`TaskRequest`.
 
     Raises:
         ConfigError: The task does not exist, or ``module:name`` is neither an entry nor a function.

@@ -1,4 +1,4 @@
-"""The trust boundary: Python names in files and messages.
+"""Check Python names in files and messages at the trust boundary.
 
 Registered names are always allowed. ``module:name`` imports a module and calls one of its objects. Such a name is
 accepted on the command line and in Python. In a file or a message it is rejected, unless the user also passes it as
@@ -16,13 +16,13 @@ from typing import Any
 from ..errors import ConfigError, excerpt
 
 CSV_FILE = re.compile(r"[^:]*\.csv(:(laps|once))?", re.IGNORECASE)
-"""Name of a trajectory file. A colon in it does not mark a Python name, but a choice between laps and one pass."""
+"""Name of a trajectory file. Its colon precedes a choice between laps and one pass, not a Python name."""
 FREE = "options"
-"""Table of a custom task; this package does not look up names in it."""
+"""Table of a custom task, in which this package does not look up names."""
 
 
 def python_names(values: Any) -> tuple[str, ...]:
-    """Return the Python names that would be imported to build ``values``.
+    """Return the Python names that building ``values`` would import.
 
     Args:
         values: A preset, a scenario, a name, or tables and lists of them.
@@ -36,7 +36,7 @@ def check_trust(values: Any, trust: Collection[str], *, source: str) -> None:
     Args:
         values: Content of the file or message, before anything is built from it.
         trust: Names that the user trusts, e.g. ``mine:task``.
-        source: Source of the values; the error message begins with it.
+        source: Source of the values, with which the error message begins.
 
     Raises:
         ConfigError: The values contain a name that the user does not trust.

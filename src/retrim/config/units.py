@@ -1,4 +1,4 @@
-"""Unit checks: a number in a wrong unit is rejected, and the message suggests the probable unit."""
+"""Reject numbers in a wrong unit, with messages that suggest the probable unit."""
 
 from collections.abc import Callable, Iterable
 from typing import Annotated
@@ -10,12 +10,12 @@ Three = tuple[Positive, Positive, Positive]
 
 
 def at_most(largest: float, unit: str, *others: tuple[str, float]) -> Callable[[float], float]:
-    """Return a validator that rejects larger numbers, and suggests a different unit if the number fits it.
+    """Return a validator that rejects larger numbers, and suggests a different unit if the number is plausible in it.
 
     Args:
         largest: Largest accepted value.
         unit: Unit of the value.
-        others: Units that are easily confused with it, in order of preference: the name and the size in ``unit``.
+        others: Units that are easily confused with ``unit``, in order of preference: name, and size in ``unit``.
     """
 
     def validate(value: float) -> float:

@@ -1,4 +1,4 @@
-"""Read TOML files, and validate tables against dataclasses; error messages have one line."""
+"""Read TOML files and validate tables against dataclasses, with one-line error messages."""
 
 import dataclasses
 import difflib
@@ -15,7 +15,7 @@ from ..errors import ConfigError, excerpt
 T = TypeVar("T")
 
 CHECKED, TOLD = 100, 8
-"""Largest numbers of mistakes per file that are examined and that are listed."""
+"""Largest number of mistakes per file that are examined, and largest number that are listed."""
 UNKNOWN = "unknown key"
 NO_NAME = "Input should be a valid string"
 MAX_TOML_BYTES = 1_000_000
@@ -25,7 +25,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file.
 
     Raises:
-        ConfigError: The path is not a regular file, or the file is too large, cannot be read, or is not TOML.
+        ConfigError: The path is not a regular file, or the file is too large, unreadable or not valid TOML.
     """
     try:
         if not path.is_file():
@@ -45,7 +45,7 @@ def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: st
     Args:
         kind: Dataclass to build.
         tables: Values, as dictionaries or as JSON.
-        source: Source of the values; error messages begin with it.
+        source: Source of the values, with which error messages begin.
 
     Raises:
         ConfigError: A value is missing, unknown or impossible. The message lists the mistakes with their paths.
@@ -58,13 +58,13 @@ def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: st
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return a text with the closest known name and all known names."""
+    """Return a text that suggests the closest known name and lists all known names."""
     near = difflib.get_close_matches(name[:100], known := list(known), n=1)
     return (f"did you mean {near[0]!r}? " if near else "") + f"there are {', '.join(known)}"
 
 
 def _explained(kind: type[Any], error: ValidationError) -> str:
-    """Return the first mistakes, each with its path and, for an unknown key, the valid keys."""
+    """Return a text with the first mistakes: the path of each and, for an unknown key, the valid keys."""
     result, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False, include_input=False)
     for each in mistakes[:CHECKED]:
         path = [excerpt(str(part), quotes=False) for part in each["loc"] if not str(part).startswith("function-")]
@@ -74,7 +74,7 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
             message = f"{UNKNOWN}; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
-        if result.get(where) in (None, NO_NAME):  # a table or a name is valid here: prefer the mistake in the table
+        if result.get(where) in (None, NO_NAME):  # a table and a name are valid here: prefer the mistake in the table
             result[where] = message
     ordered = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys
     told = [f"{where}: {message}" if where else message for where, message in ordered][:TOLD]
@@ -83,7 +83,7 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
 
 
 def _keys(kind: type[Any], path: Sequence[str]) -> list[str]:
-    """Return the keys of the table at a path. Parts that are not keys, such as members of a union, are skipped."""
+    """Return the keys of the table at a path. Parts that are not keys, such as union members, are skipped."""
     for part in path:
         annotation = typing.get_type_hints(kind).get(part)
         nested = [each for each in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(each)]

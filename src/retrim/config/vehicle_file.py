@@ -1,4 +1,4 @@
-"""Vehicles from TOML files with values that can be measured or looked up; fixed rules give all other values."""
+"""Build vehicles from TOML files of values that can be measured or looked up; fixed rules give all other values."""
 
 import dataclasses
 import math
@@ -41,29 +41,29 @@ class VehicleSpec:
     inertia: Three
     """Diagonal of the inertia tensor, body frame [kg m^2]."""
     arm: tuple[Positive, Positive]
-    """Distance of the rotors from the centre along body x and y [m]."""
+    """Distances of the rotors from the centre along body x and y [m]."""
     thrust_max: Positive
     """Static thrust of all four rotors together [N]."""
     rates_max: tuple[Rate, Rate, Rate]
-    """Largest body rates that the rate controller accepts [rad/s]."""
+    """Largest body rates that the rate controller accepts: roll, pitch, yaw [rad/s]."""
     motor_tau: Annotated[float, Field(gt=0, strict=True), AfterValidator(at_most(0.5, "s", *MILLI))]
     """Time constant of the motors [s]."""
     rate_lag: tuple[Lag, Lag, Lag] | None = None
-    """Time constants with which the body rates follow commands: roll, pitch, yaw [s]; by default those of the simulated
-    rate loop, which depend on the motors. Policies are trained for them, and for a thrust with the time constant of
-    the motors."""
+    """Time constants with which the body rates follow commands: roll, pitch, yaw [s]; by default, those of the
+    simulated rate loop, which depend on the motors. Policies are trained for these time constants, and for a thrust
+    with the time constant of the motors."""
     rate_damping: tuple[Damping, Damping, Damping] | None = None
-    """Damping ratios of the rate loops: roll, pitch, yaw; by default the loops are of first order. With damping ratios,
+    """Damping ratios of the rate loops: roll, pitch, yaw; by default, the loops are first-order. With damping ratios,
     ``rate_lag`` is 2 zeta / omega_n."""
     command_delay: Annotated[float, Field(ge=0, strict=True), AfterValidator(at_most(0.2, "s", *MILLI))] | None = None
-    """Time between a command and its effect [s]; by default that of the preset. Policies are trained for it, in whole
-    ticks. Learners use it to pair accelerations with the commands that caused them."""
+    """Time between a command and its effect [s]; by default, that of the preset. Policies are trained for this delay,
+    in whole ticks. Learners use the delay to pair accelerations with the commands that caused them."""
     propeller: Literal["3 inch", "5 inch"] | None = None
-    """Blade geometry that is scaled to the vehicle; by default the one with the closer diameter."""
+    """Blade geometry that is scaled to the vehicle; by default, the one whose diameter is closer."""
     propeller_diameter: Positive | None = None
     """Propeller diameter [inch]: 0.3 to 1.3 times the distance between adjacent rotors; by default 0.9 times."""
     drag_area: Three | None = None
-    """Drag area c A of the body along its axes [m^2]; by default that of the kingfisher, scaled by the squared arm."""
+    """Drag area c A of the body along its axes [m^2]; by default, that of the kingfisher, scaled by the squared arm."""
 
     @model_validator(mode="after")
     def _possible(self) -> "VehicleSpec":
@@ -175,7 +175,7 @@ class VehicleSpec:
 
 
 def check_flyable(vehicle: Vehicle) -> None:
-    """Raise an error if a simulated rate loop cannot fly the vehicle.
+    """Raise an error if the simulated rate loop cannot control the vehicle.
 
     Raises:
         ValueError: A step response of the rates overshoots too much or rises too slowly; the message states its values.
@@ -194,7 +194,7 @@ def read_vehicle(path: Path) -> VehicleSpec:
     """Read a vehicle file.
 
     Raises:
-        ConfigError: The file cannot be read, a value is missing, unknown or impossible, or the rate loop cannot fly
+        ConfigError: The file cannot be read, a value is missing, unknown or impossible, or the rate loop cannot control
             the vehicle.
     """
     tables = read_toml(path)

@@ -1,4 +1,4 @@
-"""Registry of vehicles, and vehicles from files."""
+"""Registry of vehicles, and functions that read vehicles from files."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,15 +19,15 @@ register_vehicle = VEHICLES.register
 
 
 def is_published(vehicle: str | VehicleSpec) -> bool:
-    """Return whether a vehicle is a published one, whose rate loop others have used in flight."""
+    """Return whether a vehicle is a published one, whose rate loop has been used in flight by others."""
     return isinstance(vehicle, str) and vehicle in PUBLISHED
 
 
 def vehicle_from(name: str | VehicleSpec) -> str | VehicleSpec:
-    """Return the form of a vehicle that presets and scenarios store: a valid name, or the content of its file.
+    """Return a vehicle in the form that presets and scenarios store: a valid name, or the content of its file.
 
     Raises:
-        ConfigError: There is no such vehicle, or its file cannot be used.
+        ConfigError: There is no such vehicle, or the vehicle file cannot be used.
     """
     if isinstance(name, VehicleSpec):
         return name
@@ -41,7 +41,7 @@ def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
     """Build a vehicle; a :class:`Vehicle` is returned unchanged.
 
     Raises:
-        ConfigError: The vehicle does not exist, is physically impossible, or cannot be controlled by a rate loop.
+        ConfigError: The vehicle does not exist, is physically impossible, or cannot be controlled by the rate loop.
     """
     if isinstance(vehicle, Vehicle):
         return vehicle

@@ -25,7 +25,7 @@ class TrackingState(eqx.Module):
 class ActuatorTracking(AbstractController[TrackingState]):
     """Provides the inner controller with the present thrust and body rates.
 
-    The command path predicts them. A gyroscope, or the measured attitudes, corrects the body rates.
+    The command path predicts thrust and body rates. A gyroscope, or the measured attitudes, corrects the body rates.
     """
 
     inner: AbstractController[Any]
@@ -39,7 +39,7 @@ class ActuatorTracking(AbstractController[TrackingState]):
     """Age of measurements [s]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "ActuatorTracking":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "ActuatorTracking":

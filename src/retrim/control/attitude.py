@@ -13,7 +13,7 @@ STEEPEST = 4.0  # tangent of the largest desired tilt, 76 degrees
 
 
 def flyable(thrust: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return a thrust to which a quadrotor can turn: upward, and tilted by at most 76 degrees.
+    """Limit a thrust to directions to which a quadrotor can turn: upward, and tilted by at most 76 degrees.
 
     Args:
         thrust: Desired mass-normalised thrust, world [m/s^2].
@@ -32,12 +32,12 @@ def attitude_of(thrust: Float[Array, "3"], heading: Float[Array, ""]) -> Float[A
 
 
 def thrust_of(acceleration: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return the mass-normalised thrust for an acceleration, world [m/s^2]."""
+    """Return the mass-normalised thrust for an acceleration, in the world frame [m/s^2]."""
     return acceleration + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=acceleration.dtype)
 
 
 def command_for(x: State, thrust: Float[Array, "3"], wanted: Point, gain: Float[Array, "3"]) -> Command:
-    """Return the command that turns a vehicle to a thrust; its collective thrust is the part along the present z axis.
+    """Return the command that turns a vehicle towards a thrust; the collective thrust is its part along the z axis.
 
     Args:
         x: State in which the command begins to act.

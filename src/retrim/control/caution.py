@@ -1,8 +1,8 @@
-"""Detect a vehicle that oscillates by itself, and assume that it is slower until it is calm.
+"""Detect a vehicle that oscillates by itself, and assume a slower vehicle until the oscillation stops.
 
 A policy that assumes a faster vehicle than the actual one turns back too late and drives the vehicle back and forth.
-The estimate of the vehicle cannot show this, since it may be the cause. The attitude can: the tilt swings by many times
-the amount that a push, a gust or a kick causes, and does not stop.
+The estimate of the vehicle cannot show the oscillation, since a wrong estimate may be the cause. The attitude can: the
+tilt swings by many times the amount that a push, a gust or a kick causes, and does not stop.
 """
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from .swings import Swings
 # otherwise, flights on 60 vehicles with a true belief reach 15. Self-induced oscillations stay between 45 and 145.
 LARGE, FULL = 30.0, 60.0
 RISE = 3.0  # [1/s], largest rate at which the level rises
-MEMORY = 6.0  # [s], time constant of its decay; lasting caution makes the flight inaccurate
+MEMORY = 6.0  # [s], time constant of the level's decay; lasting caution makes the flight inaccurate
 REPORTED = 0.1  # level from which the log reports the oscillation
 MORE = 0.5  # share by which the thrust gain may be larger than estimated
 SLOWER = (1.0, 1.0, 0.0, 0.0)  # coordinates that the level changes: delay and rate lag
@@ -32,7 +32,7 @@ class Caution(eqx.Module):
 
     @classmethod
     def none(cls, x: State) -> "Caution":
-        """Return the memory at the start of a flight in the state ``x``."""
+        """Return the memory for a flight that starts in the state ``x``."""
         return cls(Swings.none(_tilt(x)), jnp.zeros_like(x.p[0]))
 
     def after(self, x: State, dt: float) -> "Caution":
@@ -48,15 +48,16 @@ class Caution(eqx.Module):
         return Caution(swings, jnp.minimum(level, 1.0).astype(self.level.dtype))
 
     def applied(self, belief: PathBelief) -> PathBelief:
-        """Return a belief about a vehicle that is slower by the level of caution."""
+        """Return the belief with delay and rate lag moved towards the slowest vehicle by the level of caution."""
         share = self.level * jnp.array(SLOWER)
         low, high = (end + share * (1.0 - end) for end in belief.ends)
         return PathBelief.between(low, high)
 
     def gain(self, gain: Float[Array, ""]) -> Float[Array, ""]:
-        """Return a thrust gain that is larger by the level of caution, so that the commands are smaller.
+        """Return a thrust gain that grows with the level of caution, which makes the commands smaller.
 
-        Too small a gain makes all loops stiffer; too large a gain costs a few centimetres, which the observer removes.
+        Too small a gain makes all loops stiffer. Too large a gain causes an error of a few centimetres, which the
+        observer removes.
 
         Args:
             gain: Estimated thrust gain.
@@ -65,5 +66,5 @@ class Caution(eqx.Module):
 
 
 def _tilt(x: State) -> Float[Array, "3"]:
-    """Return the acceleration from hover thrust at this attitude, world [m/s^2]."""
+    """Return the acceleration from hover thrust at this attitude, in the world frame [m/s^2]."""
     return STANDARD_GRAVITY * x.R[:, 2]

@@ -1,4 +1,4 @@
-"""Condition of a controller that can step back from some of its functions, and its description in words."""
+"""The condition of a controller that can step back from some of its functions, with a description in words."""
 
 from enum import IntEnum
 

@@ -1,4 +1,4 @@
-"""Controllers: functions from time and state to a command, with a memory of fixed shape."""
+"""Controllers, which map time and state to a command and keep a memory of fixed shape."""
 
 import abc
 import dataclasses
@@ -26,7 +26,7 @@ class AbstractController(eqx.Module, Generic[M]):
 
     @abc.abstractmethod
     def init(self, x: State) -> M:
-        """Return the memory at the start of a flight in the state ``x``; JAX traces this method and calls."""
+        """Return the memory for a flight that starts in the state ``x``; JAX traces this method and ``__call__``."""
 
     @abc.abstractmethod
     def __call__(self, memory: M, t: Float[Array, ""], x: State) -> tuple[Command, M]:
@@ -47,22 +47,22 @@ class AbstractController(eqx.Module, Generic[M]):
         return memory
 
     def with_age(self, age: float | Float[Array, ""]) -> "AbstractController[M]":
-        """Return the same controller for measurements that are ``age`` old [s]; by default the age is ignored."""
+        """Return the same controller for measurements that are ``age`` seconds old; by default, the age is ignored."""
         del age
         return self
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "AbstractController[M]":
-        """Return the same controller for a tick with inertial measurements; by default they are ignored.
+        """Return the same controller for a tick with inertial measurements; by default, these are ignored.
 
         Args:
             omega: Body rates [rad/s].
-            a: Acceleration, the mean over the last tick, world [m/s^2].
+            a: Mean acceleration over the last tick, world [m/s^2].
         """
         del omega, a
         return self
 
     def with_vehicle(self, member: Member) -> "AbstractController[M]":
-        """Return the same controller for an identified vehicle; by default it is ignored.
+        """Return the same controller for an identified vehicle; by default, the vehicle is ignored.
 
         Args:
             member: Most likely command path of the vehicle, and the belief about it.
@@ -71,7 +71,7 @@ class AbstractController(eqx.Module, Generic[M]):
         return self
 
     def with_actuators(self, actuators: ActuatorState) -> "AbstractController[M]":
-        """Return the same controller for a tick in which thrust and rates are known; by default they are ignored.
+        """Return the same controller for a tick in which thrust and rates are known; by default, these are ignored.
 
         Args:
             actuators: Present thrust and body rates.
@@ -90,7 +90,7 @@ class AbstractController(eqx.Module, Generic[M]):
         return False
 
     def follow(self, estimate: VehicleEstimate) -> "AbstractController[Any]":
-        """Return the controller for a vehicle that another process identifies; by default the estimate is ignored.
+        """Return the controller for a vehicle that another process identifies; by default, the estimate is ignored.
 
         Args:
             estimate: Present estimate of the vehicle.

@@ -1,7 +1,7 @@
-"""Active exploration: small doublets of thrust and body rates while the command path is not known well enough.
+"""Excite the vehicle with small doublets of thrust and body rates until the command path is known well enough.
 
-Each pulse train is (+, -, -, +), so that it leaves neither a velocity nor a displacement. The vehicle moves by a few
-centimetres. By default, a policy does not excite the vehicle; the caller adds the result to the command.
+Each pulse train has the signs (+, -, -, +), so it leaves neither a velocity nor a displacement. The vehicle moves by a
+few centimetres. By default, a policy does not excite the vehicle; the caller adds the excitation to the command.
 """
 
 import equinox as eqx
@@ -18,17 +18,17 @@ class Excitation(eqx.Module):
     """Bounded additions to the command until the estimate is narrow."""
 
     thrust: Float[Array, ""]
-    """Amplitude of the thrust [m/s^2]."""
+    """Amplitude of the thrust pulses [m/s^2]."""
     rates: Float[Array, "3"]
-    """Amplitudes of the body rates [rad/s]."""
+    """Amplitudes of the body-rate pulses [rad/s]."""
     pulse: Float[Array, "4"]
     """Pulse lengths of thrust, roll, pitch and yaw [s]."""
     delay_margin: Float[Array, ""]
     """Sufficient half width of the 90 % interval of the delay [s]."""
     lag_margin: Float[Array, ""]
-    """The same for the rate lag, as a share of the lag."""
+    """Sufficient half width of the 90 % interval of the rate lag, as a share of the lag."""
     gain_margin: Float[Array, ""]
-    """The same for the thrust gain, as a share of the gain."""
+    """Sufficient half width of the 90 % interval of the thrust gain, as a share of the gain."""
     longest: Float[Array, ""]
     """Time after which the excitation ends in any case [s]."""
 
@@ -46,11 +46,11 @@ class Excitation(eqx.Module):
         """Return the excitation; a thrust of 2 m/s^2 moves the vehicle by 3 cm.
 
         Args:
-            thrust: Amplitude of the thrust [m/s^2].
-            rates: Amplitudes of the body rates [rad/s].
+            thrust: Amplitude of the thrust pulses [m/s^2].
+            rates: Amplitudes of the body-rate pulses [rad/s].
             delay_margin: Sufficient half width of the 90 % interval of the delay [s].
-            lag_margin: The same for the rate lag, as a share of the lag.
-            gain_margin: The same for the thrust gain, as a share of the gain.
+            lag_margin: Sufficient half width of the 90 % interval of the rate lag, as a share of the lag.
+            gain_margin: Sufficient half width of the 90 % interval of the thrust gain, as a share of the gain.
             longest: Time after which the excitation ends in any case [s].
 
         Raises:
@@ -68,7 +68,7 @@ class Excitation(eqx.Module):
         return cls(jnp.array(thrust), jnp.array(rates), pulse, *margins, jnp.array(longest))
 
     def __call__(self, t: Float[Array, ""], estimate: PathEstimate) -> Command:
-        """Return the addition to the command, which is zero where the estimate is narrow enough.
+        """Return the addition to the command; it is zero where the estimate is narrow enough.
 
         Args:
             t: Time since the start of the flight [s].
@@ -84,7 +84,7 @@ class Excitation(eqx.Module):
         return Command(self.thrust * signs[0], self.rates * signs[1:])
 
     def wide(self, estimate: PathEstimate) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Return whether the estimates of thrust and of rates are wider than the margins."""
+        """Return whether the thrust estimate and the rate estimate are wider than their margins."""
         gain, lag, delay = estimate.thrust_gain, estimate.rate_lag, estimate.delay
         thrust = 0.5 * (gain.high - gain.low) > self.gain_margin * gain.mean
         rates = 0.5 * (lag.high - lag.low) > self.lag_margin * lag.mean

@@ -1,4 +1,4 @@
-"""A controller that tolerates measurements that are not finite."""
+"""A controller that tolerates non-finite measurements."""
 
 from typing import Any, Generic, TypeVar
 
@@ -15,7 +15,7 @@ from .controller import AbstractController
 from .vehicle_report import VehicleReport
 
 LARGEST = float(2**20)
-"""Limit of valid measurements, in SI units; networks overflow only far beyond it."""
+"""Limit of valid measurements, in SI units; networks overflow only far beyond this limit."""
 
 M = TypeVar("M")
 
@@ -32,7 +32,7 @@ class FiniteMemory(eqx.Module, Generic[M]):
 
 
 class FiniteController(AbstractController[FiniteMemory[Any]]):
-    """Repeats the last command and keeps its memory while the measurement or the command is not finite.
+    """Repeats the last command and leaves its memory unchanged while the measurement or the command is not finite.
 
     Exported policies behave in the same way, tick by tick.
     """
@@ -59,7 +59,7 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
         return FiniteMemory(self.base.accepted(memory.inner, u), u, memory.is_finite)
 
     def with_age(self, age: float | Float[Array, ""]) -> "FiniteController":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return FiniteController(self.base.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "FiniteController":
@@ -84,5 +84,5 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
 
 
 def _all_below(tree: State | Command) -> Bool[Array, ""]:
-    """Return whether all numbers are below the limit; NaN is not."""
+    """Return whether all numbers are below the limit; return false for NaN."""
     return jnp.all(jnp.stack([jnp.all(jnp.abs(leaf) < LARGEST) for leaf in jax.tree.leaves(tree)]))

@@ -24,10 +24,10 @@ class Gains(eqx.Module):
     attitude: Float[Array, ""]
     """Gain of the attitude error [1/s]."""
     integral: Float[Array, ""]
-    """Gain of the integral of the position error [1/s^3]; zero for no integral action."""
+    """Gain of the integral of the position error [1/s^3]; zero disables integral action."""
 
     def acceleration(self, x: State, wanted: Point, integral: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return the acceleration that brings a vehicle to its reference, world [m/s^2].
+        """Return the acceleration that brings a vehicle to its reference, in the world frame [m/s^2].
 
         Args:
             x: State.
@@ -65,7 +65,7 @@ class GeometricController(AbstractController[GeometricState]):
     """Largest command that the vehicle accepts."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "GeometricController":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> GeometricState:
@@ -73,7 +73,7 @@ class GeometricController(AbstractController[GeometricState]):
         return GeometricState(self.prediction.init(x), jnp.zeros_like(x.p))
 
     def __call__(self, memory: GeometricState, t: Float[Array, ""], x: State) -> tuple[Command, GeometricState]:
-        """Compute the command for the state in which it begins to act."""
+        """Compute the command for the state in which the command begins to act."""
         gain, dt = self.gains.integral, self.prediction.dt
         x, _ = self.prediction(memory.underway, x, gain * -memory.integral)
         wanted = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))

@@ -1,7 +1,7 @@
 """Fly an unchanged controller in the frame of the effective gravity.
 
 A constant disturbance tilts and scales gravity (:mod:`retrim.physics.effective_gravity`). In the frame of this
-effective gravity the vehicle is undisturbed, so a controller performs its task under a constant push without further
+effective gravity, the vehicle is undisturbed, so a controller performs its task under a constant push without further
 inputs or training. A disturbance that changes with state and command is treated as if its present value were constant.
 """
 
@@ -44,30 +44,30 @@ class GravityFrame(AbstractController[GravityFrameState]):
     observer: DisturbanceObserver
     """Observer that estimates the unknown part of the disturbance."""
     known: Residual | None = None
-    """Learned residual, world frame [m/s^2]. The deviation from its value at rest is used directly, since an estimate
-    of it would be late."""
+    """Learned residual in the world frame [m/s^2]. The deviation from its value at rest is used directly, since an
+    estimate of this deviation would be late."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]; the inner controller receives the state extrapolated to the current time."""
     rate_bias: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
-    """Actual minus commanded body rates [rad/s]; it is subtracted from the command."""
+    """Actual minus commanded body rates [rad/s]; this difference is subtracted from the command."""
     trust_estimate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
-    """Share of the disturbance that turns the frame; with 0 the inner controller flies without compensation."""
+    """Share of the disturbance that turns the frame; with 0, the inner controller flies without compensation."""
     trust_known: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
     """Share of the learned residual and of the learned rate bias that is used."""
     actuators: ActuatorState | None = None
     """Present thrust and body rates; None if the last command acts."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
-    """Disturbance that turns the frame in addition to the estimated one, world [m/s^2]."""
+    """Disturbance that turns the frame in addition to the estimated one, in the world frame [m/s^2]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "GravityFrame":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, age=jnp.array(age))
 
     def with_vehicle(self, member: Member) -> "GravityFrame":
         """Return the same controller for an identified vehicle.
 
-        The observer uses the vehicle's delay and thrust lag. It is as fast as the vehicle permits, since the frame must
-        not turn much faster than the vehicle can follow.
+        The observer uses the vehicle's delay and thrust lag. The observer is as fast as the vehicle permits, since the
+        frame must not turn much faster than the vehicle can follow.
         """
         observer = dataclasses.replace(self.observer, path=member.path)
         if member.lateness is not None:
@@ -121,7 +121,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
 class PoseFrame(AbstractController[tuple[OccludedMemory, Command]]):
     """A policy with :class:`OccludedKeypoints`, in the frame of the effective gravity that its pose filter estimates.
 
-    It does not need the measured state.
+    The policy does not need the measured state.
     """
 
     inner: PolicyController
@@ -155,20 +155,20 @@ class StateDependentResidual(eqx.Module):
     """Share of this part that is used."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return this part of the residual acceleration, world frame [m/s^2]."""
+        """Return this part of the residual acceleration in the world frame [m/s^2]."""
         rest = self.residual(x, u) - self.residual(State.at(x.p), Command.hover(x.p.dtype))
         return self.share.astype(x.p.dtype) * rest
 
 
 class NormLimited(eqx.Module):
-    """A residual with a limited norm, so that the frame of the effective gravity is defined."""
+    """A residual with a limited norm, which ensures that the frame of the effective gravity is defined."""
 
     residual: Residual
     limit: Float[Array, ""]
     """Largest norm [m/s^2]."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the residual acceleration, world frame [m/s^2]."""
+        """Return the residual acceleration in the world frame [m/s^2]."""
         return capped(self.residual(x, u), self.limit)
 
 

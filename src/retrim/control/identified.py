@@ -2,7 +2,7 @@
 
 The estimator of the command path (:mod:`retrim.estimation.command_path`) receives every measurement and command. Its
 90 % intervals become the belief of a policy that is trained for a family of vehicles, and the thrust gain scales the
-commands. This does not need training or compilation, since beliefs are inputs. Beliefs change slowly, so that an
+commands. A new belief needs neither training nor compilation, since beliefs are inputs. Beliefs change slowly, so an
 estimate, right or wrong, does not make the commands jump.
 """
 
@@ -32,7 +32,7 @@ class BeliefState(eqx.Module):
     """Memory of a flight with a belief, and of the inner controller."""
 
     belief: PathBelief
-    """Belief of the last command."""
+    """Belief that was used for the last command."""
     gain: Float[Array, ""]
     """Thrust gain that was used for the last command."""
     inner: Any
@@ -55,7 +55,7 @@ class BeliefFlight(AbstractController[BeliefState]):
     tilt swings even without such an oscillation."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "BeliefFlight":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, inner=self.inner.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "BeliefFlight":
@@ -63,7 +63,7 @@ class BeliefFlight(AbstractController[BeliefState]):
         return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a))
 
     def condition(self, memory: BeliefState) -> Condition | None:
-        """Return the condition of the inner controller, or by default that of the caution."""
+        """Return the condition of the inner controller; if it has none, return that of the caution."""
         inside = self.inner.condition(memory.inner)
         if inside is not None or not self.watches:
             return inside
@@ -119,7 +119,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
-    """Measured acceleration, world [m/s^2]; None if it is not measured."""
+    """Measured acceleration in the world frame [m/s^2]; None if it is not measured."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
     watches: bool = eqx.field(static=True, default=True)
@@ -128,7 +128,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     """Small command doublets until the estimate is narrow; None for no excitation."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "IdentifiedFlight":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IdentifiedFlight":

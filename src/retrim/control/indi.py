@@ -1,4 +1,4 @@
-"""Incremental nonlinear dynamic inversion: corrects the acting thrust by the error of the measured acceleration.
+"""Incremental nonlinear dynamic inversion (INDI), which corrects the acting thrust by the acceleration error.
 
 The measured acceleration contains every disturbance, so a disturbance model is not needed: the desired thrust is f +
 (a_wanted - a). The acting thrust f and the acceleration a pass through the same filter, so that they belong to the same
@@ -50,10 +50,10 @@ class IndiController(AbstractController[IncrementalState]):
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None to derive them from the commands."""
     a: Float[Array, "3"] | None = None
-    """Measured acceleration, the mean over the last tick, world [m/s^2]; None to derive it from the velocities."""
+    """Mean measured acceleration over the last tick, in the world frame [m/s^2]; None to derive it from velocities."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "IndiController":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IndiController":
@@ -65,7 +65,7 @@ class IndiController(AbstractController[IncrementalState]):
         return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p), jnp.full_like(x.p[0], -jnp.inf))
 
     def __call__(self, memory: IncrementalState, t: Float[Array, ""], x: State) -> tuple[Command, IncrementalState]:
-        """Compute the command for the state in which it begins to act."""
+        """Compute the command for the state in which the command begins to act."""
         dt, last = self.prediction.dt, memory.last
         acted, _ = self.prediction.acted(memory.underway)
         a = (x.v - last.v) / dt if self.a is None else self.a

@@ -1,4 +1,4 @@
-"""Integral action on the position of an unchanged policy: the baseline for learning in hover."""
+"""Add integral action on the position to an unchanged policy, as the baseline for learning in hover."""
 
 import dataclasses
 from typing import Any
@@ -45,7 +45,7 @@ class IntegralAction(AbstractController[IntegralState]):
         return u, IntegralState(integral, inner)
 
     def accepted(self, memory: IntegralState, u: Command) -> IntegralState:
-        """Pass the accepted command on."""
+        """Pass the accepted command to the inner controller."""
         return IntegralState(memory.integral, self.inner.accepted(memory.inner, u))
 
     def with_vehicle(self, member: Member) -> "IntegralAction":

@@ -1,6 +1,6 @@
 """Low-rank adaptation (Hu et al. 2022; paper, Sec. III-F): a frozen base, and two trained thin factors per layer.
 
-y = (W + scale * B A) x + b. B starts at zero, so that a fresh delta does not change the policy. A network of the
+y = (W + scale * B A) x + b. B starts at zero, so a fresh delta does not change the policy. A network of the
 paper's size has 12,864 numbers to train instead of 272,900.
 """
 
@@ -25,7 +25,7 @@ class LowRankFactors(eqx.Module):
 
 
 class LoraPolicy(eqx.Module):
-    """A frozen policy and a delta. It is trained like a :class:`Policy`; use :meth:`merged` in flight."""
+    """A frozen policy and a trained delta. Train it like a :class:`Policy`, and use :meth:`merged` in flight."""
 
     base: Policy
     delta: tuple[LowRankFactors, ...]
@@ -52,7 +52,7 @@ class LoraPolicy(eqx.Module):
             base: Policy to adapt.
             key: Random key, consumed.
             ranks: One rank per layer (by default those of the paper, for two hidden layers).
-            scale: Factor of B A.
+            scale: Factor of the product B A.
 
         Raises:
             ValueError: There is not one rank per layer, or a rank is not between 1 and the smaller side of its matrix.

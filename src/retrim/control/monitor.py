@@ -1,4 +1,4 @@
-"""The monitor of an adapted policy: it steps back if the adapted flight is worse than a flight without adaptation.
+"""Monitor an adapted policy, and step back if the adapted flight is worse than a flight without adaptation.
 
 An adapted flight has parts that can fail separately: the re-trained policy with the learned residual, and the
 disturbance observer. The monitor uses them in stages:
@@ -10,11 +10,11 @@ disturbance observer. The monitor uses them in stages:
 
 The monitor steps back after one of two tests. (1) A *twin*, a simulated vehicle, predicts the flight of the base
 policy, in the nominal model with the mean of the estimated disturbance. If the vehicle's error exceeds that of the twin
-in three consecutive intervals, or by a large amount in one, the flight steps back by one stage. It returns after a
-waiting time, which doubles each time. (2) An estimate that swings back and forth by itself
+in three consecutive intervals, or by a large amount in one, the flight steps back by one stage. The flight returns
+after a waiting time, which doubles with each step back. (2) An estimate that swings back and forth by itself
 (:mod:`retrim.control.swings`) shows that the observer drives the vehicle, because measurements are later than declared
-or wrongly scaled. Such an error persists in flight, so the base policy takes over at once. Later it flies with the slow
-mean, and after a second oscillation it flies alone until the end.
+or wrongly scaled. Such a fault persists throughout the flight, so the base policy takes over at once. Later, the base
+policy flies with the slow mean. After a second oscillation, it flies alone until the end of the flight.
 """
 
 import dataclasses
@@ -75,7 +75,7 @@ class MonitorState(eqx.Module):
     """Best stage to which the flight may return."""
     swings: Swings
     d: Float[Array, "3"]
-    """Mean of the estimated disturbance, world [m/s^2]."""
+    """Mean of the estimated disturbance, in the world frame [m/s^2]."""
     twin: Twin
     strikes: Int[Array, ""]
     """Number of consecutive intervals with an error beyond that of the twin."""
@@ -86,7 +86,7 @@ class MonitorState(eqx.Module):
 
 
 class Monitor(AbstractController[MonitorState]):
-    """Flies an adapted policy in the frame of the effective gravity, and steps back from it if necessary."""
+    """Flies an adapted policy in the frame of the effective gravity, and steps back if necessary."""
 
     frame: GravityFrame
     """The adapted flight; the inner controller is a :class:`~retrim.control.controller.PolicyController`."""
@@ -96,7 +96,7 @@ class Monitor(AbstractController[MonitorState]):
     """Command path of the twin; None if it follows commands immediately."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "Monitor":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, frame=self.frame.with_age(age))
 
     def with_vehicle(self, member: Member) -> "Monitor":
@@ -140,7 +140,7 @@ class Monitor(AbstractController[MonitorState]):
         return dataclasses.replace(memory, flight=frame.accepted(memory.flight, u))
 
     def condition(self, memory: MonitorState) -> Condition:
-        """Return the stage of the next command, and its cause."""
+        """Return the stage of the next command, and the cause of this stage."""
         return Condition(memory.stage, memory.cause)
 
     def _trust(self, memory: MonitorState, t: Float[Array, ""]) -> Float[Array, ""]:

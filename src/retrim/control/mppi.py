@@ -32,7 +32,7 @@ class MppiState(eqx.Module):
 
     underway: Underway
     mean: Float[Array, "horizon 4"]
-    """Planned commands, [c, omega] each."""
+    """Planned commands, one row [c, omega] per tick."""
     estimate: L1State
     last: State
     """State measured one tick ago."""
@@ -51,7 +51,7 @@ class MppiController(AbstractController[MppiState]):
     """Largest command that the vehicle accepts."""
     key: Key[Array, ""]
     estimator: L1Estimator | None
-    """Estimator of the disturbance in the model; None for the nominal model."""
+    """Estimator of the disturbance that the model includes; None for the nominal model."""
     spread: Float[Array, "4"]
     """Standard deviation of the noise: thrust [m/s^2], body rates [rad/s]."""
     correlation: Float[Array, ""]
@@ -70,7 +70,7 @@ class MppiController(AbstractController[MppiState]):
     """Length of a sequence [ticks]."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "MppiController":
-        """Return the same controller for measurements that are ``age`` old [s]."""
+        """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
     def init(self, x: State) -> MppiState:

@@ -1,4 +1,4 @@
-"""A controller that limits the distance from the target in its input."""
+"""Limit the distance from the target in a controller's input."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ from .controller import AbstractController
 class NearTarget(AbstractController[Any]):
     """Limits the position that a controller receives to within ``reach`` of the target.
 
-    A policy's commands grow with the distance. If measurements are late, a policy that is stable near its target may
-    oscillate and crash from far away.
+    A policy's commands grow with this distance. If measurements are late, a policy that is stable near its target may
+    oscillate and crash when it is far away.
     """
 
     inner: AbstractController[Any]
@@ -40,7 +40,7 @@ class NearTarget(AbstractController[Any]):
         return self.inner(memory, t, State(near, x.R, x.v))
 
     def accepted(self, memory: Any, u: Command) -> Any:
-        """Pass the accepted command on."""
+        """Pass the accepted command to the inner controller."""
         return self.inner.accepted(memory, u)
 
     def with_vehicle(self, member: Member) -> "NearTarget":

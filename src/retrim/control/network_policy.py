@@ -1,4 +1,4 @@
-"""A policy around any network: a function from an observation to four numbers."""
+"""A policy around any network that maps an observation to four numbers."""
 
 import dataclasses
 from typing import Any
@@ -15,7 +15,7 @@ from .policy import AbstractPolicy, command_bounds
 
 
 class NetworkPolicy(AbstractPolicy):
-    """A policy whose network is an Equinox module. Its floating-point arrays are trained by plain differentiation."""
+    """A policy whose network is an Equinox module; plain differentiation trains its floating-point arrays."""
 
     leaves: tuple[Array, ...]
     """Arrays of the network, in the order of its pytree."""
@@ -29,7 +29,7 @@ class NetworkPolicy(AbstractPolicy):
 
     @classmethod
     def create(cls, network: eqx.Module, vehicle: Vehicle) -> "NetworkPolicy":
-        """Return a policy.
+        """Return a policy with the given network.
 
         Args:
             network: Module that is called with one observation and returns four numbers, for thrust and body rates.
@@ -47,7 +47,7 @@ class NetworkPolicy(AbstractPolicy):
         return tuple(leaf for leaf in self.leaves if eqx.is_inexact_array(leaf))
 
     def with_params(self, params: tuple[Array, ...]) -> "NetworkPolicy":
-        """Return the same policy with other parameters."""
+        """Return the same policy with different parameters."""
         new = iter(params)
         leaves = tuple(next(new) if eqx.is_inexact_array(leaf) else leaf for leaf in self.leaves)
         return dataclasses.replace(self, leaves=leaves)

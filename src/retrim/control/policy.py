@@ -24,7 +24,7 @@ class AbstractPolicy(eqx.Module):
     """A network whose output is mapped to a command; the parameters are trained, and the limits are constant.
 
     u = u_min + (u_max - u_min) sigmoid(y + y_0), where y is the network's output and y_0 makes y = 0 the hover
-    command. A hard limit would not have a gradient once it is reached; the sigmoid always has one.
+    command. A hard limit would have a zero gradient once it is reached; the sigmoid always has a gradient.
     """
 
     if TYPE_CHECKING:  # a type checker would treat an abstract variable as a dataclass field
@@ -52,7 +52,7 @@ class AbstractPolicy(eqx.Module):
 
     @abc.abstractmethod
     def with_params(self, params: Any) -> "AbstractPolicy":
-        """Return the same policy with other parameters."""
+        """Return the same policy with different parameters."""
 
     @abc.abstractmethod
     def output(self, observation: Float[Array, " o"]) -> Float[Array, "4"]:
@@ -63,7 +63,7 @@ class AbstractPolicy(eqx.Module):
         """Return the policy with ``by`` added to its output for every observation."""
 
     def merged(self) -> "AbstractPolicy":
-        """Return itself; a low-rank policy merges its delta here."""
+        """Return the policy itself; a low-rank policy merges its delta here."""
         return self
 
     def linear_layers(self) -> Layers:
@@ -93,7 +93,9 @@ class Policy(AbstractPolicy):
     def of(
         cls, observation_size: int, vehicle: Vehicle, *, key: Key[Array, ""], hidden: tuple[int, ...] = (512, 512)
     ) -> "Policy":
-        """Return a fresh network that commands hover: kernels N(0, 0.01 / mean of fan-in and fan-out), zero biases.
+        """Return a fresh network that commands hover.
+
+        The kernels are N(0, 0.01 / mean of fan-in and fan-out), and the biases are zero.
 
         Args:
             observation_size: Length of the observation.
@@ -121,7 +123,7 @@ class Policy(AbstractPolicy):
         return self.layers
 
     def with_params(self, layers: Layers) -> "Policy":
-        """Return the same policy with other layers."""
+        """Return the same policy with different layers."""
         return Policy(layers, self.u_hover, self.u_min, self.u_max)
 
     def linear_layers(self) -> Layers:

@@ -1,8 +1,8 @@
-"""State-based controllers with a pose from camera images.
+"""Give state-based controllers a pose from camera images.
 
 The pose filter of :class:`OccludedKeypoints`, which estimates the pose for a policy, also estimates it for these
-controllers, from the same points and the same commands. A controller that uses an inertial unit keeps it: the estimated
-attitude transforms its measurements from the body frame to the world.
+controllers, from the same points and the same commands. A controller that uses an inertial unit continues to do so: the
+estimated attitude transforms the unit's measurements from the body frame to the world frame.
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ class PoseFilteredController(AbstractController[SeenPoseState]):
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
-    """Acceleration, the mean over the last tick, world [m/s^2]; None if it is not measured."""
+    """Mean acceleration over the last tick, in the world frame [m/s^2]; None if it is not measured."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "PoseFilteredController":
-        """Return the same controller for frames that are ``age`` old [s]."""
+        """Return the same controller for frames that are ``age`` seconds old."""
         return dataclasses.replace(self, inner=self.inner.with_age(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "PoseFilteredController":

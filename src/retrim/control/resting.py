@@ -13,10 +13,10 @@ from .controller import PolicyController
 
 
 class RestingController(PolicyController):
-    """A policy whose output is shifted by its output at rest at home, with the present heading.
+    """Subtracts a policy's output at rest at home, with the present heading, from its output.
 
-    A policy for many vehicles has a different rest point for each belief. The shift removes that error, so that the
-    policy rests at home, as :class:`~retrim.adapt.trim.RestTrim` does after an update.
+    A policy for many vehicles has a different rest point for each belief. The shift moves the rest point to home, as
+    :class:`~retrim.adapt.trim.RestTrim` does after an update.
     """
 
     home: Float[Array, "3"]

@@ -1,4 +1,4 @@
-"""Self-induced oscillation: how far and how often an estimated disturbance swings back and forth."""
+"""Measure self-induced oscillation: how far and how often an estimated disturbance swings back and forth."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ MEMORY = 1.5  # [s], time constant with which swings are forgotten
 
 
 class Swings(eqx.Module):
-    """Turning points of an estimate per axis, and the size of its recent swings.
+    """Turning points of an estimate on each axis, and the size of the recent swings.
 
     A disturbance step, a load or a gust moves an estimate once. An observer that drives its own vehicle, because
     measurements are late or wrongly scaled, moves it back and forth by several m/s^2 more than once a second.

@@ -1,4 +1,4 @@
-"""The identified vehicle, for the controller and as a line for the log."""
+"""Report the identified vehicle to the controller and, as one line, to the log."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -19,7 +19,7 @@ class VehicleEstimate(eqx.Module):
 
 
 class VehicleReport(eqx.Module):
-    """Present estimate of the vehicle, and the values in its file."""
+    """Present estimate of the vehicle, and the values from the vehicle file."""
 
     estimate: PathEstimate
     declared: Float[Array, "2"] | None = None

@@ -1,7 +1,7 @@
-"""Present body rates from a gyroscope, or from commands and measured attitudes.
+"""Estimate the present body rates from a gyroscope, or from commands and measured attitudes.
 
-Without a gyroscope, the command path predicts the rates, and the rotation between two attitudes corrects them. That
-rotation is noisy and late; the prediction is current, and as accurate as the known command path.
+Without a gyroscope, the command path predicts the rates, and the rotation between two attitudes corrects them. This
+rotation is noisy and late. The prediction is current, and as accurate as the known command path.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ SHARE = 0.3  # share of the difference between measurement and prediction that c
 
 
 class BodyRates(eqx.Module):
-    """Prediction of the body rates and its memory."""
+    """Predicted body rates, and the memory of the prediction."""
 
     R: Float[Array, "3 3"]
     """Attitude measured one tick ago."""

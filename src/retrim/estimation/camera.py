@@ -1,4 +1,4 @@
-"""A wide-angle camera that looks straight down: the double-sphere model (Usenko et al. 2018), and its inverse."""
+"""Model a wide-angle camera that looks straight down, with the double-sphere model (Usenko et al. 2018)."""
 
 from typing import NamedTuple
 

@@ -1,8 +1,8 @@
-"""Consistency of two successive measurements: whether a rigid body can have moved from one to the other.
+"""Test whether a rigid body can have moved from one measurement to the next.
 
-A single wrong velocity enters two accelerations with opposite signs and 50 times its size (at 50 Hz), so that one
+A single wrong velocity enters two accelerations with opposite signs and 50 times its size (at 50 Hz), so one
 sample in a window can outweigh all others. These tests need neither a vehicle model nor a history. The disturbance
-observer, which receives one pair per tick, and the learners, which receive a window, share one definition.
+observer, which receives one pair per tick, and the learners, which receive a window, share these tests.
 """
 
 import equinox as eqx
@@ -13,17 +13,17 @@ from jaxtyping import Array, Bool, Float
 from ..physics import so3
 from ..physics.state import State, where
 
-SPEED = 0.25  # [m/s], tolerated difference of a velocity from the derivative of the position, e.g. a small bias
-SPREADS = 4.0  # tolerated standard deviations beyond it; a normal distribution exceeds them in < 1 of 10^4
-NOISE_PRIOR = 1e-3  # [m], before the first measurement
+SPEED = 0.25  # [m/s], tolerated difference between a velocity and the derivative of the position, e.g. a small bias
+SPREADS = 4.0  # standard deviations tolerated beyond SPEED; normal noise exceeds them in < 1 of 10^4 cases
+NOISE_PRIOR = 1e-3  # [m], noise assumed before the first measurement
 NOISE_LIMIT = 3e-3  # [m]; larger noise is a fault, since otherwise every fault would look like noise
 NOISE_TAU = 1.0  # [s], memory of the noise
 JUMP = 3.0**0.5  # ratio of the mean change of a gap to the mean gap, for white noise in the positions
 ACCELERATION = 150.0  # [m/s^2], beyond any vehicle of this kind, including a push and a collision with air
 RATE = 40.0  # [rad/s], beyond any commanded rate of a vehicle of this kind
 REST = 1e-3  # [m/s]; a slower vehicle may be measured twice in the same state
-SCALE = 0.25  # largest difference of the motion from that implied by the velocities, as a share
-CORRELATED = 0.5  # smallest squared correlation of gaps and steps for a wrong scale
+SCALE = 0.25  # largest relative difference between the motion and that implied by the velocities
+CORRELATED = 0.5  # smallest squared correlation of gaps and steps that shows a wrong scale
 MOTION, OVER_NOISE = 0.15, 3.0  # [m/s], and multiple of the noise of gaps: smallest mean motion that shows a scale
 SCALE_TAU = 1.0  # [s], memory of the moments that show a scale
 DOUBT_TAU = 0.3  # [s], memory of the share of unusable steps
@@ -51,23 +51,23 @@ class Findings(eqx.Module):
 
 
 def gap(before: State, after: State, dt: float) -> Float[Array, "3"]:
-    """Return the position step minus the step from the mean of the velocities at its ends, world [m].
+    """Return the position step minus the step that the mean of the two velocities implies, in the world frame [m].
 
-    The trapezoidal rule is exact to dt^3 / 12 times the jerk, which is 0.1 mm at 50 Hz in the most agile flight.
+    The error of the trapezoidal rule is dt^3 / 12 times the jerk, which is 0.1 mm at 50 Hz in the most agile flight.
     """
     return after.p - before.p - 0.5 * dt * (before.v + after.v)
 
 
 def gap_noise(before: Float[Array, "3"], after: Float[Array, "3"]) -> Float[Array, ""]:
-    """Return the size of the noise from two successive gaps [m].
+    """Return the size of the noise, estimated from two successive gaps [m].
 
-    Velocities with a bias or a wrong scale have gaps that hardly change, and such gaps do not count as noise.
+    Velocities with a bias or a wrong scale cause gaps that hardly change, and such gaps do not count as noise.
     """
     return jnp.sqrt(jnp.sum((after - before) ** 2) + 1e-20) / JUMP
 
 
 class Scale(eqx.Module):
-    """Moments of gaps and of steps from velocities; their covariance shows a wrong scale of the velocities."""
+    """Moments of gaps, and of steps from velocities; the covariance of both shows a wrong scale of the velocities."""
 
     gap: Float[Array, "3"]
     """Mean gap, world [m]."""
@@ -85,7 +85,7 @@ class Scale(eqx.Module):
         return cls(missing, step, jnp.sum(missing * step), jnp.stack([jnp.sum(missing**2), jnp.sum(step**2)]))
 
     def verdict(self, dt: float, noise: Float[Array, ""]) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Return whether the vehicle moved enough to show the scale, and whether the scale is then wrong.
+        """Return whether the vehicle moved enough to show the scale, and whether the scale is wrong.
 
         Constant errors of the velocity do not count, since the moments are centred.
 
@@ -126,7 +126,7 @@ def contradictions(before: State, after: State, dt: float, noise: Float[Array, "
 
 
 class Consistency(eqx.Module):
-    """Memory of the tests in flight, tick by tick."""
+    """Memory of the tests in flight, updated every tick."""
 
     gap: Float[Array, "3"]
     """Last :func:`gap`, world [m]."""

@@ -1,7 +1,7 @@
-"""Disturbance observer: the acceleration that the nominal model misses, from states and commands.
+"""Estimate the disturbance, which is the acceleration that the nominal model misses, from states and commands.
 
-The filter has two states per axis, velocity v and disturbance d. The nominal model predicts the change of v over a
-tick, the prediction of d is constant, and the measured velocity corrects both,
+The filter has two states per axis: the velocity v and the disturbance d. The nominal model predicts the change in v
+over a tick, the prediction of d is constant, and the measured velocity corrects both v and d,
 
     v <- v_predicted + (1 - z w) (v_measured - v_predicted),
     d <- d + (1 - z) (1 - w) (v_measured - v_predicted) / dt,
@@ -19,7 +19,7 @@ is then not that of one tick.
 Measurements that contradict each other (:mod:`retrim.estimation.consistency`) do not contain information about the
 disturbance. During such a tick and the next one, d is held, and v is predicted if a frame was dropped. The more of the
 last few ticks have contradictions, the faster d decays, since an estimate without measurements acts like a push. The
-correction in one tick is limited, so that a wrong velocity that passes all tests has little effect.
+correction in one tick is limited, so a wrong velocity that passes all tests has little effect.
 """
 
 import dataclasses
@@ -75,7 +75,8 @@ class DisturbanceObserver(eqx.Module):
     limit: Float[Array, ""]
     """Largest norm of the estimate [m/s^2]."""
     wander: Float[Array, ""]
-    """Standard deviation per axis of the change of the disturbance in a second [m/s^2]; infinity ignores the noise."""
+    """Standard deviation, per axis, of the change in the disturbance in a second [m/s^2]; with infinity, the noise is
+    ignored."""
     path: CommandPath = eqx.field(default_factory=CommandPath.of)
     """Command path of the vehicle. Only its delay and thrust are used, since rates are measured."""
     limits: tuple[Command, Command] | None = None
@@ -98,7 +99,7 @@ class DisturbanceObserver(eqx.Module):
     def __call__(self, s: ObserverState, t: Float[Array, ""], x: State) -> ObserverState:
         """Return the memory with the estimate corrected by the new measurement.
 
-        Call it once per tick, then :meth:`issued` with the command of the new tick.
+        Call the observer once per tick, then :meth:`issued` with the command of the new tick.
 
         Args:
             s: Memory.
@@ -130,7 +131,7 @@ class DisturbanceObserver(eqx.Module):
         doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
         decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
         # The model bridges a few dropped frames, since the measured velocity has the full noise. After other
-        # contradictions it does not: measurements may be later than declared, so that the prediction is for a
+        # contradictions, it does not: measurements may be later than declared, so the prediction would be for a
         # different time.
         dropped = consistency.repeated | s.consistency.repeated
         coasts = comparable & dropped & (consistency.doubt < COAST)

@@ -1,14 +1,14 @@
-"""L1 adaptive estimation of a disturbance: a velocity predictor, an adaptation law held over a tick, and a filter.
+"""Estimate a disturbance by L1 adaptation: a velocity predictor, an adaptation law held over a tick, and a filter.
 
 The predicted velocity v_hat follows the measured velocity v at the speed of the pole A_s < 0. The law selects the sigma
-that would remove the whole prediction error within a tick, and the filter computes the estimate from it,
+that would remove the whole prediction error within a tick, and the filter computes the estimate from sigma,
 
     v_hat <- v_hat + dt (g + f - sigma + A_s (v_hat - v)),
     sigma <- exp(A_s dt) phi^-1 (v_hat - v),   phi = (exp(A_s dt) - 1) / A_s,
     d_hat <- alpha d_hat - (1 - alpha) sigma,
 
 where f is the commanded thrust (Hovakimyan and Cao 2010; as in DATT, Huang et al. 2023). A constant disturbance d
-appears in -sigma from the second tick on, so that d_hat approaches it with the time constant -dt / ln(alpha). At the
+appears in -sigma from the second tick on, so d_hat approaches d with the time constant -dt / ln(alpha). At the
 first measurement, and after a missed tick, the predictor starts from the measured velocity and d_hat is held, since the
 velocity change is then not that of one tick.
 """
@@ -27,7 +27,7 @@ class L1State(eqx.Module):
     v_hat: Float[Array, "3"]
     """Predicted velocity [m/s]."""
     sigma: Float[Array, "3"]
-    """Correction of the last tick [m/s^2]."""
+    """Correction in the last tick [m/s^2]."""
     d_hat: Float[Array, "3"]
     """Estimated disturbance [m/s^2]."""
     t: Float[Array, ""]

@@ -1,4 +1,4 @@
-"""Extrapolation of old measurements to the current time, and a test for successive measurements."""
+"""Extrapolate old measurements to the current time, and test whether measurements are successive."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -9,7 +9,7 @@ from ..physics.state import Command, State
 
 
 def follows(t: Float[Array, ""], last: Float[Array, ""], dt: float) -> Bool[Array, ""]:
-    """Return whether a measurement follows the previous one by one tick, so that their difference is that of one tick.
+    """Return whether a measurement was taken one tick after the previous one.
 
     Args:
         t: Time of the measurement [s].
@@ -20,11 +20,11 @@ def follows(t: Float[Array, ""], last: Float[Array, ""], dt: float) -> Bool[Arra
 
 
 def ahead(x: State, u: Command, d: Float[Array, "3"], age: Float[Array, ""]) -> State:
-    """Return the state ``age`` after ``x``, by Eq. (1) of the paper with constant acceleration and body rates.
+    """Return the state ``age`` seconds after ``x`` from Eq. (1) of the paper, for constant acceleration and body rates.
 
     Args:
         x: Measured state.
-        u: Command that has acted since then.
+        u: Command that has acted since the measurement.
         d: Disturbance, world [m/s^2].
         age: Age of the measurement [s].
     """

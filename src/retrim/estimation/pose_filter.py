@@ -1,8 +1,8 @@
-"""Error-state extended Kalman filter for the camera's pose and the disturbance.
+"""Estimate the camera's pose and the disturbance with an error-state extended Kalman filter.
 
-The filter uses the ground pattern, the commands and Eq. (1) of the paper, but not the state. It only predicts while no
-point is visible; one visible point is enough for a correction. Errors of Eq. (1) are modelled as a slow
-acceleration.
+The filter uses the ground pattern, the commands and Eq. (1) of the paper, but not the state. While no point is
+visible, the filter only predicts; one visible point is enough for a correction. Errors in Eq. (1) are modelled as a
+slow acceleration.
 """
 
 import equinox as eqx
@@ -19,14 +19,14 @@ from .camera import Camera, in_camera
 
 START = (0.1, 0.05, 0.2)  # uncertainty of the pose at hand-over: m, rad, m/s
 PUSH = 1.0  # [m/s^2], uncertainty of the disturbance at hand-over
-DRIFT = (0.0, 0.5, 1.0)  # further errors of Eq. (1): rates [rad/s] and acceleration [m/s^2], held over a tick
+DRIFT = (0.0, 0.5, 1.0)  # further errors in Eq. (1): rates [rad/s] and acceleration [m/s^2], held over a tick
 WANDER = 1.0  # [m/s^2] after one second, random walk of the disturbance
 ITERATIONS = 3  # a first estimate may be far off, so the projection is linearised again at the last result
 GATE = 4.0  # standard deviations; a point farther off corrects no more than one at this distance
 
 
 class PoseFilter(eqx.Module):
-    """Estimate and covariance of its error: position (world), attitude (body), velocity and disturbance (world)."""
+    """Estimate and error covariance: position (world), attitude (body), velocity and disturbance (world)."""
 
     x: State
     d: Float[Array, "3"]
@@ -97,7 +97,7 @@ class PoseFilter(eqx.Module):
         here = (jnp.zeros(12, dtype=self.P.dtype), self.P)
 
         def scalar(carry: tuple[Array, Array], row: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
-            """Correct by one coordinate of a pixel, which does not need a matrix inverse."""
+            """Correct with one coordinate of a pixel, which does not need a matrix inverse."""
             (off, P), (h, level, r, seen) = carry, row
             Ph = P @ h
             s = h @ Ph + r

@@ -1,4 +1,4 @@
-"""Prediction of the state at the time when the next command begins to act."""
+"""Predict the state at the time when the next command begins to act."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ class Underway(eqx.Module):
 
 
 class Prediction(eqx.Module):
-    """Eq. (1) of the paper behind a vehicle's declared command path."""
+    """Prediction with a vehicle's declared command path, followed by Eq. (1) of the paper."""
 
     path: CommandPath
     dt: float = eqx.field(static=True)
@@ -59,7 +59,7 @@ class Prediction(eqx.Module):
         return self.path.advance(s.queue, s.before, self.dt)
 
     def thrust(self, s: Underway, before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
-        """Return the mass-normalised thrust over the tick that has just ended, world [m/s^2].
+        """Return the mass-normalised thrust over the tick that has just ended, in the world frame [m/s^2].
 
         Args:
             s: Memory.
@@ -77,7 +77,7 @@ class Prediction(eqx.Module):
             s: Memory.
             x: Measured state.
             d: Disturbance, world [m/s^2].
-            omega: Measured body rates [rad/s]; None to use those that follow from the commands.
+            omega: Measured body rates [rad/s]; None to use the rates that follow from the commands.
         """
         _, actuators = self.acted(s)
         if omega is not None:

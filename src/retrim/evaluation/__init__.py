@@ -1,4 +1,4 @@
-"""Evaluation as a library: fleets of flights, sweeps, tables and pictures. This package never prints."""
+"""Evaluates policies with fleets of flights, sweeps, tables and pictures. This package never prints."""
 
 from .cluster import Cluster as Cluster
 from .executor import Flights as Flights

@@ -1,4 +1,4 @@
-"""Batches of flights; each batch runs as one program."""
+"""Divides flights into batches, each of which runs as one program."""
 
 import threading
 from collections.abc import Callable, Hashable, Iterable

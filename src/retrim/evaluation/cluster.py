@@ -1,4 +1,4 @@
-"""Jobs on other machines: an executor that submits them to a Dask scheduler, which distributes them to its workers."""
+"""Runs jobs on other machines, with an executor that submits them to a Dask scheduler."""
 
 import re
 import socket

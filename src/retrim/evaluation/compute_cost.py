@@ -1,4 +1,4 @@
-"""Cost of each method: steps and time for training, for an update in flight, and for one decision."""
+"""Measures the cost of each method: steps and time for training, for an update in flight, and for one decision."""
 
 import time
 from collections.abc import Callable

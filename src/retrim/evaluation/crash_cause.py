@@ -1,4 +1,4 @@
-"""The likely cause of a crash, with numbers, from the measurements and commands in its log."""
+"""Finds the likely cause of a crash, with numbers, from the measurements and commands in the flight's log."""
 
 from collections.abc import Iterator
 

@@ -20,7 +20,7 @@ OFTEN = 1.0  # interval between progress reports while flights are running [s]
 Progress = Callable[[float, int], None]
 """Receives the numbers of completed flights and of all flights; a running flight counts by its completed share."""
 Submit = Callable[[FlightBatch, Callable[[float], None]], "Future[list[Flight]]"]
-"""Starts a batch; its second argument is a callback that receives the completed share."""
+"""Starts a batch; the second argument is a callback that receives the completed share."""
 
 
 def report_progress(advance: Callable[[float, str], None]) -> Progress:

@@ -1,4 +1,4 @@
-"""Pictures of flights."""
+"""Draws pictures of flights."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -101,7 +101,7 @@ def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
 
 
 def _label(here: ExternalEffects) -> str:
-    """Return the effects in words; an empty string without effects."""
+    """Return the effects in words; an empty string if there are no effects."""
     words = list[str]()
     if np.any(here.push):
         same = len(set(here.push.tolist())) == 1

@@ -1,4 +1,4 @@
-"""Many flights with one preset: scenarios x methods x seeds x starts, on any executor."""
+"""Flies many flights with one preset: scenarios x methods x seeds x starts, on any executor."""
 
 import secrets
 import threading

@@ -33,7 +33,7 @@ class FlightStore:
     """
 
     def __init__(self, run: Run, fleet: Fleet) -> None:
-        """Read the same fleet's flights that an earlier run with the same code has written to the folder."""
+        """Read the flights of the same fleet that an earlier run with the same code wrote to the folder."""
         self._run, self._over = run, dict[FlightSpec, Flight]()
         self._groups = dict[Group, list[FlightSpec]]()
         for spec in dict.fromkeys(fleet.specs):  # a method that is listed twice flies once

@@ -1,4 +1,4 @@
-"""A fault in one version of JAX, and a test for it."""
+"""Tests for a fault in one version of JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ EXCLUDED = "0.10.2"
 def wrong_rows(n: int, dtype: jnp.dtype) -> int:
     """Return the number of rows that ``jit`` computes incorrectly.
 
-    The program rotates n vectors by the identity, and sums the squares of each. Row i has the vector (i, 0, 0), and its
+    The program rotates n vectors by the identity, and sums the squares of each. Row i is the vector (i, 0, 0), and its
     result must be i^2, exactly in float64 and to rounding in float32. jax 0.10.2 returns a different row's result once
     the batch is large enough (jax-ml/jax#39103).
     """

@@ -1,4 +1,4 @@
-"""A batch of flights as a job for another process: a job is a plain value, and each process builds the set-up once."""
+"""Runs batches of flights as jobs in other processes; a job is a plain value, and each process builds a set-up once."""
 
 import functools
 from dataclasses import dataclass, replace

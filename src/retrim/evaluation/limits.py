@@ -1,4 +1,4 @@
-"""Limits for seeds, the number of starts and flight lengths, checked before any training."""
+"""Checks seeds, the number of starts and flight lengths against limits, before any training."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Rows of results from flights."""
+"""Computes rows of results from flights."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Flights as one NPZ file, bit for bit, without their learner states."""
+"""Packs flights into one NPZ file, bit for bit, without their learner states."""
 
 import io
 import json

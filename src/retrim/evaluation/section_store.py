@@ -21,7 +21,7 @@ def keep(run: Run, key: str, section: TableSection, rows: list[dict[str, Any]]) 
 
 
 def kept(run: Run, key: str) -> tuple[TableSection, list[dict[str, Any]]] | None:
-    """Return a section that an earlier run has finished in this folder, with its rows; None if it is not there.
+    """Return a section that an earlier run has finished in this folder, with its rows; None if there is none.
 
     The result is also None if another run has overwritten the section's picture. The section is then made again.
     """

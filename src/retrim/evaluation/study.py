@@ -1,4 +1,4 @@
-"""Common steps for all tables: check the options, train the policies, and fly them."""
+"""Performs the steps that all tables share: checks the options, trains the policies, and flies them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -69,7 +69,7 @@ def refuse_misfits(
 
     Raises:
         ConfigError: A name does not exist, or two settings are incompatible.
-        PlantError: The package of a plant is not installed.
+        PlantError: A plant's package is not installed.
     """
     for scenario in scenarios:
         scenario.make(preset.vehicle, dt=preset.dt)
@@ -101,7 +101,7 @@ def fly_all(
         keep: Store the flights until the table removes them; learner states are not stored.
 
     Raises:
-        PlantError: The package of a plant is not installed.
+        PlantError: A plant's package is not installed.
         JobError: Flights failed in another process; an incomplete table is not written.
     """
     if not study.policies or run.interrupted:

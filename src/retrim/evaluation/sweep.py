@@ -1,4 +1,4 @@
-"""Sweeps: policies x scenarios x seeds from one TOML file, resumable after being killed."""
+"""Runs sweeps of policies x scenarios x seeds from one TOML file; a killed sweep can be resumed."""
 
 import dataclasses
 import json
@@ -58,7 +58,7 @@ class Sweep:
     seconds: float | None = Field(default=None, ge=1.0, le=36_000.0, strict=True)
     """Length of a flight [s]; the task's own by default."""
     overlay: dict[str, Any] = Field(default_factory=dict)
-    """Values that override those of every preset, as in its TOML file. A vehicle file is relative to the sweep file."""
+    """Values that override every preset's, in the preset format. A vehicle file is relative to the sweep file."""
 
     def scenarios(self) -> list[Scenario]:
         """Return every combination of disturbance, plant, vehicle, sensors and reference."""

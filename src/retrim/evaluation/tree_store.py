@@ -1,4 +1,4 @@
-"""Networks and training states in a run's folder: training runs only once, and resumes after an interruption."""
+"""Stores networks and training states in a run's folder, to train only once and to resume after an interruption."""
 
 from collections.abc import Mapping
 from pathlib import Path

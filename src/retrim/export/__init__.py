@@ -1,1 +1,1 @@
-"""Exports policies for computers without JAX: NPZ with a runner in NumPy, ONNX, and a C header."""
+"""Export policies for computers without JAX: as NPZ with a NumPy runner, as ONNX, and as a C header."""

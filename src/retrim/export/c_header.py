@@ -1,6 +1,6 @@
-"""Exports a policy as a C99 header in single precision, without allocation, with built-in test vectors.
+"""Export a policy as a C99 header in single precision, without allocation and with built-in test vectors.
 
-The generated code tests the bits of numbers: with -ffast-math, a compiler would remove comparisons that fail only for
+The generated code tests the bits of numbers. With -ffast-math, a compiler would remove comparisons that fail only for
 NaN.
 """
 
@@ -20,19 +20,19 @@ BAD = (math.nan, math.inf, -math.inf, LARGEST)  # test vectors contain each of t
 
 
 def write_c(path: Path, policy: Portable) -> list[Path]:
-    """Write a header and return its path; names in the header begin with the name of the file."""
+    """Write a header and return its path; all names in the header begin with the file name."""
     write_whole(path, _header(name_of(path), policy))
     return [path]
 
 
 def name_of(path: Path) -> str:
-    """Return the prefix of all names in the header of a file."""
+    """Return the prefix of all names in the header file at ``path``."""
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     return f"_{name}" if name[0].isdigit() else name
 
 
 def remark(text: object) -> str:
-    """Return a text that is safe in a comment: it cannot end the comment, continue a line or begin another comment."""
+    """Return the text in a form that cannot end a comment, continue a line or begin a new comment."""
     return re.sub(r"[^\w./+ -]|/(?![\w.])", "_", str(text)[:64], flags=re.ASCII)
 
 
@@ -230,7 +230,7 @@ def _array(name: str, values: np.ndarray) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """Return the C literal of a number, which is exact in single precision."""
+    """Return the C literal of a number, exact in single precision."""
     text = f"{np.float32(value):.9g}"
     return f"{text}f" if any(sign in text for sign in ".e") else f"{text}.0f"
 

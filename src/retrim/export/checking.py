@@ -1,4 +1,4 @@
-"""Compares an exported policy with JAX on 10,000 observations, and measures the time of a step.
+"""Compare an exported policy with JAX on 10,000 observations, and measure the time of a step.
 
 The test vectors of each format contain NaN, infinite numbers and numbers that are too large.
 """
@@ -25,7 +25,7 @@ from .runner import Runner
 ROWS = 10_000
 STEPS = 2_000  # single observations that are used to measure the time of a step
 FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-Werror")
-LONGEST = 300.0  # time limit of the compiler and of the compiled program [s]
+LONGEST = 300.0  # [s]: time limit of the compiler and of the compiled program
 MAIN = """#include <stdio.h>
 #include <time.h>
 #include "{header}"
@@ -46,24 +46,24 @@ int main(void)
 
 @dataclass(frozen=True)
 class Parity:
-    """Result of running an exported policy."""
+    """The accuracy and speed of an exported policy."""
 
     by: str
     """Program that ran the policy."""
     worst: float
-    """Largest difference from JAX, as a share of the command range."""
+    """Largest difference from JAX, as a fraction of the command range."""
     step_s: float
-    """Time of one step [s]: the median, or the mean for C."""
+    """Time of one step [s]: the median; for C, the mean."""
 
 
 def check_npz(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Check the NPZ file with the NumPy runner."""
+    """Check an NPZ file with the NumPy runner."""
     runner = Runner(path)
     return Parity("NumPy", _worst(policy, runner.command(rows), wanted), _timed(lambda o: runner.command(o), rows))
 
 
 def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Check the model with ONNX Runtime; return None if it is not installed."""
+    """Check a model with ONNX Runtime; return None if ONNX Runtime is not installed."""
     if find_spec("onnxruntime") is None:
         return None
     import onnxruntime
@@ -78,7 +78,7 @@ def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarra
 
 
 def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
-    """Compile and check the header; return None if there is no compiler.
+    """Compile and check a header; return None if there is no compiler.
 
     Raises:
         ConfigError: The header does not compile.

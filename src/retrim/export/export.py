@@ -1,4 +1,4 @@
-"""Implements `retrim export`: writes a policy in another format, runs it and compares it with JAX."""
+"""Write a policy in another format, run the result and compare it with JAX."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from .npz_file import write_delta, write_npz
 from .onnx_file import write_onnx
 from .portable import Portable, commands, observations, portable_of
 
-PARITY = 1e-5  # largest error of an exported policy, as a share of the command range
+PARITY = 1e-5  # largest error of an exported policy, as a fraction of the command range
 SPREAD = 1.5  # scale of the observations for the comparison, in units of their usual size
 
 
@@ -40,14 +40,14 @@ FORMATS = {
 def export(
     policy: Path, to: str, out: Path | None, delta: Path | None, reporter: Reporter, *, trust: Collection[str] = ()
 ) -> list[Path]:
-    """Write a policy in another format, and report its accuracy there.
+    """Write a policy in another format, and report the accuracy of the result.
 
     Args:
         policy: A policy, or the folder that contains one.
         to: A format; or ``delta``, to write only a low-rank delta.
-        out: File to write; by default ``policy`` or ``delta`` and the suffix of the format, in the current folder.
-        delta: A low-rank delta that is added to the policy.
-        reporter: Receives the results.
+        out: File to write; by default, ``policy`` or ``delta`` with the suffix of the format, in the current folder.
+        delta: A low-rank delta to add to the policy.
+        reporter: Reporter that receives the results.
         trust: Python names that the policy may refer to, for example ``mine:task``.
 
     Returns:

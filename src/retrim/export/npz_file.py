@@ -1,4 +1,4 @@
-"""Exports NPZ files: the arrays of a policy, with a runner in the same folder, or only a low-rank delta."""
+"""Export NPZ files: the arrays of a policy, with a runner in the same folder, or only a low-rank delta."""
 
 import json
 from importlib.resources import files
@@ -16,7 +16,7 @@ RUNNER = "runner.py"
 
 
 def write_npz(path: Path, policy: Portable) -> list[Path]:
-    """Write a policy, and the runner in the same folder; return both paths.
+    """Write a policy, with the runner in the same folder; return both paths.
 
     Raises:
         ConfigError: A different file already has the name of the runner.
@@ -35,7 +35,7 @@ def write_npz(path: Path, policy: Portable) -> list[Path]:
 
 
 def write_delta(path: Path, policy: LoraPolicy) -> list[Path]:
-    """Write the delta of a low-rank policy, without its base; return the path."""
+    """Write the delta of a low-rank policy without the base policy; return the path in a list."""
     arrays = {f"down{i}": np.asarray(thin.down, np.float32) for i, thin in enumerate(policy.delta)}
     arrays |= {f"up{i}": np.asarray(thin.up, np.float32) for i, thin in enumerate(policy.delta)}
     _write(path, arrays | {"shift": np.asarray(policy.shift, np.float32)},

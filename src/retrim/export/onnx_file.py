@@ -1,4 +1,4 @@
-"""Exports ONNX models: the network with its bounded output, for any number of rows.
+"""Export ONNX models: the network with its bounded output, for any number of rows.
 
 This module needs the extra ``export``.
 """
@@ -19,7 +19,7 @@ OPSET, IR = 17, 8  # old enough for all current runtimes
 
 
 def write_onnx(path: Path, policy: Portable) -> list[Path]:
-    """Write a model from ``observation`` (rows x numbers) to ``command`` (rows x 4) and ``finite`` (rows x 1).
+    """Write a model that maps ``observation`` (rows x numbers) to ``command`` (rows x 4) and ``finite`` (rows x 1).
 
     The model has no memory: if an observation or a command is not finite, the command is NaN and ``finite`` is false.
 

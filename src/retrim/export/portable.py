@@ -1,4 +1,4 @@
-"""The portable part of a policy: weights in single precision, limits, the observation, and test vectors."""
+"""Build the portable form of a policy: weights in single precision, limits, the observation, and test vectors."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -30,10 +30,10 @@ class Portable:
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Weights (inputs, outputs) and biases; a ReLU follows each layer except the last."""
     low: np.ndarray
-    """Smallest command: c [m/s^2], omega [rad/s]."""
+    """Smallest command: c [m/s^2] and omega [rad/s]."""
     high: np.ndarray
     y0: np.ndarray
-    """Offset of the network output, so that an output of zero commands hover."""
+    """Offset of the network output, with which a zero output commands hover."""
     observation: dict[str, Any] | None
     """Parameters of the state observation; None if the observation depends on more than the state."""
     about: dict[str, Any]
@@ -51,8 +51,8 @@ def portable_of(policy: AbstractPolicy, setup: Setup) -> Portable:
     """Return the portable form of a policy.
 
     Args:
-        policy: Policy to export; a low-rank one must be merged.
-        setup: Set-up with its preset, vehicle and task.
+        policy: Policy to export; a low-rank policy must be merged first.
+        setup: Set-up with the policy's preset, vehicle and task.
 
     Raises:
         ConfigError: The policy is not a perceptron.
@@ -78,7 +78,7 @@ def portable_of(policy: AbstractPolicy, setup: Setup) -> Portable:
 
 
 def observations(size: int, n: int, seed: int) -> np.ndarray:
-    """Return ``n`` random observations: standard normal, single precision."""
+    """Return ``n`` random observations, drawn from a standard normal distribution in single precision."""
     return np.asarray(random.normal(random.key(seed), (n, size), dtype=jnp.float32))
 
 

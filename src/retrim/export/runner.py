@@ -1,4 +1,4 @@
-"""Runs an exported policy with NumPy only.
+"""Run an exported policy with NumPy only.
 
 This file does not need the rest of its package: copy it together with the NPZ file.
 
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-TOLERANCE = 1e-5  # largest error at the test vectors in the file, as a share of the command range
+TOLERANCE = 1e-5  # largest error at the test vectors in the file, as a fraction of the command range
 LARGEST = 2.0**20  # valid measurements are smaller than this number
 
 
@@ -29,7 +29,7 @@ class Runner:
 
         Args:
             path: NPZ file of the policy.
-            delta: NPZ file with the learned delta of a low-rank policy, which is added to the policy.
+            delta: NPZ file with a learned low-rank delta to add to the policy.
 
         Raises:
             ValueError: The policy fails the test vectors of the file, or the delta belongs to a different policy.
@@ -55,7 +55,7 @@ class Runner:
 
     @property
     def repeats(self) -> int:
-        """Number of ticks for which the last command has been repeated; 0 if it follows from the newest state."""
+        """Number of ticks for which the last command has been repeated; 0 if it results from the newest state."""
         return self._repeats
 
     def command(self, observation: np.ndarray) -> np.ndarray:
@@ -80,10 +80,10 @@ class Runner:
         self._last = np.array([0.0 if seen is None else seen["gravity"], 0.0, 0.0, 0.0], np.float32)
 
     def step(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the command for a state, once per control tick.
+        """Return the command for a state; call this method once per control tick.
 
         If the state or the command is not finite, the last command is repeated, :attr:`repeats` increases, and the
-        memory does not change.
+        history of commands does not change.
 
         Args:
             p: Position, world [m].

@@ -1,4 +1,4 @@
-"""Reads and writes files: policies, deltas, and a flight's learned state."""
+"""Reads and writes files that contain policies, deltas, or a flight's learned state."""
 
 from .checkpoint import load_delta as load_delta
 from .checkpoint import read_policy as read_policy

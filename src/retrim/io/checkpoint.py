@@ -1,4 +1,4 @@
-"""Policies as files with weights, limits, a description and a checksum; they can be read without a configuration."""
+"""Reads and writes policy files, which contain weights, limits, a description and a checksum."""
 
 import hashlib
 from collections.abc import Callable, Mapping
@@ -20,11 +20,11 @@ from .sanity import check_policy
 
 MAX_WIDTH, MAX_LAYERS = 16_384, 16
 NETWORK = "network"
-"""Architecture of a policy that is not a perceptron; the function that its preset names builds the network."""
+"""Architecture of a policy that is not a perceptron; the function named in the policy's preset builds the network."""
 
 
 def write_policy(path: str | Path, policy: AbstractPolicy, about: Mapping[str, str]) -> None:
-    """Write a policy; the file's folder is created if necessary.
+    """Write a policy, and create the file's folder if necessary.
 
     Args:
         path: The file.
@@ -73,7 +73,7 @@ def policy_like(sizes: str, *, source: str) -> Policy:
     """Return a policy's shapes from its architecture, for example ``15-512-512-4``.
 
     Raises:
-        CheckpointError: The text is not a policy's architecture.
+        CheckpointError: The text does not describe a policy's architecture.
     """
     try:
         widths = [int(word) for word in sizes.split("-")]
@@ -96,7 +96,7 @@ def architecture(policy: AbstractPolicy) -> str:
 
 
 def fingerprint(policy: AbstractPolicy) -> str:
-    """Return a hash of a policy's weights in single precision; it identifies the base of a low-rank delta."""
+    """Return a hash of a policy's weights in single precision; the hash identifies the base of a low-rank delta."""
     digest = hashlib.sha256()
     for layer in policy.linear_layers():
         for leaf in (layer.weight, layer.bias):

@@ -60,8 +60,8 @@ def read_bounded(path: Path, advice: str) -> bytes:
     """Read a file of at most :data:`retrim.transport.wire.MAX_BYTES`.
 
     Raises:
-        CheckpointError: There is no regular file (the message then contains ``advice`` on how to make one), or it is
-            too large or cannot be read.
+        CheckpointError: The file is missing or is not a regular file (the message then contains ``advice`` on how
+            to make one), is too large, or cannot be read.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; {advice}")
@@ -74,7 +74,7 @@ def read_bounded(path: Path, advice: str) -> bytes:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that files can be written to a folder, before a long computation begins; new folders are removed again.
+    """Check, before a long computation, that files can be written to a folder; new folders are removed again.
 
     Raises:
         ConfigError: Files cannot be written.

@@ -19,7 +19,7 @@ def this_release() -> str:
 
 
 def newer_release(header: Mapping[str, str]) -> str | None:
-    """Return the version that wrote a file if it is known and newer than this one, otherwise None.
+    """Return the version that wrote a file if it is known and newer than this one; otherwise return None.
 
     Args:
         header: Header of the file.

@@ -56,7 +56,7 @@ def check_policy(policy: AbstractPolicy, *, source: str, observation: np.ndarray
 
 
 def _outputs(policy: AbstractPolicy, rows: np.ndarray) -> np.ndarray:
-    """Return the network's outputs for rows of observations; NumPy computes a perceptron, to avoid compilation."""
+    """Return the network's outputs for rows of observations; for a perceptron, NumPy is used to avoid compilation."""
     layers, h = policy.linear_layers(), rows
     if not layers:
         return np.stack([np.asarray(eqx.filter_jit(policy.output)(jnp.asarray(row))) for row in rows])

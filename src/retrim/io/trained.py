@@ -1,4 +1,4 @@
-"""Files for policies with their presets, and for a flight's learned state."""
+"""Reads and writes files for policies with their presets, and for a flight's learned state."""
 
 import logging
 from collections.abc import Collection
@@ -52,7 +52,7 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Abstr
 
     Args:
         path: The file or folder.
-        trust: Python names that its preset may refer to, for example ``mine:task``; they are imported.
+        trust: Python names that the preset may refer to, for example ``mine:task``; they are imported.
 
     Raises:
         CheckpointError: The file is missing, truncated, damaged or of a different kind, its weights are not finite, or
@@ -87,7 +87,7 @@ def load_learner_state(path: str | Path, *, trust: Collection[str] = ()) -> tupl
 
     Args:
         path: The file.
-        trust: Python names that its preset may refer to, for example ``mine:task``; they are imported.
+        trust: Python names that the preset may refer to, for example ``mine:task``; they are imported.
 
     Raises:
         CheckpointError: The file is missing, truncated, damaged or of a different kind, or its preset cannot be used,

@@ -39,7 +39,7 @@ def policy_loss(policy: AbstractPolicy, env: Env, x0: Start) -> Float[Array, ""]
 def policy_gradient(policy: AbstractPolicy, env: Env, x0: Start) -> tuple[Float[Array, ""], Any]:
     """Return :func:`policy_loss` and its gradient with respect to ``policy.params``.
 
-    For a perceptron the gradient is formed from perturbations of the layers' outputs, which is several times faster;
+    For a perceptron, the gradient is formed from perturbations of the layers' outputs, which is several times faster;
     see :mod:`retrim.learn.weight_gradients`.
     """
     if isinstance(policy, Policy):

@@ -1,7 +1,7 @@
-"""Devices of a computation: an axis of environments, flights or vehicles is divided among all JAX devices.
+"""Divide an axis of environments, flights or vehicles among all JAX devices.
 
-Training with few starts and a small network stays on the CPU: its steps follow one another, and an accelerator would
-wait for each next program.
+Training with few starts and a small network stays on the CPU: its steps run one after another, and an accelerator
+would wait for each program.
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -28,7 +28,7 @@ LEAST_WORK = 500_000
 
 
 def suitable_device(policy: Any, starts: int) -> AbstractContextManager[Any]:
-    """Return a context in which training runs on the device that suits its size: the CPU if it is small.
+    """Return a context in which training runs on the device that suits its size; small training runs on the CPU.
 
     Args:
         policy: Policy to train.

@@ -1,7 +1,7 @@
-"""Pretraining of a vision policy's hidden layers: they learn to predict the state from keypoints.
+"""Pretrain a vision policy's hidden layers to predict the state from keypoints.
 
-The paper (Sec. IV-A.2, after Heeg et al.) trains them on flights of a random policy. Here the histories are synthetic:
-random motions with constant velocity and body rates, redrawn at each step, without roll-outs.
+The paper (Sec. IV-A.2, after Heeg et al.) trains these layers on flights of a random policy. Here, the histories are
+synthetic: random motions with constant velocity and body rates, redrawn at each step, without roll-outs.
 """
 
 import equinox as eqx
@@ -30,7 +30,7 @@ def pretrain_encoder(
     """Train the hidden layers of ``policy`` to predict [p, R, v]; the output layer is unchanged.
 
     The optimiser is Adam with a cosine schedule from 1e-3. The layers are first redrawn at the usual scale (Glorot),
-    since those of a fresh policy are small.
+    since the weights of a fresh policy are small.
 
     Args:
         policy: A policy with at least one hidden layer.

@@ -32,7 +32,7 @@ class Env(eqx.Module):
     """Cost of the squared change of a policy's command from tick to tick, [c, omega] in m/s^2 and rad/s; None for no
     cost."""
     family: PathFamily | None = None
-    """Family of vehicles from which training draws, each with a belief about it; None for the model's vehicle."""
+    """Family from which training draws vehicles, each with a belief about it; None for the model's vehicle."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
     """Longest delay that the command queue of a roll-out can hold [s]."""
 

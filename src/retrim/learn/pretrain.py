@@ -59,7 +59,7 @@ def pretrain(
         env: Nominal model, task and delay.
         key: Random key, consumed.
         optimiser: Optimiser of the policy's parameters. A second call with the same object does not recompile.
-        num_updates: Number of optimiser steps; it is a multiple of ``chunk``, since every chunk runs the same program.
+        num_updates: Number of optimiser steps, a multiple of ``chunk``, since every chunk runs the same program.
         num_envs: Starts per step.
         chunk: Steps between two results.
 
@@ -68,7 +68,7 @@ def pretrain(
 
     Raises:
         ValueError: ``num_updates`` is not a positive multiple of ``chunk``.
-        TrainingError: The loss is not a number in ten consecutive steps or at the end.
+        TrainingError: The loss is not a number in ten consecutive steps or in the last step.
     """
     if num_updates % chunk or num_updates <= 0:
         raise ValueError(f"num_updates = {num_updates} must be a positive multiple of {chunk}")

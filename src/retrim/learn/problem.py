@@ -1,4 +1,4 @@
-"""The environment for learning from rewards; it does not need gradients."""
+"""The environment for learning from rewards, without gradients."""
 
 from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -26,7 +26,7 @@ class Problem(Protocol, Generic[S]):
         ...
 
     def observe(self, s: S, key: Key[Array, ""]) -> Float[Array, " o"]:
-        """Return the observation; the key is used for its noise."""
+        """Return the observation; the key is used for the observation's noise."""
         ...
 
     def step(self, s: S, action: Float[Array, " a"], key: Key[Array, ""]) -> tuple[S, Outcome]:

@@ -1,4 +1,4 @@
-"""Roll-out of one drone as one scan."""
+"""Roll out the flight of one drone as one scan."""
 
 from collections.abc import Callable
 from typing import Any
@@ -24,9 +24,9 @@ class Trajectory(eqx.Module):
     u: Command
     """Mean command that acts during each tick."""
     reward: Float[Array, " horizon"]
-    """r(x_t, u_t). After termination, it is the worst reward of the roll-out so far, so that terminating never pays."""
+    """r(x_t, u_t). After termination, the reward is the worst of the roll-out so far, so terminating never pays."""
     terminated: Bool[Array, " horizon"]
-    """True after the tick in which the vehicle left the task's bounds; its state is then frozen."""
+    """True after the tick in which the vehicle left the task's bounds; the vehicle's state is then frozen."""
 
 
 def rollout(env: Env, policy: AbstractPolicy, start: Start) -> Trajectory:

@@ -1,4 +1,4 @@
-"""Screening of a window: it finds contradictory measurements, and the ticks that a learner can use."""
+"""Screen a window for contradictory measurements, and find the ticks that a learner can use."""
 
 from collections.abc import Sequence
 
@@ -49,7 +49,7 @@ def describe_counts(counts: Int[ArrayLike, "5"] | Sequence[int]) -> str:
 def screen(window: Window, dt: float) -> Screening:
     """Return which measurements of a window are usable for learning.
 
-    The noise of the flight is a median over its steps, so that up to half of them may be corrupted. The step after a
+    The noise of the flight is a median over its steps, so up to half of them may be corrupted. The step after a
     repeated measurement contains the motion of two ticks, so it does not count either.
 
     Args:

@@ -1,8 +1,8 @@
 """Weights in both layouts, so that each product in a roll-out's scan reads its matrix along the rows.
 
 In the forward pass, a layer multiplies a few rows by a fan-in x fan-out matrix; in the backward pass, by a fan-out x
-fan-in matrix. A CPU multiplies ten rows by the transpose of a stored matrix at half to a third of the rate of the
-matrix itself. A scan would do so at every tick, so both layouts are computed once, before the scan.
+fan-in matrix. A CPU multiplies ten rows by the transpose of a stored matrix at a third to half of the rate for the
+matrix itself. A scan would do this at every tick, so both layouts are computed once, before the scan.
 """
 
 from typing import TypeGuard, TypeVar

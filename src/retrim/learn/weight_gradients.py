@@ -1,9 +1,10 @@
-"""Weight gradients from one product after the scan.
+"""Compute weight gradients from one product after the scan.
 
 Differentiating a scan that closes over a policy adds to the weight cotangent at every step of the backward pass. This
 takes ``horizon`` read-modify-write passes over a 512 x 512 matrix, each for a product with only as many rows as there
 are environments. Instead, a zero *perturbation* is added to each pre-activation, and the loss is differentiated with
-respect to these alone. Every weight gradient is formed afterwards, from all rows (environments x ticks) at once:
+respect to the perturbations alone. Every weight gradient is formed afterwards, from all rows (environments x ticks) at
+once:
 
     W_l gradient = (pre-activation cotangents of layer l)^T (inputs of layer l).
 """

@@ -1,1 +1,1 @@
-"""Live flight in real time: processes for control, learning and the plant, and the bus between them."""
+"""Fly in real time, with processes for control, learning and the plant that communicate on a bus."""

@@ -18,9 +18,9 @@ from ..transport.shared_memory import SharedMemoryBus
 from .refused_notes import NETWORK
 
 IDLE = 0.002  # [s]
-SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; the autopilot may land
+SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; its autopilot may land
 PATIENCE = 10.0  # [s], longest time that the network may block the bridge
-LINGER = 2.0  # [s] after the end of the flight, so that the note about the end reaches the learners
+LINGER = 2.0  # [s] after the end of the flight, during which the note about the end reaches the learners
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class BridgePlan:
 
 
 def carry(plan: BridgePlan) -> None:
-    """Transfer messages until the process is terminated, as the main function of the process.
+    """Transfer messages until the process is terminated; this is the main function of the process.
 
-    Without a supervisor it returns when the flight is over.
+    Without a supervisor, the function returns when the flight is over.
     """
-    signal.signal(signal.SIGTERM, _ended)  # so that the network is closed properly in this case, too
+    signal.signal(signal.SIGTERM, _ended)  # close the network properly in this case, too
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True, writes=OUT)
     try:
@@ -55,11 +55,11 @@ def carry(plan: BridgePlan) -> None:
                 if (now := _said(bus)) != said:
                     said, since = now, time.monotonic()
     finally:
-        network.close()  # otherwise its threads would keep the process alive
+        network.close()  # otherwise the threads of the network would keep the process alive
 
 
 def _told(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
-    """Publish the number of refused network messages and the reason why the network receives no messages."""
+    """Publish any change in the number of refused messages or in the fault that prevents their reception."""
     now = network.refused, network.fault
     if now != before:
         bus.publish(NETWORK, pack_note(NETWORK, count=now[0], last=now[1] or "a message that was none, forged or old",
@@ -68,7 +68,7 @@ def _told(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
 
 
 def _said(bus: Bus) -> tuple[int, int]:
-    """Return the versions of the newest measurement and of the note that the flight is over."""
+    """Return the versions of the newest measurement and of the note about the end of the flight."""
     measured, ended = bus.latest("sample"), bus.latest("ended")
     return 0 if measured is None else measured.version, 0 if ended is None else ended.version
 

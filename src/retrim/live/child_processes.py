@@ -1,4 +1,4 @@
-"""Monitoring of a live flight from take-off to landing."""
+"""Monitor a live flight from take-off to landing."""
 
 import contextlib
 import threading
@@ -13,7 +13,7 @@ from .status import Status
 from .supervisor import LANDING, Supervisor
 
 EVERY = 0.05  # [s] between two reads of the status
-LAST = 1.0  # [s] for a terminal to display the end of a flight
+LAST = 1.0  # [s], longest wait for a terminal to display the end of a flight
 
 
 def watched(
@@ -24,13 +24,13 @@ def watched(
     stop: threading.Event,
     wishes: OperatorRequests | None = None,
 ) -> Status:
-    """Take off, watch until the flight is over, and wait until its log is written.
+    """Take off, monitor the flight until it is over, and wait until its log is written.
 
     Args:
         supervisor: Supervisor whose processes are ready.
         seconds: Time after which the vehicle lands [s].
-        events: Events of the flight; this function adds to them.
-        show: Called many times per second with the status and the new events.
+        events: Events of the flight; this function adds new events.
+        show: Function that is called many times per second with the status and the new events.
         stop: Event that lands the vehicle early.
         wishes: User requests in flight.
 
@@ -55,7 +55,7 @@ def watched(
 
 
 class _Screen:
-    """Shows the status in a separate thread, so that a blocked terminal does not block the flight."""
+    """Shows the status in a separate thread so that a blocked terminal does not block the flight."""
 
     def __init__(self, show: Callable[[Status, list[Event]], None]) -> None:
         self._show, self._waiting = show, list[Event]()

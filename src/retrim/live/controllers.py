@@ -1,4 +1,4 @@
-"""Conversion of a set-up's controller into programs for the control process."""
+"""Convert a set-up's controller into programs for the control process."""
 
 import hashlib
 from typing import Any
@@ -33,7 +33,7 @@ def parameter_groups(policy: AbstractPolicy, residual: Any) -> dict[str, Any]:
 
 
 def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
-    """Return the controller source for an adaptive policy.
+    """Return the controller source of an adaptive policy.
 
     Args:
         setup: Set-up of the policy's preset with the flight's reference.
@@ -66,7 +66,7 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
 
 
 def plain_source(setup: Setup, controller: AbstractController[Any]) -> ControllerSource:
-    """Return the controller source for a controller that does not learn.
+    """Return the controller source of a controller that does not learn.
 
     Raises:
         ConfigError: The controller uses an operation without a NumPy form.
@@ -146,7 +146,7 @@ def _on(setup: Setup, parameters: dict[str, Any]) -> Setup:
 
 
 def _arrays(memory: Any) -> Any:
-    """Return a memory; raise ``TypeError`` if a leaf is not an array, since NumPy programs carry only arrays."""
+    """Return a memory; raise ``TypeError`` if a leaf is not an array, since NumPy programs handle only arrays."""
     if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
         raise TypeError("a controller's memory must be a pytree of arrays to fly live")
     return memory

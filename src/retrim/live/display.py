@@ -21,7 +21,7 @@ def live_line(status: Status) -> str:
 
 
 def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
-    """Return the status of a flight as rows of a label and a value."""
+    """Return the status of a flight as rows, each with a label and a value."""
     control = status.control
     rows: list[tuple[str, str]] = []
     rows.append(("flown by", "watchdog" if status.watchdog_flies else control.get("mode", "not started")))

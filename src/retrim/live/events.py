@@ -1,4 +1,4 @@
-"""Events of a live flight, each generated once from periodic reports."""
+"""Generate the events of a live flight from periodic reports, each event once."""
 
 from collections.abc import Iterable
 
@@ -8,13 +8,13 @@ from ..onboard.pulses import SILENCE
 from ..runtime.events import Event
 from .status import Status
 
-EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements, the length of a window
+EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements; the duration of a window
 HUNG = f"hung: it said nothing for {SILENCE:g} s and was ended"
 WITHOUT = {
     "control": "the watchdog flies, holds and lands",
     "plant": "nobody measures any more, and the flight is over",
 }
-"""Consequence for the flight if a process that is not restarted ends, by role."""
+"""Consequence for the flight if a process that cannot be restarted ends, by role."""
 WATCHDOG = "watchdog: the process that flew is gone or hangs, the watchdog flies the fallback"
 
 
@@ -24,7 +24,7 @@ class LiveEvents:
     def __init__(self) -> None:
         self.all: list[Event] = []
         self.swaps: list[tuple[float, str, int, float]] = []
-        """Time [s], parameter group, version, and age of the flight data from which it was learned [s]."""
+        """Swaps: time [s], parameter group, version, and age of the flight data from which it was learned [s]."""
         self._newest: dict[str, int] = {}
         self._mode, self._watchdog, self._log_failed = "policy", False, False
         self._log_moved, self._watchdog_ticks = "", 0
@@ -93,7 +93,7 @@ class LiveEvents:
         return new
 
     def _processes(self, status: Status) -> list[Event]:
-        """Return events for processes that hang or were restarted."""
+        """Return events about processes that hang or were restarted."""
         new = []
         for role in sorted(status.hangs.keys() | status.restarts.keys()):
             hung = status.hangs.get(role, 0) > self._hangs.get(role, 0)

@@ -1,4 +1,4 @@
-"""Learning for many vehicles in one process: updates that are due at the same time run as one program."""
+"""Learn for many vehicles in one process: updates that are due at the same time run as one program."""
 
 import hashlib
 import time
@@ -28,7 +28,7 @@ AT_ONCE, MANY = 4, 1024  # vehicles per program on a CPU and on an accelerator
 
 
 class FleetLearner:
-    """Learners of many vehicles. They do not wait for a vehicle whose window is late."""
+    """Learners of many vehicles. The learners do not wait for a vehicle whose window is late."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         """Initialise without vehicles; ``clock`` returns the time [s]."""
@@ -42,7 +42,7 @@ class FleetLearner:
 
     @property
     def loops(self) -> dict[str, LearnerLoop]:
-        """Loops by the name of the vehicle and layer; the one that has waited longest comes first."""
+        """Loops by the name of the vehicle and layer; the loop that has waited longest comes first."""
         return {name: member.loop for name, member in self._members.items()}
 
     def add(self, name: str, plan: LearnerPlan, bus: Bus, wanted: Callable[[], bool] = lambda: True) -> None:
@@ -52,7 +52,7 @@ class FleetLearner:
             name: Name of the vehicle and layer.
             plan: Plan of the learner.
             bus: Bus of the flight.
-            wanted: Called before each publication; it returns False if the vehicle has left in the meantime.
+            wanted: Function that is called before each publication; it returns False if the vehicle has left.
         """
         loop = LearnerLoop(plan, bus, self._clock, self._setup_of)
         loop.catch_up()
@@ -65,7 +65,7 @@ class FleetLearner:
         self._members.pop(name, None)
 
     def warm_up(self) -> None:
-        """Compile the present vehicles' programs for each number of vehicles that may be due at once."""
+        """Compile the current vehicles' programs for each number of vehicles that may be due at once."""
         for kind, members in self._kinds().items():
             loops = [member.loop for member in members.values()]
             for n in (1 << k for k in range(room_for(min(len(loops), self._most)).bit_length())):
@@ -80,10 +80,10 @@ class FleetLearner:
                 self._compiled.add((kind, n, len(loops) > 1))
 
     def step(self) -> int:
-        """Learn for the vehicles that are due, the longest waiting first; return their number.
+        """Learn for the vehicles that are due, the longest-waiting first; return their number.
 
-        On a CPU a few vehicles fill a core. With more vehicles in one program, each would only wait for the others. The
-        remaining vehicles are due in the next step and learn from the window at that time.
+        On a CPU, a few vehicles fill a core. With more vehicles in one program, each would only wait for the others.
+        The remaining vehicles are due in the next step and learn from the window at that time.
         """
         done = 0
         for kind, members in self._kinds().items():
@@ -121,7 +121,7 @@ class FleetLearner:
     def _setup_of(self, preset: Preset, reference: str | None) -> Setup:
         """Return the set-up for a preset and a reference.
 
-        Vehicles with the same preset and reference share a learner, so that their updates can run as one program.
+        Vehicles with the same preset and reference share a learner, so their updates can run as one program.
         """
         key = dump(preset), reference
         if key not in self._setups:
@@ -146,12 +146,12 @@ class _Member(NamedTuple):
 
     @property
     def kind(self) -> tuple[str, int, str]:
-        """Key of vehicles that share a program: layer, set-up (its reference may change in flight) and base."""
+        """Key of the vehicles that share a program: layer, set-up (its reference may change in flight) and base."""
         return self.loop.plan.layer, id(self.loop.setup), self.base
 
 
 def _low_rank(workers: Sequence[Worker]) -> list[PolicyWorker]:
-    """Return the workers that learn a low-rank delta: either all workers of a kind or an empty list."""
+    """Return the workers that learn a low-rank delta; for one kind, these are either all workers or none."""
     return [each for each in workers if isinstance(each, PolicyWorker) and isinstance(each.policy, LoraPolicy)]
 
 

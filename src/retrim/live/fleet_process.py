@@ -1,4 +1,4 @@
-"""Process that learns for many vehicles. Vehicles may join and leave while it runs."""
+"""Process that learns for many vehicles. Vehicles may join and leave while the process runs."""
 
 import contextlib
 import os
@@ -31,12 +31,12 @@ class FleetPlan:
     """Arguments of the process."""
 
     folder: Path
-    """Folder of the plans: one file ``NAME.plan`` per vehicle and layer. Files appear and disappear during the run."""
+    """Folder of the plans: one file ``NAME.plan`` per vehicle and layer. Files appear and disappear during a run."""
     parent: int
 
 
 def learn_for_all(plan: FleetPlan) -> None:
-    """Learn until the parent has ended, as the main function of the process."""
+    """Learn until the parent has ended; this is the main function of the process."""
     with contextlib.suppress(OSError, AttributeError):
         os.nice(NICE)
     enable_compile_cache()
@@ -55,7 +55,7 @@ def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
     Args:
         fleet: Learners.
         folder: Folder of the plans.
-        done: Names of plans whose flight is over or that cannot be executed. This function adds names to it.
+        done: Names of plans whose flight is over or that cannot be executed. This function adds names to the set.
     """
     there = {path.stem: path for path in folder.glob("*.plan")}
     done |= {name for name, loop in fleet.loops.items() if loop.bus.latest("ended") is not None}
@@ -87,7 +87,7 @@ def _look(fleet: FleetLearner, folder: Path, done: set[str]) -> None:
 
 @dataclass
 class FleetProcess:
-    """Process of a :class:`FleetLearner`. It starts with the first vehicle, and starts again if it has died."""
+    """Process of a :class:`FleetLearner`. It starts with the first vehicle; if it dies, it restarts with the next."""
 
     folder: Path
     cores: set[int] | None = None
@@ -121,13 +121,13 @@ class FleetProcess:
 
 @dataclass(frozen=True)
 class FleetSlot:
-    """One vehicle and layer in the shared process; the ground station uses it like a separate process."""
+    """One vehicle and layer in the shared process; the ground station treats the slot like a separate process."""
 
     process: "subprocess.Popen[bytes]"
     path: Path
 
     def poll(self) -> int | None:
-        """Return the exit code of the process, or 1 if it cannot execute the plan; None while it learns."""
+        """Return the exit code of the process, or 1 if the process cannot execute the plan; None while it learns."""
         return 1 if self.path.with_suffix(FAILED).exists() else self.process.poll()
 
     def kill(self) -> None:

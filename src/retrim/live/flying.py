@@ -1,4 +1,4 @@
-"""Live flight, from the warm-up to the output files."""
+"""Fly a live flight, from the warm-up to the output files."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing
@@ -35,8 +35,8 @@ from .status import Status
 from .supervisor import Supervisor
 
 Display = Callable[[LiveEvents], AbstractContextManager[Callable[[Status, list[Event]], None]]]
-"""Function that takes all events so far and returns a context manager. The value of the context manager is called with
-the status and the new events."""
+"""Function that takes all events so far and returns a context manager. The context manager yields a function, which is
+called with the status and the new events."""
 
 
 class LiveFlight(NamedTuple):
@@ -46,13 +46,13 @@ class LiveFlight(NamedTuple):
     rows: list[dict[str, Any]]
     """Rows of ``results.json``."""
     paths: list[Path]
-    """Output files, the most interesting first."""
+    """Output files, with the most interesting ones first."""
     request: LiveRequest
-    """Request whose set-up follows all references of the flight in sequence."""
+    """Request for the flight; its set-up follows all references of the flight in sequence."""
     landed: bool
-    """Whether the vehicle landed under the control of this flight, rather than being lost or crashing."""
+    """Whether the vehicle landed normally, rather than being lost or crashing."""
     outlet: Outlet
-    """Location of the files, with faults for missing files."""
+    """Folder of the output files, with descriptions of the faults for missing files."""
 
 
 def fly_live(
@@ -63,9 +63,9 @@ def fly_live(
     Args:
         request: Request for the flight.
         run: Run with the flight's folder and the interruption flag.
-        reporter: Receives messages before take-off and at the end.
+        reporter: Reporter that receives messages before take-off and at the end.
         display: Display of the flight.
-        opened: Called with the page's address when the page is ready.
+        opened: Function that is called with the page's address when the page is ready.
 
     Returns:
         The flight; None if it was interrupted before take-off.
@@ -80,7 +80,7 @@ def fly_live(
     for old in (*run.folder.glob("*.log"), *(run.folder / name for name in names)):
         old.unlink(missing_ok=True)
     events, outlet = LiveEvents(), Outlet(run.folder)
-    with ExitStack() as screen:  # it closes last, since a blocked terminal would delay everything else
+    with ExitStack() as screen:  # the display closes last, since a blocked terminal would delay everything else
         with Supervisor(replace(live_spec(request), spare=outlet.spare)) as supervisor:
             if not _warmed_up(supervisor, run, reporter):
                 return None
@@ -132,7 +132,7 @@ def _written(
 
 
 def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
-    """Write the flight, including the landing, as NPZ and for viewers; return the path of the requested recording."""
+    """Write the flight with its landing as NPZ and for viewers; return the path of the requested recording, if any."""
     target = np.asarray(jax.jit(jax.vmap(request.setup.flight_task.target))(rows[:, 1]), dtype=float)
     recording = Recording(
         rows[:, 1], rows[:, MEASURED], rows[:, TRUE], rows[:, 2], rows[:, COMMAND],

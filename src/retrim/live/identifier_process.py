@@ -1,4 +1,4 @@
-"""Process that identifies the vehicle during a flight: it reads flight rows and publishes the identified vehicle."""
+"""Process that reads flight rows, and identifies the vehicle and publishes it during a flight."""
 
 import contextlib
 import time
@@ -35,9 +35,9 @@ from .states import state_of
 
 EVERY = 0.1  # [s] between two messages
 CHECK_EVERY = 0.005  # [s]
-ALLOWANCE = 5.0  # [s], longest time for one read of the bus with all its rows
+ALLOWANCE = 5.0  # [s], longest time to read the bus once and process the rows
 AT_ONCE = 5 * PIECE  # rows per step
-SMALL = 1e-3  # an estimate is published only if one of its numbers changes by more than this
+SMALL = 1e-3  # an estimate is published only if one of its numbers changes by more than this amount
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class IdentifierPlan:
 
 
 class IdentifierLoop:
-    """Identification during one flight. Call :meth:`step` repeatedly."""
+    """Identifies the vehicle during one flight. Call :meth:`step` repeatedly."""
 
     def __init__(self, preset: Preset, base: str, bus: Bus) -> None:
         """Initialise the loop.
@@ -83,7 +83,7 @@ class IdentifierLoop:
         self._version = 0 if message is None else message.version  # version from an earlier process
 
     def warm_up(self) -> None:
-        """Compile the flight's programs with rows from a hovering vehicle, and discard the rows."""
+        """Compile the flight's programs with rows from a hovering vehicle, and discard the result."""
         row = np.zeros(len(COLUMNS))
         row[MEASURED] = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
         row[COMMAND] = np.asarray(Command.hover().vector())
@@ -94,7 +94,7 @@ class IdentifierLoop:
         self._state, self._taken, self._t = None, 0, 0.0
 
     def step(self) -> bool:
-        """Process some of the new rows; return whether there were any."""
+        """Process some of the new rows; return whether there were new rows."""
         self._look()
         if not self._rows:
             return False
@@ -158,7 +158,7 @@ def _vehicle(family: PathFamily, s: EstimatorState) -> VehicleEstimate:
 
 
 def identify(plan: IdentifierPlan) -> None:
-    """Identify the vehicle until the flight is over, as the main function of the process."""
+    """Identify the vehicle until the flight is over; this is the main function of the process."""
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     _, preset = load_learner_state(plan.start, trust=plan.trust)

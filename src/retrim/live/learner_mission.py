@@ -1,4 +1,4 @@
-"""Mission: description of a flight for learners on another machine."""
+"""Mission, which describes a flight to learners on another machine."""
 
 import json
 import re
@@ -21,7 +21,7 @@ LOCAL = re.compile(r"\.(csv|toml)(:|\+|$)", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class LearnerMission:
-    """Description of one flight for its learners."""
+    """Describes one flight to its learners."""
 
     number: int
     """Number of the mission; an increase restarts the policy learner from a new ``start``."""
@@ -33,7 +33,7 @@ class LearnerMission:
     floor: int
     """Policy version; updates up to this version are older than ``start``."""
     capacities: Mapping[str, int]
-    """Length of the longest message of each topic [bytes]."""
+    """Maximum message length of each topic [bytes]."""
     start: bytes
     """Content of the file with the preset and the learned state from before the flight."""
 
@@ -51,7 +51,7 @@ class LearnerMission:
             trust: Trusted Python names, e.g. ``mine:task``.
 
         Raises:
-            MessageError: The file does not hold a learner state, or the mission names a file on this machine.
+            MessageError: ``start`` does not contain a learner state, or the mission names a file on this machine.
             ConfigError: The preset cannot be used, or a Python name is not trusted.
         """
         header = describe(self.start, kind="learnt", source="mission")

@@ -1,4 +1,4 @@
-"""Process of one learning layer: it reads flight windows and publishes parameters."""
+"""Process of one learning layer; the process reads flight rows and publishes parameters."""
 
 import contextlib
 import os
@@ -41,8 +41,8 @@ from .published_updates import active_update, keep, learnt_from, newest_update
 from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
-LOOKING, COMPUTING = 5.0, 60.0  # [s], longest time for a read of the bus and for an update
-VERDICT = 1.0  # [s] for control to accept or refuse a policy; after that, the policy counts as lost
+LOOKING, COMPUTING = 5.0, 60.0  # [s], longest time to read the bus and to compute an update
+VERDICT = 1.0  # [s] for control to accept or refuse a policy; the policy then counts as lost
 NICE = 10
 REMEMBERED = 8  # number of the flight's past policies that are kept for a rollback
 
@@ -65,11 +65,11 @@ class LearnerPlan:
     trust: tuple[str, ...] = ()
     """Python names that ``start`` may contain. The user passed them to the process that wrote this plan."""
     out: Path | None = None
-    """Folder for the learned state if the supervisor is gone and cannot write it; None to discard the state."""
+    """Folder for the learned state if the supervisor has ended before writing the state; None to discard it."""
 
 
 class LearnerLoop:
-    """Learning loop of one layer during the flight. Call :meth:`step` repeatedly; tests pass their own clock."""
+    """Learning loop of one layer during a flight. Call :meth:`step` repeatedly; tests pass their own clock."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class LearnerLoop:
         return make_worker(self.setup.learner, self.plan.layer, self.state, random.key(self.plan.seed))
 
     def warm_up(self) -> None:
-        """Compile the flight's programs on a synthetic window and discard the result."""
+        """Compile the flight's programs with a synthetic window, and discard the result."""
         self.worker.learn(self.dummy_window())
         self.worker = self.new_worker()
 
@@ -117,7 +117,7 @@ class LearnerLoop:
         return buffer.window()
 
     def catch_up(self) -> None:
-        """Continue from the update in flight if an earlier process of this layer published it."""
+        """Continue from the update in flight if an earlier process of this layer published the update."""
         self._take_residual()
         if (
             self.plan.layer == "policy"
@@ -156,7 +156,7 @@ class LearnerLoop:
         note = pack_note(topic, learnt=self._learnt, took=took, until=update.computed_from, excluded=excluded)
         self.bus.publish(topic, note)
         if self.plan.layer == "policy" and self._judge():
-            return  # control has since rolled back the policy from which it was trained
+            return  # control has since rolled back the policy from which the update was trained
         if self._wanted():
             self._publish(update)
 
@@ -193,7 +193,7 @@ class LearnerLoop:
             return
         topic = f"parameters.{layer}"
         before = self.bus.latest(topic)
-        known = self._status().get("newest", {}).get(layer, 0)  # a new bus lacks versions that control has received
+        known = self._status().get("newest", {}).get(layer, 0)  # a new bus may lack the version in control
         version = max(0 if before is None else before.version, known) + 1
         parent = self._flown[-1][0] if self._flown else 0
         whole = self._learnt_by(update)
@@ -213,7 +213,7 @@ class LearnerLoop:
         return LearnerState(self.state.policy, update.state)
 
     def _judge(self) -> bool:
-        """Continue from an accepted policy or, after a rollback, from the last valid one; return if there was one."""
+        """Continue from an accepted policy or, after a rollback, the last valid one; return True after a rollback."""
         status = self._status()
         given_up, back = status.get("given_up", []), False
         while self._flown and self._flown[-1][0] in given_up:
@@ -231,14 +231,14 @@ class LearnerLoop:
             self.worker.receive(update)
             self._flown, self._pending = [*self._flown[-REMEMBERED:], (version, update)], None
         elif self._clock() - published > VERDICT:
-            self._pending = None  # it was corrupted in transit, or control no longer accepts policies
+            self._pending = None  # the policy was corrupted in transit, or control no longer accepts policies
         return back
 
     def _status(self) -> dict[str, Any]:
         return last_note(self.bus, "status")
 
     def _wanted(self) -> bool:
-        """Return whether learning is not paused and control accepts updates, which it does only in policy mode."""
+        """Return whether learning is active and control accepts updates, which it does only in policy mode."""
         return self._status().get("mode", "policy") == "policy" and not last_note(self.bus, "learning").get(
             "paused", False
         )
@@ -258,7 +258,7 @@ class LearnerLoop:
         return message.data
 
     def leave(self, folder: Path, patience: float = 3.0) -> None:
-        """Write the flight's last learned state once no policy is in control, or after ``patience`` [s]."""
+        """Write the flight's last learned state once updates are no longer accepted, or after ``patience`` [s]."""
         until = self._clock() + patience
         while self._wanted() and self.bus.latest("ended") is None and self._clock() < until:
             time.sleep(CHECK_EVERY)
@@ -274,9 +274,9 @@ def _start(state: LearnerState) -> PolicyUpdate:
 
 
 def learn(plan: LearnerPlan) -> None:
-    """Learn until the flight is over, as the main function of the process."""
+    """Learn until the flight is over; this is the main function of the process."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(NICE)  # so that a browser or terminal on the same machine does not have to wait for an update
+        os.nice(NICE)  # a browser or terminal on the same machine must not wait for an update
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     loop = LearnerLoop(plan, bus)

@@ -26,22 +26,22 @@ from .learner_mission import LearnerMission
 from .learner_process import LearnerPlan
 from .spec import MAINS
 
-IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before it
+IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before the flight
 BEAT_EVERY = TOLD_EVERY = 0.25  # [s]
-SILENCE = 5.0  # [s] without a message from the flight, after which the silence is reported
+SILENCE = 5.0  # [s] without a status from the flight, after which the silence is reported
 STARTING, ATTEMPTS = 300.0, 5  # [s] for a learner to compile and send its first heartbeat; restarts per learner
 
 
 class LearnerServer:
-    """Learners of one flight on another machine. Leaving the context ends them."""
+    """Runs the learners of one flight on a different machine. Leaving the context ends the learners."""
 
     def __init__(self, address: Address, fleet: FleetProcess | None = None, trust: tuple[str, ...] = ()) -> None:
         """Join the bus.
 
         Args:
             address: Address of the flight.
-            fleet: Process that learns for several flights; None for separate processes for this flight.
-            trust: Python names that the flight may use, e.g. ``mine:task``; this machine imports them.
+            fleet: Process that learns for several flights; None to start separate processes for this flight.
+            trust: Python names that the flight may use, e.g. ``mine:task``; this machine imports these names.
 
         Raises:
             ConfigError: The bus cannot be joined.
@@ -89,7 +89,7 @@ class LearnerServer:
     def learn(self) -> Iterator[str]:
         """Learn until the flight is over; yield the status after each step.
 
-        A flight that has become silent may return, and a different flight may begin.
+        A silent flight may send messages again, and a different flight may begin.
         """
         while True:
             self._look()
@@ -101,13 +101,13 @@ class LearnerServer:
                 self._standing = self._beat()
             if ended := last_note(self._bus, "ended"):
                 self._tell(over=True)
-                time.sleep(FAREWELL)  # the flight keeps its bridge until it receives that message
+                time.sleep(FAREWELL)  # the flight keeps its bridge until it receives this note
                 yield one_line(f"flight over: {ended.get('reason', '')}")
                 return
             yield self._standing
 
     def _look(self) -> bool:
-        """Accept a new mission, if there is one; return whether there is a mission."""
+        """Accept a new mission if one has arrived; return whether this station has a mission."""
         message = self._network.latest("mission", self._known)
         try:
             mission = None if message is None else LearnerMission.unpack(message.data)
@@ -138,7 +138,7 @@ class LearnerServer:
         """Start learning for a new flight."""
         self._end()
         self._bus = SharedMemoryBus.create({**mission.capacities, **{beat_topic(x): 1024 for x in mission.layers}})
-        topics = mission.capacities  # a controller without a residual has no topic for it
+        topics = mission.capacities  # a controller without a residual has no topic for residual parameters
         out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
         # The network still holds messages from the previous flight; its ticks, orders and reference do not apply here.
         before = {} if self._bridge is None else self._bridge.known
@@ -161,7 +161,7 @@ class LearnerServer:
 
     def _begin_with(self, layer: Any) -> None:
         self._start(layer)
-        if self._fleet is None:  # a process that learns for several flights does not send a heartbeat for each
+        if self._fleet is None:  # a process that learns for several flights does not send heartbeats for each flight
             self._pulses.expect(layer, STARTING)
 
     def _start(self, layer: Any) -> None:
@@ -199,7 +199,7 @@ class LearnerServer:
         return failed or self._stands()
 
     def _tell(self, failed: str = "", *, over: bool = False) -> None:
-        """Report to the flight which learners are alive and whether this station has received the end of the flight."""
+        """Report to the flight which learners are alive and whether this station knows that the flight is over."""
         assert self._mission is not None
         alive = {layer: process.poll() is None for layer, process in self.processes.items()}
         note = pack_note("ground", base=self._mission.base, alive=alive, failed=failed, over=over)
@@ -231,21 +231,21 @@ def learn_for(
 ) -> str:
     """Learn for flights on other machines until all of them are over.
 
-    A single flight uses separate processes. Several flights share one process, which learns for all flights that are
-    due at the same time.
+    For a single flight, each layer learns in its own process. Several flights share one process, which runs the updates
+    that are due at the same time together.
 
     Args:
         addresses: Addresses of the flights.
         stop: Event that ends learning early; the flights continue with their last policies.
-        told: Called at a high rate with the status of the flights.
-        trust: Python names that a flight may use, e.g. ``mine:task``; this machine imports them.
+        told: Function that is called at a high rate with the status of the flights.
+        trust: Python names that a flight may use, e.g. ``mine:task``; this machine imports these names.
 
     Returns:
         The final status of the flights.
 
     Raises:
-        ConfigError: A bus cannot be joined, an address occurs twice, the addresses name two rosmasters, or an
-            address is outside this machine and there is no shared key.
+        ConfigError: A bus cannot be joined, an address occurs twice, the addresses name more than one rosmaster, or
+            an address is outside this machine and there is no shared key.
         Exception: The first failure, raised when the other flights are over.
     """
     if twice := [str(each) for i, each in enumerate(addresses) if each in addresses[:i]]:
@@ -261,17 +261,17 @@ def learn_for(
             stack.callback(fleet.close)
         grounds = [stack.enter_context(LearnerServer(address, fleet, trust)) for address in addresses]
         stands = dict.fromkeys(grounds, "waiting for a flight")
-        # One thread per flight, so that a slow network to one vehicle does not delay the others.
+        # One thread per flight, so a slow network to one vehicle does not delay the others.
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
         flights = {pool.submit(_serve, ground, stands, stop): ground for ground in grounds}
         try:
             while (now := wait(flights, TOLD_EVERY)).not_done:
-                for flight in now.done:  # report a failure immediately: the other flights may last long
+                for flight in now.done:  # report a failure immediately, since the other flights may last long
                     if (error := flight.exception()) is not None:
                         stands[flights[flight]] = f"failed: {error!r}"
                 told(_summary(stands))
         except BaseException:
-            stop.set()  # so that the threads end, too
+            stop.set()  # end the threads, too
             raise
         for flight in flights:
             flight.result()

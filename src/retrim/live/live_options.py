@@ -16,13 +16,13 @@ from ..tasks.shapes import REFERENCES
 
 
 def choices(setup: Setup, present: str) -> tuple[str, ...]:
-    """Return the references that a user may select in flight, the present one first.
+    """Return the names of the references that a user may select in flight, with the current one first.
 
-    The result is empty if the policy does not observe its reference: such a policy cannot follow a different one.
+    The result is empty if the policy does not observe its reference: such a policy cannot follow a different reference.
 
     Args:
         setup: Set-up of the flight.
-        present: Name of the present reference.
+        present: Name of the current reference.
     """
     seen = jax.tree.leaves(setup.flight_task.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
     if not any(isinstance(part, Reference) for part in seen):
@@ -31,7 +31,7 @@ def choices(setup: Setup, present: str) -> tuple[str, ...]:
 
 
 def paths(names: Sequence[str], seconds: float) -> Mapping[str, np.ndarray]:
-    """Return the positions along each reference over ``seconds``, world [m], (n, 3), by name."""
+    """Return the positions along each reference over ``seconds`` in the world frame [m], (n, 3), by name."""
     times = jnp.arange(0.0, seconds, 0.05)
     return {name: np.asarray(_places(make_reference(name), times), dtype=float) for name in names}
 

@@ -26,15 +26,15 @@ class ManualDisturbance:
     """Positions of the knobs. Their effects are added to the scenario's disturbance."""
 
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """External acceleration, world [m/s^2]."""
+    """External acceleration in the world frame [m/s^2]."""
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Wind, world [m/s]."""
+    """Wind velocity in the world frame [m/s]."""
     load: float = 0.0
     """Mass of the payload under the vehicle [kg]."""
     rotor: float = 1.0
-    """Share of its thrust that the front-right rotor keeps."""
+    """Share of its thrust that the front-right rotor retains."""
     kick: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Acceleration of the last kick, world [m/s^2]."""
+    """Acceleration of the last kick in the world frame [m/s^2]."""
     kicks: int = 0
     """Number of kicks so far; an increase triggers a kick."""
 
@@ -76,10 +76,10 @@ class ManualDisturbance:
 
 
 class KnobbedPlant:
-    """Plant with knobs that change in flight. It rejects unsupported knobs, and the flight continues."""
+    """Plant with knobs that may change in flight. The plant rejects unsupported knobs, and the flight continues."""
 
     def __init__(self, plant: Plant, scenario: Scenario, seed: int) -> None:
-        """Initialise; a user-defined plant without a ``disturb`` method has no knobs."""
+        """Initialise with a plant; a user-defined plant without a ``disturb`` method has no knobs."""
         self.refused = "" if hasattr(plant, "disturb") else "this plant has no knobs"
         """Reason why the last change of the knobs was rejected; empty if it was accepted."""
         self._plant, self._possible = plant, not self.refused

@@ -1,4 +1,4 @@
-"""User requests in flight: land, pause, change the method, fly the initial parameters, change the reference."""
+"""Execute the user's requests in flight, such as to land, to pause learning or to change the method or reference."""
 
 import contextlib
 import time
@@ -19,14 +19,14 @@ from .session import LiveRequest, learner_state
 from .status import Status
 from .supervisor import Supervisor
 
-SETTLED_S = 0.5  # [s] without a further change, after which a change of the knobs becomes an event
+SETTLED_S = 0.5  # [s] without a further change, after which the new knob positions become an event
 
 
 class OperatorRequests:
-    """Reads and executes the user's requests in one flight. Long operations run in a separate thread."""
+    """Reads and executes the user's requests during one flight. Long operations run in a separate thread."""
 
     def __init__(self, request: LiveRequest, supervisor: Supervisor) -> None:
-        """Initialise for a supervisor's flight."""
+        """Initialise for the flight of a supervisor."""
         self._request, self._supervisor = request, supervisor
         self._wish: dict[str, Any] = {"method": request.method, "paused": False}
         self._method, self._starts = request.method, 0
@@ -70,7 +70,7 @@ class OperatorRequests:
         return [Event(status.t, "asked", f"method {method}" + (", paused" if paused else ""))]
 
     def _start_of(self, method: str, status: Status) -> Path:
-        """Write the policy and residual in flight, in the form that ``method`` learns; return the path."""
+        """Write the policy and the residual in flight in the form that ``method`` learns; return the path."""
         start, trust = self._supervisor.start, self._supervisor.spec.trust
         state = learnt_in(self._supervisor.bus, status, start, trust) or load_learner_state(start, trust=trust)[0]
         self._starts += 1

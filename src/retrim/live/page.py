@@ -1,4 +1,4 @@
-"""Process of the page, which shows a flight and its knobs in a browser. It never blocks the flight."""
+"""Process of the page, which shows a flight and its knobs in a browser. The page never blocks the flight."""
 
 import contextlib
 import io
@@ -59,10 +59,10 @@ HOST = re.compile(r"(?:[\w-]{1,63}\.){0,9}[\w-]{1,63}|(?=.*:)[\da-fA-F:.]{2,45}(
 
 
 def free_port(host: str, wanted: int) -> int:
-    """Return the first free port of ``host`` among the ten ports that start at ``wanted``.
+    """Return the first free port of ``host`` among the ten ports from ``wanted`` on.
 
     Raises:
-        ConfigError: All ten ports are in use, or this machine does not have the address.
+        ConfigError: All ten ports are in use, or ``host`` is not an address of this machine.
     """
     if not HOST.fullmatch(host):
         raise ConfigError(f"--page-host {excerpt(host)}: neither an address nor the name of a host")
@@ -82,11 +82,11 @@ def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], N
     Args:
         host: Address to listen on.
         port: First port to try.
-        demanded: Whether the user requested a page explicitly, rather than by default.
-        say: Called with messages for the user.
+        demanded: Whether the user explicitly requested a page.
+        say: Function that is called with messages for the user.
 
     Raises:
-        ConfigError: The port is out of range, or a requested page is not possible.
+        ConfigError: The port is out of range, or a requested page cannot be shown.
     """
     if not 1 <= port <= 65535:
         raise ConfigError(f"--page-port {port} must be between 1 and 65535")
@@ -105,7 +105,7 @@ def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], N
 
 
 def show(plan: PagePlan) -> None:
-    """Show the flight until the process is terminated, as the main function of the process."""
+    """Show the flight until the process is terminated; this is the main function of the process."""
     import viser
 
     bus, parent, spec = SharedMemoryBus(plan.folder), ParentWatch(plan.parent), plan.page
@@ -200,7 +200,7 @@ class _Page:
             self._bus.publish(PAGE, pack_note(PAGE, count=self._refused, last=plain(why)))
 
     def _turn(self, turned: Callable[[ManualDisturbance], ManualDisturbance]) -> ManualDisturbance | None:
-        """Set the knobs relative to their current positions; return these positions if that fails.
+        """Set the knobs relative to their current positions; return the current positions if the change fails.
 
         This method may be called from any thread.
         """
@@ -225,10 +225,10 @@ class _Page:
             return first | {"reference": next(iter(self._paths), "")} | self._wishes
 
     def _possible(self, wish: dict[str, Any]) -> dict[str, Any]:
-        """Return the known fields of a request after a check.
+        """Check a request, and return its known fields.
 
         Raises:
-            MessageError: A field has the wrong type, or there is no such choice.
+            MessageError: A field has the wrong type, or its value is not among the choices.
         """
         result = read_fields("wish", {name: value for name, value in wish.items() if name in FIELDS["wish"]})
         for name, there in (("method", (*self._spec.methods, "none")), ("reference", tuple(self._spec.paths))):
@@ -267,13 +267,13 @@ def _text(
 
 
 def _drawn(vector: Any) -> np.ndarray:
-    """Return a finite vector of limited size for drawing, whatever values were reported."""
+    """Return a vector for drawing, with finite and bounded values, whatever values were reported."""
     drawn: np.ndarray = np.clip(np.nan_to_num(np.asarray(vector, dtype=float)), -FAR, FAR)
     return drawn
 
 
 def _escaped(text: str) -> str:
-    """Return a text with its Markdown markup escaped, so that it is shown literally."""
+    """Return a text with its Markdown markup escaped so that the text is shown literally."""
     return "".join(c if c.isalnum() or c in " ,.:;()'+-/%=" else f"&#{ord(c)};" for c in plain(text))
 
 

@@ -1,8 +1,8 @@
-"""Access control of a flight's page: only users with the printed address may open it, and only by that address.
+"""Restrict access to a flight's page: only users with the printed address may open the page, and only at that address.
 
 Every website that is open in a browser can send requests to this machine. The server therefore answers a request only
-if its path begins with a random token, its ``Host`` is the address that it has reached, and its ``Origin`` is the page
-itself. An attacker's name that resolves to this machine (DNS rebinding) is a different ``Host``.
+if its path begins with a random token, its ``Host`` is the address that the request has reached, and its ``Origin`` is
+the page itself. An attacker's name that resolves to this machine (DNS rebinding) is a different ``Host``.
 """
 
 import contextlib
@@ -29,17 +29,17 @@ SEALED = {
 
 
 def page_url(host: str, port: int, token: str) -> str:
-    """Return the address of a page that listens on ``host``, with its token."""
+    """Return the address, including the token, of a page that listens on ``host``."""
     return f"http://{_bracketed(_outward() if host in EVERYWHERE else host)}:{port}/{token}"
 
 
 def refusal(
     path: str, headers: Mapping[str, tuple[str, ...]], *, token: str, host: str, local: tuple[Any, ...]
 ) -> HTTPStatus | None:
-    """Return the status with which a request is refused; None if the request is allowed.
+    """Return the HTTP status with which to refuse a request; None if the request is allowed.
 
     Args:
-        path: Path of the request with its query, unmodified.
+        path: Unmodified path of the request, with its query.
         headers: All values of each header of the request, by name in lower case.
         token: First part of every path of the page.
         host: Address that the page listens on.
@@ -59,7 +59,7 @@ def refusal(
 
 @contextlib.contextmanager
 def only_for(token: str, host: str) -> Iterator[None]:
-    """Restrict each server of ``websockets`` that starts in this context to requests with the token.
+    """Restrict each ``websockets`` server that starts in this context to requests with the token.
 
     viser serves files and WebSockets with one such server and provides no hook for access control.
 
@@ -104,7 +104,7 @@ def only_for(token: str, host: str) -> Iterator[None]:
 
 
 def _authorities(host: str, local: tuple[Any, ...]) -> set[str]:
-    """Return the valid ``Host`` values, with port, for an address that a browser has reached."""
+    """Return the valid ``Host`` values, with the port, for an address that a browser has reached."""
     address, port = ip_address(str(local[0]).partition("%")[0]), int(local[1])
     if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
         address = address.ipv4_mapped
@@ -119,7 +119,7 @@ def _bracketed(host: str) -> str:
 
 
 def _outward() -> str:
-    """Return the address by which other machines reach this one, without sending a packet."""
+    """Return the address at which other machines reach this one, without sending a packet."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))
         return str(probe.getsockname()[0])

@@ -1,4 +1,4 @@
-"""Input filter of the page: a browser may change only the values of controls."""
+"""Filter the input to the page: a browser may change only the values of controls."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ def take_values_only(server: Any, refuse: Callable[[str], None]) -> None:
 
     Args:
         server: The viser server.
-        refuse: Called with a description of the refused input.
+        refuse: Function that is called with a description of each refused input.
     """
     from viser._messages import GuiUpdateMessage
 

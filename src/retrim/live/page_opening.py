@@ -1,4 +1,4 @@
-"""Opening of a flight's page in a browser on this machine."""
+"""Open a flight's page in a browser on this machine."""
 
 import atexit
 import contextlib
@@ -11,9 +11,9 @@ from pathlib import Path
 
 
 def open_page(url: str, folder: Path) -> None:
-    """Open a page through a file that only this user can read.
+    """Open a page in a browser through a file that only this user can read.
 
-    All users of a machine can read a browser's command line, so it must not contain the token.
+    All users of a machine can read a browser's command line, so the command line must not contain the token.
 
     Args:
         url: Address of the page, with its token.

@@ -1,4 +1,4 @@
-"""Panel of the page, with controls and the status of the flight."""
+"""Panel of the page; it contains controls and the status of the flight."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ WAITING = "Waiting for take-off."
 
 
 class Panel:
-    """Panel of sliders, buttons and a history plot. It reports each user action immediately."""
+    """Panel with sliders, buttons and a history plot. It reports each user action immediately."""
 
     def __init__(
         self,
@@ -33,9 +33,9 @@ class Panel:
 
         Args:
             server: The viser server.
-            turn: Called with a function that maps the current positions of the knobs to the new ones; it returns the
-                current positions if the new ones are not possible.
-            wish: Called with ``method`` and ``paused``, with ``reference``, or with ``land``; it returns the current
+            turn: Function that takes a mapping from the current positions of the knobs to the new ones; it returns
+                the current positions if the new ones are not possible, else None.
+            wish: Function that takes ``method`` and ``paused``, ``reference``, or ``land``; it returns the current
                 requests, which may differ from the arguments.
             knobs: Positions of the knobs.
             wishes: Earlier requests.
@@ -92,12 +92,12 @@ class Panel:
         self._gui.add_button("Land", color="red").on_click(lambda _: wish(land=True))
 
     def pull(self, a: np.ndarray) -> None:
-        """Set the acceleration of the mouse pull, world [m/s^2]."""
+        """Set the acceleration of the mouse pull in the world frame [m/s^2]."""
         self._pull = a
         self._turned()
 
     def note(self, t: float, error: float, policies: int) -> None:
-        """Add the time since take-off [s], distance from the target [m] and number of policies to the history."""
+        """Add the flight time [s], the distance from the target [m] and the number of policies to the history."""
         self._history.append((t, 100.0 * error, policies))
 
     def show(self, text: str) -> None:
@@ -106,7 +106,7 @@ class Panel:
         if len(self._history) > 1:
             t, error, policies = np.array(self._history).T
             top = max(1.0, 1.1 * error.max())
-            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # others lie below the axis
+            marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # hide others below the axis
             self._plot.scales = _scales((t[0], t[-1]), top)
             self._plot.data = (t, error, marks)
 

@@ -1,4 +1,4 @@
-"""Plans for the processes of a live flight."""
+"""Plans of the processes of a live flight."""
 
 import os
 from pathlib import Path
@@ -19,7 +19,7 @@ PRIORITIES = {"control": 30, "watchdog": 40, "plant": 20}
 
 
 def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores: frozenset[int], control: int) -> Any:
-    """Return the plan for a role.
+    """Return the plan of the process with a role.
 
     Args:
         role: Name of the role.
@@ -28,7 +28,7 @@ def plan_of(role: str, spec: LiveSpec, start: Path, floor: int, bus: Path, cores
         floor: Policy version; updates up to this version are older than ``start``.
         bus: Folder of the bus.
         cores: CPU cores of the real-time processes.
-        control: Process identifier of the control process; 0 before it runs.
+        control: Process identifier of the control process; 0 before the control process runs.
     """
     s, parent = spec, os.getpid()
     if role == "control":

@@ -1,4 +1,4 @@
-"""Process of a simulated plant. It runs in wall-clock time, like a vehicle."""
+"""Process of a simulated plant. The plant runs in wall-clock time, like a vehicle."""
 
 import contextlib
 import time
@@ -39,7 +39,7 @@ class PlantPlan:
     vehicle: Any
     """Vehicle used in training: a name or a specification."""
     x0: np.ndarray
-    """Initial state: p, R by rows, v."""
+    """Initial state: p, R by rows and v."""
     dt: float
     seed: int
     cores: frozenset[int]
@@ -48,7 +48,7 @@ class PlantPlan:
 
 
 def simulate(plan: PlantPlan) -> None:
-    """Simulate until the vehicle has landed, as the main function of the process."""
+    """Simulate until the flight ends; this is the main function of the process."""
     jax.config.update("jax_cpu_enable_async_dispatch", False)  # compute each tick synchronously, without a thread pool
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
@@ -98,7 +98,7 @@ def _flown(
         setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
         unanswered = 0 if setpoint is not None else unanswered + 1
         if setpoint is None:
-            held += 1  # a vehicle also keeps the last command
+            held += 1  # like a vehicle, keep the last command
             if unanswered * plan.dt > ALONE and parent.gone():
                 return "nobody commands, and the supervisor is gone"
         elif setpoint.landed:
@@ -121,7 +121,7 @@ def _flown(
 
 
 def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
-    """Return the setpoint from control or the fallback for a sample; None if it does not arrive by ``until`` [s]."""
+    """Return the setpoint from control or the fallback for a tick; None if no setpoint arrives by ``until`` [s]."""
     while True:
         for topic in ("setpoint", "fallback"):
             message = bus.latest(topic)

@@ -1,7 +1,7 @@
-"""Full updates, including optimiser states, which learners publish on the bus in addition to parameters.
+"""Keep full updates, including optimiser states, on the bus in addition to parameters.
 
-A restarted learner continues from such an update. The bus keeps two updates of each layer: the last one, and the
-newest one in flight.
+A restarted learner continues from such an update. The bus holds two updates of each layer; the newest update in flight
+is always one of them.
 """
 
 import contextlib
@@ -14,13 +14,13 @@ from ..errors import MessageError
 from ..onboard.topics import LAYERS, SLOTS, slot
 from ..transport.bus import Bus, Message
 
-PREFIX = 8  # [bytes], length of the version in front of an update
+PREFIX = 8  # [bytes], length of the version that precedes an update
 
 
 def keep(bus: Bus, layer: str, version: int, update: Update, status: dict[str, Any]) -> None:
-    """Publish an update in place of the one before the last, but never in place of the one in flight.
+    """Publish an update in place of an older one, but never in place of the one in flight.
 
-    The update in flight must remain, since control may not accept the new one.
+    The update in flight must remain, since control may not accept the new update.
 
     Args:
         bus: Bus of the flight.
@@ -37,12 +37,12 @@ def keep(bus: Bus, layer: str, version: int, update: Update, status: dict[str, A
 
 
 def newest_update(bus: Bus, state: LearnerState, layer: str, after: int = 0) -> tuple[int, Update] | None:
-    """Return the newest update of a layer with its version, if it is newer than ``after``."""
+    """Return the newest update of a layer with its version; None if the update is not newer than ``after``."""
     return _newest(bus, state, layer, lambda version: version > after)
 
 
 def active_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, Any]) -> tuple[int, Update] | None:
-    """Return the newest update of a layer in flight, with its version; None if it is not on the bus.
+    """Return the newest update of a layer in flight with its version; None if that update is not on the bus.
 
     Args:
         bus: Bus of the flight.
@@ -54,7 +54,7 @@ def active_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, A
 
 
 def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> LearnerState | None:
-    """Return the last learned state that was in flight; None if no update was in flight.
+    """Return the last learned state that was used in flight; None if no update was used.
 
     Args:
         bus: Bus of the flight.
@@ -71,7 +71,7 @@ def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> Learne
 
 
 def _flies(layer: str, status: dict[str, Any]) -> Callable[[int], bool]:
-    """Return a function that checks whether control has accepted a version and has not rolled it back."""
+    """Return a function that checks whether control has accepted a version and has not rolled that version back."""
     newest = status.get("newest", {}).get(layer, 0)
     given_up = status.get("given_up", []) if layer == "policy" else []
     return lambda version: version <= newest and version not in given_up

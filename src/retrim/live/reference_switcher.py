@@ -1,4 +1,4 @@
-"""Reference changes in flight: the user selects a reference, and the vehicle changes to it smoothly."""
+"""Change the reference in flight: the user selects a reference, and the vehicle goes over to it smoothly."""
 
 from concurrent.futures import Executor, Future
 
@@ -24,7 +24,7 @@ TOLD = "followed"
 
 
 class ReferenceSwitcher:
-    """Changes the reference on request. It computes the tables in a separate thread."""
+    """Changes the reference on request. A separate thread computes the tables."""
 
     def __init__(self, request: LiveRequest, supervisor: Supervisor, work: Executor) -> None:
         """Initialise for a flight.
@@ -49,7 +49,7 @@ class ReferenceSwitcher:
         """Begin a change to a different reference as soon as no other change is pending; return the events.
 
         Args:
-            name: Name of the reference, one of the choices. Repeated requests for the same one have no effect.
+            name: Name of the reference; other names than the choices are ignored. Repeated requests have no effect.
             t: Flight time [s].
         """
         if name in self._choices:
@@ -79,7 +79,7 @@ class ReferenceSwitcher:
                 if self._attempts < ATTEMPTS:
                     self._make(name)
                 else:
-                    self._publish(self.pieces[-1][1], t)  # learners return to the reference in flight
+                    self._publish(self.pieces[-1][1], t)  # make learners return to the reference in flight
                     new = [Event(status.t, "asked", f"reference {name} cannot be followed: it was not taken")]
         return new + self._begun(status.t)
 
@@ -99,7 +99,7 @@ class ReferenceSwitcher:
     def _table(self, name: str) -> tuple[float, Reference]:
         """Return the start time of the transition, and the table.
 
-        A first call compiles the program, so that the compile time does not shift the start.
+        A first, discarded computation compiles the program, so the compile time does not delay the start.
         """
         old, new = self.pieces[-1][1], make_reference(name)
         transition_between(old, new, 0.0, self._vehicle)
@@ -113,9 +113,9 @@ class ReferenceSwitcher:
         return at, table
 
     def _now(self) -> float:
-        """Return the time [s] of the control process, which evaluates the table.
+        """Return the flight time of the control process, which evaluates the table [s].
 
-        On a busy machine a simulated plant falls behind wall-clock time, and control uses the plant's time.
+        On a busy machine, a simulated plant falls behind wall-clock time. Control uses the plant's time.
         """
         message = self._supervisor.bus.latest("flight")
         try:

@@ -1,4 +1,4 @@
-"""Invalid notes between processes: they are counted, and reported at intervals rather than each time."""
+"""Count the invalid notes between processes, and report only some of them."""
 
 from collections.abc import Iterable
 
@@ -8,13 +8,13 @@ from ..transport.bus import Bus
 
 NOTES = ("airborne", "beat.", "ended", "followed", "ground", "knobs", "learner.", "learning", "order", "ready.",
          "refusals.", "stalls", "status", "wish", "world")  # fmt: skip
-"""Topics of notes, or prefixes of their names."""
+"""Names of the topics of notes, or prefixes of these names."""
 PAGE, NETWORK = "refusals.page", "refusals.network"
-"""Topics of refusals: the page refuses browser inputs, and the bridge refuses network messages."""
+"""Topics with the number of browser inputs that the page refused and of network messages that the bridge refused."""
 
 
 class RefusedNotes:
-    """Checks each new note of a bus once. Readers of notes also ignore the notes that are refused here."""
+    """Checks each new note on a bus once. Readers of notes also ignore the notes that this class refuses."""
 
     def __init__(self, bus: Bus, topics: Iterable[str]) -> None:
         """Initialise for a bus.
@@ -29,7 +29,7 @@ class RefusedNotes:
         self._refused, self._told_so_far = dict.fromkeys(self._known, 0), dict[str, int]()
 
     def look(self) -> list[str]:
-        """Return lines about new refusals; a topic is reported at its 1st, 10th, 100th refusal and so on."""
+        """Return one line for each topic that has reached its 1st, 10th, 100th, etc. refusal since the last call."""
         said = []
         for topic, known in self._known.items():
             message = self._bus.latest(topic, known)
@@ -45,7 +45,7 @@ class RefusedNotes:
         return said
 
     def _told(self, topic: str) -> list[str]:
-        """Count the refusals that a process has published."""
+        """Count the new refusals that a process has published."""
         note = last_note(self._bus, topic)
         before, now = self._told_so_far.get(topic, 0), note.get("count", 0)
         self._told_so_far[topic] = now

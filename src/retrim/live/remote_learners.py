@@ -35,7 +35,7 @@ class RemoteLearners:
         self._bus.publish("mission", mission.pack())
 
     def alive(self) -> dict[str, bool]:
-        """Return whether each learner is alive, according to the last message from its machine."""
+        """Return whether each learner is alive according to the last message from the learners' machine."""
         message, said = self._bus.latest("ground"), None
         if message is not None:
             if message.version != self._beat[0]:
@@ -45,11 +45,11 @@ class RemoteLearners:
         return {layer: fresh and isinstance(said, dict) and bool(said.get(layer)) for layer in self._spec.layers}
 
     def ready(self, layer: str) -> bool:
-        """Return whether a learner is ready for this flight, rather than for an earlier one."""
+        """Return whether a learner is ready for this flight rather than for an earlier one."""
         return last_note(self._bus, f"ready.{layer}", "ready").get("base") == self._spec.controller.base
 
     def failed(self) -> str | None:
-        """Return why the learners cannot learn: a wrong key, or the last output of a dead learner; else None."""
+        """Return why the learners cannot learn, e.g. a wrong key or a dead learner's last output; None if they can."""
         fault = last_note(self._bus, NETWORK).get("fault", "")
         self._distrust = (self._distrust or time.monotonic()) if fault else None
         if self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
@@ -63,7 +63,7 @@ class RemoteLearners:
     def part(self) -> None:
         """Wait until the learners confirm the end of the flight or are gone.
 
-        The learners run until they receive the note about the end.
+        The learners run until they receive the note about the end of the flight.
         """
         base, began = self._spec.controller.base, time.monotonic()
         while (waited := time.monotonic() - began) < PARTING:

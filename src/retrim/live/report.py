@@ -32,7 +32,7 @@ GAP_S = 0.5  # [s], allowed gap in a log, since a stalled machine does not send 
 def flight_of(
     request: LiveRequest, events: Sequence[Event], status: Status, learnt: LearnerState | None, path: Path
 ) -> tuple[Flight, np.ndarray]:
-    """Return the flight in a log, up to its landing, and the rows of the log.
+    """Return the flight in a log, up to its landing, and all rows of the log.
 
     Args:
         request: Request for the flight.
@@ -69,7 +69,7 @@ def flight_of(
 def results(
     request: LiveRequest, flight: Flight, rows: np.ndarray, status: Status, events: LiveEvents
 ) -> list[dict[str, Any]]:
-    """Return the rows of ``results.json``, which exclude the landing.
+    """Return the rows of ``results.json``; the results exclude the landing.
 
     Args:
         request: Request for the flight.
@@ -113,7 +113,7 @@ def results(
 
 
 def _stalls(status: Status, dt: float) -> dict[str, Any]:
-    """Return statistics of the machine's stalls and the ticks missed in them, or null values without stall reports."""
+    """Return the machine's stalls and the ticks missed in them; the values are null without stall reports."""
     seen = status.stalls
     if not seen:
         return dict.fromkeys(("missed_in_stalls", "stalls", "stall_max_ms"))
@@ -122,7 +122,7 @@ def _stalls(status: Status, dt: float) -> dict[str, Any]:
 
 
 def missing(rows: np.ndarray, status: Status, dt: float) -> list[str]:
-    """Return one line about the part of a flight that its log lacks; an empty list if the log is complete.
+    """Return one line about the part of a flight that is missing from its log; an empty list if the log is complete.
 
     Args:
         rows: All rows of the log.
@@ -157,7 +157,7 @@ def _finite(value: Any) -> Any:
 
 
 def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()) -> LearnerState | None:
-    """Return the last learned state that was in flight; None if no update was in flight.
+    """Return the last learned state that was used in flight; None if no update was used.
 
     Args:
         bus: Bus of the flight.
@@ -169,7 +169,7 @@ def learnt_in(bus: Bus, status: Status, start: Path, trust: Collection[str] = ()
 
 
 def complaints(folder: Path) -> list[Path]:
-    """Return the files with the standard output and error of the processes; remove empty files."""
+    """Return the files with the processes' standard output and error; remove empty files."""
     result = sorted(folder.glob("*.log"))
     for path in result:
         if not path.stat().st_size:

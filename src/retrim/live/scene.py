@@ -1,4 +1,4 @@
-"""Three-dimensional scene with the vehicle and the disturbances on it."""
+"""Three-dimensional scene with the vehicle and the disturbances that act on it."""
 
 from collections import deque
 from collections.abc import Callable
@@ -11,7 +11,7 @@ METRES = 0.25  # [m per m/s^2], length of arrows
 ROPE = 5.0  # [1/s^2], acceleration per metre between grip and hand
 TRAIL_S = 6.0  # [s]
 FORWARD = np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, 1.0]])
-"""Directions of the rotors, x forward and y left: front-right, back-left, back-right, front-left."""
+"""Directions of the rotors (front-right, back-left, back-right, front-left); x points forward, y to the left."""
 
 
 class Scene:
@@ -26,7 +26,7 @@ class Scene:
             arm: Distance from the centre of the vehicle to a rotor [m].
             rate: Update rate of the scene [Hz].
         """
-        # Without shadows the page appears in a sixth of the time with software rendering.
+        # With software rendering, the page appears in a sixth of the time without shadows.
         server.scene.configure_default_lights(cast_shadow=False)
         self._scene, self._trail = server.scene, deque[np.ndarray](maxlen=round(TRAIL_S * rate))
         middle, size = path.mean(0), float(np.ptp(path, axis=0).max())
@@ -55,10 +55,10 @@ class Scene:
         }
 
     def on_pull(self, pull: Callable[[np.ndarray], None]) -> None:
-        """Call ``pull`` with an acceleration while the user pulls the vehicle, and with zero at the end.
+        """Call ``pull`` with an acceleration while the user pulls the vehicle, and with zero when the pull ends.
 
         Args:
-            pull: Called with the acceleration, world [m/s^2].
+            pull: Function that takes the acceleration, world [m/s^2].
         """
 
         async def dragged(event: Any) -> None:  # the server preserves the order of calls for coroutines only
@@ -74,7 +74,7 @@ class Scene:
         self._grip.on_drag("left")(dragged)
 
     def follow(self, path: np.ndarray) -> None:
-        """Show the current reference by positions along it, world [m], (n, 3)."""
+        """Show the current reference, given positions along it in the world frame [m], (n, 3)."""
         pairs = np.stack([path[:-1], path[1:]], axis=1)
         self._scene.add_line_segments("/reference", pairs, GREY, thickness=0.006)
 
@@ -85,7 +85,7 @@ class Scene:
 
         Args:
             p: Position, world [m].
-            R: Attitude, body to world.
+            R: Attitude, from body to world.
             target: Target position, world [m].
             disturbance: Acceleration that the simple model does not describe, world [m/s^2].
             estimate: Estimate of this acceleration from the residual model, world [m/s^2].
@@ -106,7 +106,7 @@ class Scene:
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
     """Return an attitude as a unit quaternion, real part first."""
-    from scipy.spatial.transform import Rotation  # local import: it takes as long as the import of retrim
+    from scipy.spatial.transform import Rotation  # local import, because it takes as long as the import of retrim
 
     x, y, z, w = Rotation.from_matrix(R).as_quat()
     return float(w), float(x), float(y), float(z)

@@ -1,4 +1,4 @@
-"""Specification of a live flight from a policy and a scenario."""
+"""Derive the specification of a live flight from a policy and a scenario."""
 
 import secrets
 from collections.abc import Callable
@@ -39,8 +39,8 @@ from .states import vector_of
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
 PATH_S = 20.0  # [s], duration of the reference path on the page
 STEP = 0.05  # [s] between two positions on the path
-BELOW_GROUND = 0.3  # [m], depth of the fence below z = 0: flights may start there, and transients go lower
-LONGEST = 3600.0  # [s], maximum length of a flight
+BELOW_GROUND = 0.3  # [m], depth of the fence below z = 0: flights may start at z = 0, and transients go lower
+LONGEST = 3600.0  # [s], maximum duration of a flight
 
 
 def check_limits(fence: float, seconds: float | None, policy_age: float | None) -> None:
@@ -48,8 +48,8 @@ def check_limits(fence: float, seconds: float | None, policy_age: float | None) 
 
     Args:
         fence: Maximum distance of the vehicle from the reference [m].
-        seconds: Length of the flight [s]; None to fly until the user stops the flight.
-        policy_age: Maximum age of the flight data from which the policy was learned [s]; None for any age.
+        seconds: Duration of the flight [s]; None to fly until the user stops the flight.
+        policy_age: Maximum age of the flight data from which the policy was learned [s]; None for no limit.
 
     Raises:
         ConfigError: One of the limits is out of range.
@@ -71,9 +71,9 @@ class LiveRequest:
     policy: AbstractPolicy
     scenario: Scenario
     method: str
-    """Method of the flight: one that learns, or one whose pilot is a controller."""
+    """Method of the flight: a learning method, or a method whose pilot is a controller."""
     seconds: float
-    """Length of the flight [s]; the fence must enclose the reference over this time."""
+    """Duration of the flight [s]; the fence encloses the reference over this time."""
     seed: int
     fence: float
     """Maximum distance of the vehicle from the reference along each axis [m]."""
@@ -81,13 +81,13 @@ class LiveRequest:
     state: LearnerState | None = None
     """Learned state of an earlier flight, from which learning continues."""
     page: tuple[str, int] | None = None
-    """Address and port of the page, if the flight has one."""
+    """Address and port of the page; None for a flight without a page."""
     learners: Address | None = None
-    """Address of the learners if they run on another machine."""
+    """Address of the learners on another machine; None for learners on this machine."""
     policy_age: float = float("inf")
     """Maximum age of the flight data from which the policy was learned [s]."""
     record: Path | None = None
-    """Path of a recording for other viewers."""
+    """Path of an additional recording; None for no additional recording."""
     until_stopped: bool = False
     """Whether an interruption is the intended end of the flight."""
 
@@ -104,7 +104,7 @@ class LiveRequest:
 
 
 def live_spec(request: LiveRequest) -> LiveSpec:
-    """Return the specification of all processes of a flight without starting them.
+    """Return the specification of all processes of a flight; do not start the processes.
 
     Raises:
         ConfigError: The method cannot be used in a live flight, or the reference is not finite.
@@ -165,12 +165,12 @@ def live_spec(request: LiveRequest) -> LiveSpec:
 
 
 def learners_at(text: str | None, say: Callable[[str], None], key: Path | None = None) -> Address | None:
-    """Return the address of the learners on another machine; None if they run on this one.
+    """Return the address of the learners on another machine; None if the learners run on this machine.
 
     Args:
         text: Address, e.g. ``zenoh:192.168.1.5:7447``; None for this machine.
-        say: Called with messages for the user.
-        key: File with the key that the learners share; None for the key from ``RETRIM_KEY``, if there is one.
+        say: Function that is called with messages for the user.
+        key: File with the key that the flight shares with the learners; None for the key from ``RETRIM_KEY``, if set.
 
     Raises:
         ConfigError: The text is not an address, a required package is not installed, an address outside this machine
@@ -218,7 +218,7 @@ def learner_state(request: LiveRequest, policy: AbstractPolicy, method: str, res
         request: Request for the flight.
         policy: Policy from which the learners start.
         method: Learning method.
-        residual: State of the fitted residual, if there is one.
+        residual: State of the fitted residual; None for the initial state.
     """
     key, prepare = request.flight.key(), find_method(method).learns
     chosen = policy if prepare is None else prepare(request.setup, policy, key)
@@ -256,7 +256,7 @@ def _limits(request: LiveRequest) -> Limits:
 
 
 def _places(request: LiveRequest, seconds: float) -> np.ndarray:
-    """Return positions along the reference, world [m], (n, 3)."""
+    """Return positions along the reference in the world frame [m], (n, 3)."""
     setup = request.setup
     times = jnp.arange(0.0, max(seconds, setup.preset.dt), STEP)
     return np.asarray(jax.jit(jax.vmap(setup.flight_task.target))(times), dtype=float)

@@ -43,7 +43,7 @@ class PageSpec:
     name: str
     """Name of the preset."""
     path: np.ndarray
-    """Positions along the reference, world [m], (n, 3)."""
+    """Positions along the reference in the world frame [m], (n, 3)."""
     methods: tuple[str, ...]
     """Available learning methods, the current one first; empty if the flight does not learn."""
     arm: float
@@ -51,12 +51,12 @@ class PageSpec:
     mass: float
     """Mass of the vehicle [kg]."""
     paths: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Positions along each available reference, world [m], (n, 3), by name, the current one first; empty if there is no
-    choice."""
+    """Positions along each available reference in the world frame [m], (n, 3), by name, the current one first; empty if
+    there is no choice."""
     world: str = ""
     """Description of the plant and the disturbance."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
-    """Secret first part of every path of the page; only the printed address contains it."""
+    """Secret first part of every path of the page; only the printed address contains this token."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,10 @@ class LiveSpec:
     delay_ticks: int
     window: int
     seconds: float
-    """Time after which the vehicle lands [s]."""
+    """Flight time after which the vehicle lands [s]."""
     seed: int
     folder: Path
-    """Folder for the log and for the standard output and error of the processes."""
+    """Folder for the log and for the processes' standard output and error."""
     spare: tuple[Path, ...] = ()
     """Folders for files that cannot be written to ``folder``."""
     page: PageSpec | None = None
@@ -91,4 +91,4 @@ class LiveSpec:
     trust: tuple[str, ...] = ()
     """Python names that ``start`` may contain. The user passed them to this process."""
     mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
-    """Main function of each process, by role. A link to a vehicle uses a different main function for the plant."""
+    """Main function of each process, by role. A flight of a vehicle uses a different main function for the plant."""

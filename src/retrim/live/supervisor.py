@@ -28,10 +28,10 @@ from .spec import RESTARTED, UNHURRIED, LiveSpec
 from .status import Status
 from .topics import topics
 
-LANDING = 60.0  # [s] for a landing; afterwards the processes are ended wherever the vehicle is
-LAST = 5  # [ticks] for the log to receive the last reports from control after the plant has ended
+LANDING = 60.0  # [s], longest time for a landing; the processes then end wherever the vehicle is
+LAST = 5  # [ticks] after the end of the plant, during which the log receives the last reports from control
 ATTEMPTS = 5  # restarts per process
-READY_S = 300.0  # [s], including compilation
+READY_S = 300.0  # [s], longest time until all processes are ready, including compilation
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Supervisor:
     hangs: dict[str, int] = field(default_factory=dict)
     """Number of times each process was ended because it was silent."""
     refused: dict[str, list[str]] = field(default_factory=dict)
-    """Requests that the operating system refused, by process."""
+    """Requests that the operating system refused, by role."""
     epoch: float | None = None
     _landing: bool = False
     _moved: str = ""
@@ -91,7 +91,7 @@ class Supervisor:
         self.bus.remove()
 
     def warm_up(self) -> Iterator[tuple[str, float]]:
-        """Start the processes; yield the names of those that are not ready, and the waiting time [s].
+        """Start the processes; yield the names of the processes that are not ready, and the waiting time [s].
 
         Raises:
             PlantError: A process ended (the message contains its last line of output), or was not ready in time.
@@ -121,7 +121,7 @@ class Supervisor:
             yield from self._lift_off()
 
     def take_off(self) -> None:
-        """Publish the order to start; the first tick is 0.5 s later for all processes.
+        """Publish the order to start; the first tick of all processes is 0.5 s later.
 
         Raises:
             PlantError: A process has ended after it was ready.
@@ -133,7 +133,7 @@ class Supervisor:
             self._pulses.expect(role)
 
     def _lift_off(self) -> Iterator[tuple[str, float]]:
-        """Make a vehicle take off under its autopilot's control once all processes are ready."""
+        """Make a vehicle take off under its autopilot's control."""
         began, self._airborne_ordered = time.monotonic(), True
         self.bus.publish("order", pack_note("order", order="take off"))
         while self.bus.latest("airborne") is None:
@@ -142,17 +142,17 @@ class Supervisor:
             time.sleep(0.1)
 
     def land(self) -> None:
-        """Publish the order to land, once."""
+        """Publish the order to land; further calls have no effect."""
         if not self._landing:
             self._landing = True
             self.bus.publish("order", pack_note("order", epoch=self.epoch, order="land"))
 
     def learn(self, *, paused: bool, flown: bool) -> None:
-        """Run or pause the learners, and fly the learned parameters or the initial ones."""
+        """Run or pause the learners, and fly with the learned parameters or the initial ones."""
         self.bus.publish("learning", pack_note("learning", paused=paused, flown=flown))
 
     def learn_from(self, start: Path) -> None:
-        """Restart the policy learner from a file."""
+        """Restart the policy learner from the learned state in a file."""
         self.start, newest = start, self.bus.latest("parameters.policy")
         self.floor = 0 if newest is None else newest.version
         if self._remote is not None:
@@ -174,7 +174,7 @@ class Supervisor:
         return last_note(self.bus, "ready.page", "ready").get("port")
 
     def watch(self) -> Status:
-        """Restart processes that died or hang if their role permits it; return the flight's status."""
+        """Restart processes that died or hang if their role permits a restart; return the flight's status."""
         assert self.epoch is not None
         self._heart.beat()
         ended = last_note(self.bus, "ended").get("reason")
@@ -207,7 +207,7 @@ class Supervisor:
         )  # fmt: skip
 
     def finish(self, patience: float = 3.0) -> None:
-        """Wait until the log is complete, and write the missing part if the recorder does not."""
+        """Wait until the log is complete; write the missing part if the recorder does not finish in time."""
         until, flew, recorder = time.monotonic() + patience, time.monotonic(), self.processes["recorder"]
         while recorder.poll() is None and time.monotonic() < until:
             if self._alive("plant"):
@@ -240,7 +240,7 @@ class Supervisor:
             self._pulses.expect(role, READY_S)
 
     def _record(self) -> None:
-        """Write the reported ticks that the log lacks; no other process may write at the same time."""
+        """Write the reported ticks that are not in the log; no other process may write at the same time."""
         Recorder(self.spec.folder / "flight.csv", self.bus, self.spec.spare).step()
 
     def _lost_plant(self) -> str:

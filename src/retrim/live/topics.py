@@ -1,4 +1,4 @@
-"""Topics of a live flight, with the maximum message length of each."""
+"""Topics of a live flight and their maximum message lengths."""
 
 from ..onboard.messages import COLUMNS
 from ..onboard.topics import LAYERS, REFERENCE, SLOTS, slot
@@ -13,7 +13,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
     """Return the maximum message length of each topic [bytes]."""
     half = {name: sum(a.nbytes for a in arrays.values()) for name, arrays in spec.controller.parameters.items()}
     rows = 8 * len(COLUMNS) * spec.window + 10_000
-    # Room for a policy with its optimiser's moments, even if the current method learns only a low-rank part of it.
+    # Leave room for a policy with its optimiser's moments, even if the current method learns only a low-rank delta.
     learnt = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
     return (
         dict.fromkeys(SMALL, 4096)

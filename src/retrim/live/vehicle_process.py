@@ -1,4 +1,4 @@
-"""Process of the link to a vehicle: it transfers samples and commands in real time."""
+"""Process of the link to a vehicle; the process transfers samples and commands in real time."""
 
 import math
 import signal
@@ -20,12 +20,12 @@ from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
 from .plant_process import ALONE, PlantPlan, answer
 
-HOLD_S = 0.05  # [s] between two reads of the orders while the autopilot holds
+HOLD_S = 0.05  # [s] between two reads of the orders while the autopilot holds the vehicle
 
 
 def fly(plan: PlantPlan) -> None:
-    """Take off, transfer until landing and return control to the autopilot, as the main function of the process."""
-    signal.signal(signal.SIGTERM, _ended)  # so that control returns to the autopilot in this case, too
+    """Take off, transfer messages until landing, and return control to the autopilot; main function of the process."""
+    signal.signal(signal.SIGTERM, _ended)  # return control to the autopilot in this case, too
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
 
     def wanted() -> bool:
@@ -58,7 +58,7 @@ def fly(plan: PlantPlan) -> None:
 
 
 def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: ParentWatch, epoch: float) -> str:
-    """Transfer samples and commands; return the reason for the end."""
+    """Transfer samples and commands; return the reason for the end of the flight."""
     tick, late, held, unanswered = 0, 0, 0, 0
     accepted = HOVER
     while True:
@@ -88,7 +88,7 @@ def _carried(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: ParentWatch
 def _sample(tick: int, dt: float, now: VehicleState, accepted: np.ndarray) -> Sample:
     state, truth = (np.concatenate([x.p, x.R.ravel(), x.v]) for x in (now, now.truth or now))
     # Normally report the age after extrapolation, for which the controller compensates. If the measurement is too old
-    # for the guard, report its full age, so that the guard refuses it.
+    # for the guard, report its full age: the guard then refuses the measurement.
     age = now.age if now.news <= Limits.state_age else now.news
     return Sample(tick, tick * dt, time.monotonic(), age, state, truth, accepted)
 

@@ -1,1 +1,1 @@
-"""Real-time control of a vehicle. It uses only NumPy and the standard library, without JAX or compilation."""
+"""Control a vehicle in real time, using only NumPy and the standard library, without JAX or compilation."""

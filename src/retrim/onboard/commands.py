@@ -1,4 +1,4 @@
-"""Orders from the supervisor."""
+"""Receive orders from the supervisor."""
 
 from ..errors import MessageError
 from ..transport.bus import Bus
@@ -7,9 +7,9 @@ from .realtime import ParentWatch
 
 
 def wait_for_take_off(bus: Bus, parent: ParentWatch) -> float | None:
-    """Wait for the order to take off, and return the time of the first tick on the monotonic clock [s].
+    """Wait for the order to take off; return the time of the first tick on the monotonic clock [s].
 
-    Return None if the supervisor ends before it gives the order.
+    Return None if the supervisor ends before it gives this order.
     """
     while not parent.gone(0.01):
         message = bus.latest("order")

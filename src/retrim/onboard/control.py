@@ -1,4 +1,4 @@
-"""The control loop: the urgent work of each tick, and other work in the time that remains."""
+"""The control loop, which does the urgent work of each tick first, and other work in the remaining time."""
 
 import contextlib
 import time
@@ -18,14 +18,14 @@ from .tick_budget import PHASE, ROOM
 from .timing_stats import blind_row
 
 REPORT_EVERY = 5  # ticks
-GAPS = 100  # the newest gaps are kept
+GAPS = 100  # number of gaps that are kept, the newest ones
 LANDING = "landing"
 BRIEF = PHASE / 4  # of a tick: longest duration of a decision that is rehearsed
 FELT = 0.1  # weight of a tick in the running mean of the disturbance
 
 
 class ControlLoop:
-    """Control loop of one flight. :meth:`tick` contains the whole control step, so that tests do not need a clock."""
+    """Control loop of one flight. :meth:`tick` contains the whole control step, so tests do not need a clock."""
 
     def __init__(self, plan: ControlPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
@@ -36,19 +36,18 @@ class ControlLoop:
         self.sample: Sample | None = None
         """Newest measurement."""
         self.stamp: Stamp | None = None
-        """Stamp of the newest measurement, even if its state was refused, because the plant still waits for an
-        answer."""
+        """Stamp of the newest measurement, even if its state was refused: the plant still waits for an answer."""
         self.over = False
-        """Whether the flight has ended and all its ticks are reported."""
+        """Whether the flight has ended and all its ticks have been reported."""
         self.error = 0.0
         self.missed, self.late_samples = 0, 0  # before the landing
         self.gaps: deque[tuple[float, float, int]] = deque(maxlen=GAPS)
-        """Gaps in the ticks: start and end [s, monotonic], and number of missed ticks."""
+        """Gaps in the ticks: start and end on the monotonic clock [s], and number of missed ticks."""
         self.felt, self.estimate = np.zeros(3), np.zeros(3)
-        """Acceleration error of the simple model over the last few tenths of a second, and the residual model's
-        estimate of it, world [m/s^2]."""
+        """Running means of the simple model's acceleration error and of the residual model's estimate of this error, in
+        the world frame [m/s^2]."""
         self.stages: deque[tuple[float, int, int]] = deque(maxlen=GAPS)
-        """Changes of the controller's stage: time since the start [s], stage, cause."""
+        """Changes of the controller's stage: time since the start [s], stage and cause."""
         self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
         self._row: np.ndarray | None = None
         self._start, self._issued, self._target = 0.0, np.array([]), np.zeros(3)
@@ -63,7 +62,7 @@ class ControlLoop:
         return self.bus.latest("sample", self._known["sample"]) is not None
 
     def warm_up(self) -> None:
-        """Run every program once before the flight, so that its first call in flight is not slow.
+        """Run every program before the flight so that its first call in flight is not slow.
 
         Raises:
             PlantError: The controller is too slow for its tick.
@@ -87,7 +86,7 @@ class ControlLoop:
             )
 
     def tick(self, now: float, lateness: float = 0.0) -> Setpoint | None:
-        """Read the newest sample, compute and publish the command, and return it; None before the first sample."""
+        """Read the newest sample, then compute, publish and return the command; return None before the first sample."""
         began, new = time.monotonic(), self._receive()
         sample, stamp = self.sample, self.stamp
         if sample is None or stamp is None:
@@ -109,20 +108,20 @@ class ControlLoop:
         elif self.mode in (Mode.BLIND, Mode.DROP):
             self._finish_row(None)
             self.rows.append(blind_row(sample, stamp, now, self._start, self.plan.dt, self._issued, self.mode))
-        if setpoint.landed:  # publish the ticks first: at this command the plant ends the flight, the recorder the log
+        if setpoint.landed:  # publish the ticks first, since the plant and the recorder end at this command
             self._finish_row(None)
             self._publish_rows()
             self.bus.publish("setpoint", setpoint.pack())
         return setpoint
 
     def rehearse(self) -> None:
-        """Run the computation for the next measurement and discard the result, to fill the processor's caches."""
+        """Repeat the computation for the newest measurement to fill the processor's caches, and discard the result."""
         if (sample := self.sample) is not None and self.mode == Mode.POLICY and self._usual < BRIEF * self.plan.dt:
             self.pilot.rehearse(sample.t - self._start, sample.age, sample.state)
             self.plan.limits.broken(Sample.unpack(sample.pack()).state)
 
     def idle(self) -> None:
-        """Do the work that is not urgent: read orders and new parameters, and publish reports."""
+        """Do the work that is not urgent, such as reading orders and new parameters and publishing reports."""
         began = time.monotonic()
         t = 0.0 if self.sample is None else self.sample.t - self._start
         if (order := self._new("order")) is not None and order.get("order") == "land":
@@ -139,7 +138,7 @@ class ControlLoop:
         self.over = self.mode in OVER or ended
         if self.over:  # no later measurement will report the command that the plant accepted
             self._finish_row(None)
-        self._publish_rows()  # each tick, so that the log contains the last one whenever this process dies
+        self._publish_rows()  # on each tick, so the log contains the last tick whenever this process dies
         if self._ticks % REPORT_EVERY == 1 or self.over:
             self.report()
         if self._row is not None:
@@ -157,7 +156,7 @@ class ControlLoop:
         ))  # fmt: skip
 
     def land(self, reason: str) -> None:
-        """Start the landing."""
+        """Start the landing, and record the reason unless one is already recorded."""
         self._landing = self._landing or reason
 
     def _policy(self, sample: Sample, t: float, age: float, new: bool) -> np.ndarray | None:
@@ -187,7 +186,7 @@ class ControlLoop:
         return None
 
     def _aim(self, t: float) -> bool:
-        """Update the target position and return whether the new one is finite; if not, keep the last one."""
+        """Update the target position if the new one is finite; return whether it is finite."""
         target = self.pilot.target(t)
         if finite := bool(np.isfinite(target).all()):
             self._target = target
@@ -220,7 +219,7 @@ class ControlLoop:
         return True
 
     def _follow(self, before: Sample, sample: Sample) -> None:
-        """Process the plant's report about the past tick: the accepted command and missed ticks."""
+        """Process the accepted command and the number of missed ticks since the previous sample."""
         accepted, lost = np.asarray(sample.accepted), sample.tick - before.tick - 1
         if lost and not self._landing:
             self.missed += lost
@@ -234,7 +233,7 @@ class ControlLoop:
         self._ended = None if lost else (before, sample)
 
     def _watch(self) -> None:
-        """Evaluate the past tick with its measurement: model errors and distance from the target."""
+        """Evaluate the model errors and the distance from the target over the past tick."""
         if self._ended is None:
             return
         (before, sample), self._ended = self._ended, None
@@ -250,7 +249,7 @@ class ControlLoop:
             self.intake.watch(float(np.linalg.norm(sample.state[:3] - target)), missed)
 
     def _finish_row(self, accepted: np.ndarray | None) -> None:
-        """Add the last tick to the report, with the command that the plant accepted if it is known."""
+        """Add the last tick to the report, with the command that the plant accepted if that command is known."""
         if self._row is None:
             return
         if accepted is not None:

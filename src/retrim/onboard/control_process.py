@@ -1,4 +1,4 @@
-"""The control process: one step per tick, on a schedule that follows the clock of the plant."""
+"""The control process, which runs one step per tick on a schedule that follows the plant's clock."""
 
 import math
 import time
@@ -12,14 +12,14 @@ from .pulses import Pulses
 from .realtime import ParentWatch, be_punctual, sleep_until, wait_until
 from .tick_budget import PHASE, ROOM
 
-PATIENCE = ROOM  # of a tick: longest wait for a late sample; after it the sender still waits for the answer
+PATIENCE = ROOM  # of a tick: longest wait for a late sample; the plant then still waits for the answer
 ALONE = 5.0  # [s] without a heartbeat from the supervisor, which shares its cores with the learners
 AHEAD = 0.75 * PHASE  # of a tick, by which the process wakes up before a step is due
 LATE = 0.5  # of a tick, after which a step is skipped
 
 
 class Schedule:
-    """Schedule of the steps, shortly after the samples from the plant, whose clock may drift, stop and continue."""
+    """Schedules each step shortly after the sample from the plant, whose clock may drift, stop and continue."""
 
     def __init__(self, epoch: float, dt: float) -> None:
         self._epoch, self._dt, self._tick = epoch, dt, 0
@@ -44,7 +44,7 @@ class Schedule:
 
 
 def _ready(loop: ControlLoop, due: float, ahead: float) -> float:
-    """Wait for the next step, and rehearse it if its sample arrives early enough; return its start time."""
+    """Wait for the next step, and rehearse the step if its sample arrives early; return the start time of the step."""
     sleep_until(due - ahead)
     latest = due - 0.5 * ahead
     while not (there := loop.new_sample()) and time.monotonic() < latest:
@@ -57,7 +57,7 @@ def _ready(loop: ControlLoop, due: float, ahead: float) -> float:
 
 
 def fly(plan: ControlPlan) -> None:
-    """Run the control loop until the vehicle has landed, as the main function of the process."""
+    """Run the control loop until the flight is over; this is the main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     loop = ControlLoop(plan, bus)

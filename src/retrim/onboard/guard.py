@@ -1,4 +1,4 @@
-"""The guard: limits of a flight, and the fallback controller. It needs neither learning nor a policy."""
+"""The guard, which checks the limits of a flight and contains the fallback controller, without learning or a policy."""
 
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -9,7 +9,7 @@ G = 9.81  # [m/s^2]
 HOVER = np.array([G, 0.0, 0.0, 0.0])
 UP = np.array([0.0, 0.0, 1.0])
 FELT_TAU = 0.2  # [s]
-BLIND_S = 2.0  # [s], after which a vehicle with an unknown state is stopped
+BLIND_S = 2.0  # [s], after which the motors of a vehicle with an unknown state stop
 
 
 class Mode(IntEnum):
@@ -17,11 +17,11 @@ class Mode(IntEnum):
 
     POLICY = 0
     HOLD = 1
-    """The geometric controller holds the position of the reference."""
+    """The geometric controller holds the last target position."""
     DESCEND = 2
     """The geometric controller makes the vehicle sink."""
     BLIND = 3
-    """The state is unknown; the vehicle levels by its last known attitude and sinks."""
+    """The state is unknown; the vehicle levels using its last known attitude and sinks."""
     LANDED = 4
     WATCHDOG = 5
     """The watchdog flies the fallback, because the control process is dead."""
@@ -30,7 +30,7 @@ class Mode(IntEnum):
 
 
 OVER = Mode.LANDED, Mode.DROP
-"""Modes that end the flight; commands are not sent after them."""
+"""Modes that end the flight; no command follows."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Limits:
     """Limits of a flight."""
 
     low: np.ndarray
-    """Lower corner of the geofence, world [m]."""
+    """Lower corner of the geofence in the world frame [m]."""
     high: np.ndarray
-    """Upper corner of the geofence, world [m]."""
+    """Upper corner of the geofence in the world frame [m]."""
     u_min: np.ndarray
     """Smallest command [c, omega] that the vehicle accepts."""
     u_max: np.ndarray
@@ -57,15 +57,15 @@ class Limits:
     """Largest flight time since the newest measurement in the policy's training data [s]."""
 
     def within(self, u: np.ndarray) -> np.ndarray:
-        """Return a command [c, omega], clipped to the vehicle's limits."""
+        """Return a command [c, omega] clipped to the vehicle's limits."""
         taken: np.ndarray = np.clip(u, self.u_min, self.u_max)
         return taken
 
     def broken(self, x: np.ndarray) -> str | None:
-        """Return a description of the limit that a state breaks; None if it is within all limits.
+        """Return a description of the limit that a state violates; None if the state is within all limits.
 
         Args:
-            x: p, R by rows, v.
+            x: State: p, R by rows, v.
         """
         p, upright, v = x[:3], x[11], x[12:15]
         if not np.isfinite(x).all():
@@ -80,19 +80,19 @@ class Limits:
 
 @dataclass
 class GeometricHover:
-    """Holds a position by thrust and body rates, with integral action.
+    """Holds a position using thrust and body-rate commands, with integral action.
 
-    The controller is that of Lee et al. 2010, with the attitude as a rotation vector.
+    The controller is that of Lee et al. (2010), with the attitude error as a rotation vector.
     """
 
     limits: Limits
     dt: float
     integral: np.ndarray = field(default_factory=lambda: np.zeros(3))
     felt: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    """Low-pass filtered acceleration from external disturbances, world [m/s^2]."""
+    """Low-pass-filtered acceleration from external disturbances in the world frame [m/s^2]."""
 
     def feel(self, before: np.ndarray, after: np.ndarray, u: np.ndarray) -> None:
-        """Update the disturbance estimate with one tick: the acceleration beyond thrust and gravity.
+        """Update the disturbance estimate with the acceleration during one tick, minus thrust and gravity.
 
         Args:
             before: State at the start of the tick: p, R by rows, v.
@@ -107,7 +107,7 @@ class GeometricHover:
         """Return the command [c, omega].
 
         Args:
-            x: p, R by rows, v.
+            x: State: p, R by rows, v.
             target: Target position, world [m].
             velocity: Velocity of the target, world [m/s]; None if the target does not move.
         """
@@ -122,7 +122,7 @@ class GeometricHover:
 
 
 def turn(R: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation vector that points the thrust along a direction, body frame [rad]."""
+    """Return the smallest rotation vector in the body frame that points the thrust along a direction [rad]."""
     d = R.T @ along
     sine = np.hypot(d[0], d[1])
     angle = np.arctan2(sine, d[2])
@@ -134,34 +134,34 @@ def turn(R: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Fallback:
-    """Fallback controller for when the policy must not fly: a simple timed sequence of hold, sink and stop."""
+    """Fallback controller for when the policy must not fly: it holds a position, sinks and stops the motors."""
 
     hover: GeometricHover
     hold_s: float = 2.0
     sink: float = 0.5
     """Sink rate [m/s]."""
     still_s: float = 0.0
-    """Time for which the vehicle has not moved during the descent [s]; a still vehicle stands on something."""
+    """Time during the descent for which the vehicle has not moved [s]; a vehicle at rest stands on something."""
     sinking_s: float = 0.0
     since: float = 0.0
     """Time for which the fallback has been active [s]."""
     blind_s: float = 0.0
     place: np.ndarray | None = None
-    """Position to hold, from which the descent starts."""
+    """Position that the vehicle holds, and from which its descent starts."""
 
     def rest(self) -> None:
-        """Reset, because a different controller is active; the next step begins a new sequence."""
+        """Reset while a different controller is active; the next step begins a new sequence."""
         self.since, self.blind_s, self.sinking_s, self.still_s, self.place = 0.0, 0.0, 0.0, 0.0, None
         self.hover.integral[:] = 0.0
 
     def step(self, x: np.ndarray, fresh: bool, target: np.ndarray, *, land: bool) -> tuple[np.ndarray, Mode]:
-        """Return the command for the next tick, and the mode.
+        """Return the command [c, omega] for the next tick, and the mode.
 
         Args:
             x: Last known state: p, R by rows, v.
             fresh: Whether the state is recent.
             target: Current target position, world [m]; the target of the first call is held.
-            land: Whether to sink at once.
+            land: Whether to sink immediately.
         """
         if self.place is None:
             self.place = target.copy()
@@ -172,7 +172,7 @@ class Fallback:
         if self._down(x, fresh):
             return np.zeros(4), Mode.LANDED
         if not fresh:
-            # Level for a quarter of a second by the last known attitude; then zero rates and a slow descent.
+            # Sink slowly. Level for a quarter of a second using the last known attitude; then command zero rates.
             rates = 4.0 * turn(x[3:12].reshape(3, 3), UP) if self.blind_s <= 0.25 else np.zeros(3)
             return self.hover.limits.within(np.concatenate([[0.95 * G], rates])), Mode.BLIND
         if land or self.since > self.hold_s:

@@ -1,4 +1,4 @@
-"""Heartbeats: each process of a flight reports many times per second that its main loop is running.
+"""Send heartbeats: each process of a flight reports many times per second that its main loop is running.
 
 The messages that the plant and control publish each tick serve as their heartbeats. A loop that computes for several
 seconds uses a thread to send its heartbeats, but only for the time that the loop announced beforehand. A loop that
@@ -23,7 +23,7 @@ def beat_topic(role: str) -> str:
 
 
 class Heart:
-    """Sends heartbeats when the main loop calls it."""
+    """Sends heartbeats when the main loop calls :meth:`beat`."""
 
     def __init__(self, bus: Bus, role: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Build a heartbeat sender for a process.
@@ -47,10 +47,10 @@ class Heart:
 
 
 class Pacemaker:
-    """Sends heartbeats from its own thread while the main loop is within its announced time."""
+    """Sends heartbeats from its own thread until the time that the main loop has announced is over."""
 
     def __init__(self, bus: Bus, role: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Build a pacemaker for a process; its thread runs while the context is open."""
+        """Build a pacemaker for a process; the thread runs while the context is open."""
         self._heart, self._clock = Heart(bus, role, clock), clock
         self._until, self._over = float("-inf"), threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -66,7 +66,7 @@ class Pacemaker:
         self._thread.join()
 
     def touch(self, allowance: float) -> None:
-        """Record that the main loop is running and will call again within ``allowance`` [s]."""
+        """Record that the main loop is running and will call this method again within ``allowance`` [s]."""
         self._until = self._clock() + allowance
 
     def beat(self) -> None:

@@ -1,4 +1,4 @@
-"""Start of a live flight's processes. They receive a plan and ignore Ctrl-C, which the supervisor handles."""
+"""Start the processes of a live flight. Each process receives a plan; Ctrl-C reaches only the supervisor."""
 
 import contextlib
 import importlib
@@ -16,7 +16,7 @@ PYTHON = (sys.executable, "-P", "-m")
 def module_path() -> str:
     """Return the module path of a child process: the path of this process, with the current folder moved to the end.
 
-    The current folder may contain a user's module. A ``numpy.py`` in the same folder does not replace NumPy.
+    The current folder may contain a user's module, but a ``numpy.py`` in the same folder does not replace NumPy.
     """
     here, places = os.path.realpath(os.curdir), [place for place in sys.path if place]
     last = [place for place in places if os.path.realpath(place) == here]
@@ -27,15 +27,15 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     """Start a process on this machine.
 
     Args:
-        main: ``module:function`` that takes the plan.
+        main: Name of a function that takes the plan, as ``module:function``.
         plan: Argument of the function; this process sends it only to its own child.
         complaints: File for the standard output and standard error of the process.
-        cores: Cores that it may use from the start, since imports also take computing time. None for all cores.
+        cores: Cores that the process may use, even during its imports; None for all cores.
 
     Returns:
         The process.
     """
-    # One thread: the arrays are small, and a thread pool would be late.
+    # One thread: the arrays are small, and a thread pool would add delays.
     quiet = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     with _opened(complaints) as file:
         process = subprocess.Popen(
@@ -65,7 +65,7 @@ def _opened(complaints: Path) -> BinaryIO:
 
 
 def last_words(complaints: Path) -> str:
-    """Return the last line that a process wrote to its standard outputs."""
+    """Return the last line that a process wrote to its standard output or error."""
     try:
         lines = complaints.read_text(errors="replace").strip().splitlines()
     except OSError:
@@ -77,7 +77,7 @@ def main() -> None:
     """Read the plan and run the named function."""
     module, _, name = sys.argv[1].partition(":")
     function = getattr(importlib.import_module(module), name)
-    function(pickle.load(sys.stdin.buffer))  # the parent wrote it
+    function(pickle.load(sys.stdin.buffer))  # the parent wrote this pickle
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The file of a log: it contains whole lines only, and its removal is detected."""
+"""Log file that contains only whole lines; its removal is detected."""
 
 import contextlib
 import os
@@ -8,11 +8,11 @@ from pathlib import Path
 from .messages import COLUMNS
 
 HEADER = (",".join(COLUMNS) + "\n").encode()
-TAIL = 2**22  # bytes; at least the amount that reports may repeat
+TAIL = 2**22  # bytes; at least the amount of data that reports may repeat
 
 
 def log_path(path: Path, spare: Sequence[Path]) -> Path:
-    """Return the path of a log: the given path, or the last temporary folder that contains it.
+    """Return the path of a log: its path in the last temporary folder that contains it, or else its regular path.
 
     Args:
         path: Regular path of the log.
@@ -23,13 +23,13 @@ def log_path(path: Path, spare: Sequence[Path]) -> Path:
 
 
 class LogFile:
-    """A file that stays open, so that its content can be read even after its removal."""
+    """A file that stays open so that its content can be read even after its removal."""
 
     def __init__(self, path: Path, *, new: bool = False) -> None:
         """Open a log and remove an incomplete last line, or create a log with its header.
 
         Args:
-            path: The file.
+            path: Path of the file.
             new: Create the file without the header, and fail if it exists.
 
         Raises:
@@ -48,7 +48,7 @@ class LogFile:
             raise
 
     def append(self, lines: bytes) -> None:
-        """Write lines; if that fails, remove those that were partly written.
+        """Write lines; if the write fails, remove the part that was written.
 
         Raises:
             OSError: The lines cannot be written, or the file is no longer at its path.
@@ -69,7 +69,7 @@ class LogFile:
         return os.pread(self._file, os.fstat(self._file).st_size, 0)
 
     def tail(self) -> bytes:
-        """Return the end of the content, from the beginning of a line."""
+        """Return the last part of the content; it begins at the beginning of a line."""
         size = os.fstat(self._file).st_size
         data = os.pread(self._file, TAIL, max(0, size - TAIL))
         return data if size <= TAIL else data[data.find(b"\n") + 1 :]

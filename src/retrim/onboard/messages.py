@@ -1,4 +1,4 @@
-"""Messages between the processes of a live flight: frozen values that are converted to bytes and back."""
+"""Messages between the processes of a live flight, which are frozen values with conversions to and from bytes."""
 
 import json
 from collections.abc import Mapping
@@ -14,11 +14,11 @@ from .note_fields import plain, read_fields
 
 STATE = 15  # p, R by rows, v
 STOPPED = "stopped without measurements"
-"""Beginning of the reason for the end of a flight whose motors were stopped in the air."""
+"""First words of the reason for the end of a flight if the motors were stopped in the air."""
 
 
 class StaleError(MessageError):
-    """An intact message that is not newer than the last one that was read."""
+    """An intact message is not newer than the last message that was read."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Stamp:
 
     @classmethod
     def unpack(cls, data: bytes) -> "Stamp":
-        """Read the stamp of a sample and ignore its other numbers, which may not be finite.
+        """Read the stamp of a sample and ignore the other numbers of the sample, which may not be finite.
 
         Raises:
             MessageError: The bytes are not a sample, or the stamp is not finite.
@@ -56,11 +56,11 @@ class Sample:
     age: float
     """Time since the state was valid [s]."""
     state: np.ndarray
-    """p [m], R by rows, v [m/s], world."""
+    """Measured state: p [m], R by rows and v [m/s] in the world frame."""
     truth: np.ndarray
-    """Like ``state``, but the true state if the plant provides it. It is used for scores, never by pilots."""
+    """Like ``state``, but the true state if the plant provides it. Scores use the true state; pilots never use it."""
     accepted: np.ndarray
-    """Command [c, omega] that the plant accepted for the past tick; with a command delay it acts later."""
+    """Command [c, omega] that the plant accepted for the past tick; with a command delay, the command acts later."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -83,7 +83,7 @@ class Sample:
 
 
 def _numbers(data: bytes) -> np.ndarray:
-    """Return the numbers of an intact sample; they may not be finite."""
+    """Return the numbers of an intact sample, which may not be finite."""
     expected = {"row": np.empty(8 + 2 * STATE, dtype=np.int64)}
     return unpack_arrays(data, expected, kind="sample", source="sample")["row"].view(float)
 
@@ -93,17 +93,17 @@ class Setpoint:
     """A command to the plant."""
 
     tick: int
-    """Tick of the sample that it answers."""
+    """Tick of the sample that this command answers."""
     sent: float
     """Send time on the monotonic clock [s]."""
     u: np.ndarray
-    """c [m/s^2], omega [rad/s]."""
+    """Command: c [m/s^2], omega [rad/s]."""
     target: np.ndarray
-    """Current target position, world [m]; a controller that takes over holds the vehicle there."""
+    """Current target position in the world frame [m]; a controller that takes over holds the vehicle there."""
     landed: bool = False
-    """Whether the vehicle has landed or must be dropped; the plant then stops."""
+    """Whether the vehicle has landed or its motors must stop; the plant then stops."""
     blind: bool = False
-    """Whether the vehicle must be dropped because its state is unknown."""
+    """Whether the motors must stop in the air because the state of the vehicle is unknown."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -121,7 +121,7 @@ class Setpoint:
         return cls(int(row[0]), float(row[1]), row[3:7], row[7:10], bool(row[2]), bool(row[10]))
 
     def ending(self, height: float) -> str:
-        """Return the reason for the end of the flight, whose last command this is.
+        """Return the reason for the end of a flight with this as its last command.
 
         Args:
             height: Last known height [m].
@@ -136,8 +136,8 @@ COLUMNS = (
     *("c", "omega0", "omega1", "omega2"),
     *("lateness", "step", "idle", "state_age", "policy_age", "mode"),
 )
-"""Columns of a tick in a report and in the log. ``idle`` is the duration of work that is not urgent. Times are in
-seconds."""
+"""Columns of a row in reports and in the log; each row describes one tick. ``idle`` is the duration of the work that is
+not urgent. Times are in seconds."""
 MEASURED, TRUE = slice(3, 3 + STATE), slice(3 + STATE, 3 + 2 * STATE)
 COMMAND = slice(3 + 2 * STATE, 7 + 2 * STATE)
 ACCOUNTS = {name: COLUMNS.index(name) for name in ("lateness", "step", "idle", "state_age", "policy_age")}
@@ -149,7 +149,7 @@ class FlightRows:
     """The last ticks of a flight, oldest first; each row contains the command that followed its measurement."""
 
     rows: np.ndarray
-    """One row per tick, columns as in ``COLUMNS``."""
+    """One row per tick, with the columns in ``COLUMNS``."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -175,14 +175,14 @@ class Parameters:
 
     half: str
     version: int
-    """Increasing number; a message with a version that is not newer is stale."""
+    """Increasing number; a message whose version is not newer than the last one is stale."""
     base: str
-    """Hash of the controller that the receiver was started with; parameters for a different controller are refused."""
+    """Hash of the controller for which the parameters are intended; the receiver refuses those for a different one."""
     computed_from: float
-    """Flight time of the newest measurement in their training data [s]."""
+    """Flight time of the newest measurement in the training data [s]."""
     arrays: Mapping[str, Any] = field(repr=False)
     parent: int = 0
-    """Version that their training started from; 0 for the version at take-off."""
+    """Version from which training started; 0 for the version at take-off."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
@@ -223,7 +223,7 @@ class Parameters:
 
 
 def pack_note(kind: str, **fields: Any) -> bytes:
-    """Return the bytes of a small message of plain values, such as an order; inverse of :func:`unpack_note`."""
+    """Return the bytes of a small message of plain values, such as an order; the inverse of :func:`unpack_note`."""
     return pack_arrays({}, kind=kind, about={"fields": json.dumps(fields)})
 
 
@@ -231,7 +231,7 @@ def unpack_note(data: bytes, kind: str) -> dict[str, Any]:
     """Read a small message.
 
     Raises:
-        MessageError: The bytes are not such a message, its kind differs, or a field has the wrong type or range.
+        MessageError: The bytes are not such a message, the kind differs, or a field has the wrong type or range.
     """
     header = describe(data, kind=kind, source=kind)
     unpack_arrays(data, {}, kind=kind, source=kind)
@@ -243,7 +243,7 @@ def unpack_note(data: bytes, kind: str) -> dict[str, Any]:
 
 
 def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
-    """Return the fields of the last small message of a topic; empty if there is no message or it is damaged.
+    """Return the fields of the last small message of a topic; empty if there is no message or the message is damaged.
 
     Args:
         bus: Bus of the flight.
@@ -258,7 +258,7 @@ def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
 
 
 def last_sent(bus: Bus, topic: str) -> float:
-    """Return the send time of a topic's newest command on the monotonic clock [s]; minus infinity if there is none.
+    """Return when a topic's newest command was sent [s, monotonic clock]; minus infinity if there is no valid command.
 
     Args:
         bus: Bus of the flight.
@@ -285,7 +285,7 @@ def ticks_of(bus: Bus) -> int:
 
 
 def last_height(bus: Bus) -> float:
-    """Return the height that the plant reported last [m]; NaN if it has not reported a height.
+    """Return the last height that the plant has reported [m]; NaN if there is no valid report.
 
     Args:
         bus: Bus of the flight.

@@ -1,4 +1,4 @@
-"""Types and ranges of the fields of notes between processes, which are checked before use."""
+"""Check the types and ranges of the fields of notes between processes before use."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -7,22 +7,22 @@ from typing import Any
 from ..errors import MessageError
 
 Read = Callable[[Any], Any]
-"""Function that returns a valid JSON value unchanged, or raises ``ValueError`` with the requirement."""
+"""Function that checks and returns a JSON value, or raises ``ValueError`` with the requirement."""
 MANY, MOST, LONG = 2**53, 1e300, 1000
-"""Largest whole number and largest number that every reader accepts, and length of the longest text."""
+"""Limits of all readers: largest whole number, largest number, and maximum length of a text."""
 
-# Largest numbers of `Stage` and `Cause` in retrim.control.condition, which needs JAX; a test compares them.
+# Largest values of `Stage` and `Cause` in retrim.control.condition, which needs JAX; a test checks that they agree.
 LAST_STAGE, LAST_CAUSE = 4, 5
 
 
 def shown(value: Any) -> str:
-    """Return a short text for a value, without control characters, for use in an error message."""
+    """Return a short text without control characters for a value in an error message."""
     text = ascii(value) if isinstance(value, str | int | float | bool | type(None)) else type(value).__name__
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def plain(text: str) -> str:
-    """Return a text of limited length with escaped control characters."""
+    """Return a text with its control characters escaped and its length limited."""
     written = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[: LONG + 1])
     return written if len(written) <= LONG else f"{written[: LONG - 3]}..."
 
@@ -61,7 +61,7 @@ def flag(value: Any) -> bool:
 
 
 def text(value: Any) -> str:
-    """Read a text; escape control characters and shorten a long text."""
+    """Read a text; escape its control characters and shorten it if it is long."""
     if not isinstance(value, str):
         raise ValueError("a text")
     return plain(value)
@@ -73,7 +73,12 @@ def maybe(read: Read) -> Read:
 
 
 def list_of(*reads: Read, length: int | None = None) -> Read:
-    """Return a reader of lists: items of one kind with any or a given length, or of several kinds in a given order."""
+    """Return a reader of lists.
+
+    Args:
+        *reads: Reader of all items, or one reader for each item.
+        length: Number of items, if there is a single reader; None for any number.
+    """
     exact = length if len(reads) == 1 else len(reads)
 
     def read(value: Any) -> list[Any]:
@@ -142,10 +147,10 @@ FIELDS: Mapping[str, Mapping[str, Read]] = {
 
 
 def read_fields(kind: str, fields: Any) -> dict[str, Any]:
-    """Return the fields of a note after a check of their types and ranges.
+    """Check the types and ranges of the fields of a note, and return the fields.
 
     Args:
-        kind: Kind of the note, for example ``wish`` or ``learner.policy``.
+        kind: Kind of the note, e.g. ``wish`` or ``learner.policy``.
         fields: Fields as received; unknown fields are returned unchanged.
 
     Raises:

@@ -1,7 +1,7 @@
-"""Intake of parameters from the learners.
+"""Receive parameters from the learners.
 
-Valid parameters are passed to the pilot. Invalid ones are refused and counted by reason. Policies that fly clearly
-worse than the last proven one are rolled back.
+The receiver passes valid parameters to the pilot, and refuses and counts invalid ones by reason. It rolls back policies
+that fly clearly worse than the last proven one.
 """
 
 from collections import deque
@@ -14,16 +14,16 @@ from .pilot import LivePilot
 from .rollback import FlownError
 from .topics import REFERENCE, UNLEARNED, VEHICLE
 
-AHEAD = 1.0  # [s] by which the time stamp of parameters may lie in the future
-IN_TIME = 0.7  # [s] within which a reference must be taken, before it departs from the current one
-REMEMBERED = 50  # swaps in a report, which is published ten times a second
+AHEAD = 1.0  # [s], how far the time stamp of parameters may lie in the future
+IN_TIME = 0.7  # [s], time limit to take a new reference, before it departs from the current one
+REMEMBERED = 50  # number of past swaps, rollbacks and policies that are kept
 
 
 class ParameterReceiver:
-    """Intake of new parameters for the active controller."""
+    """Receives new parameters for the active controller."""
 
     def __init__(self, pilot: LivePilot, bus: Bus, base: str, dt: float) -> None:
-        """Build an intake.
+        """Build a receiver.
 
         Args:
             pilot: Pilot that receives the parameters.
@@ -48,7 +48,7 @@ class ParameterReceiver:
 
     @property
     def open(self) -> bool:
-        """Whether the learned parameters are in use; if not, the controller uses those from take-off."""
+        """Whether the learned parameters are in use; if not, the controller uses the parameters from take-off."""
         return self._open
 
     @open.setter
@@ -62,7 +62,7 @@ class ParameterReceiver:
             self.pilot.restart()
 
     def poll(self, t: float) -> None:
-        """Read the parameters that have arrived by flight time ``t`` [s], and take them if they are valid."""
+        """Read the parameters that have arrived by flight time ``t`` [s]; use valid ones and refuse the others."""
         for half in self._known:
             if half not in UNLEARNED and not self._open:
                 continue

@@ -1,4 +1,4 @@
-"""Pilot of the control process: a controller in the form of NumPy programs whose parameters are swapped in flight."""
+"""Pilot of the control process, which runs a controller as NumPy programs and swaps its parameters in flight."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from ..compile.ops.program import Arrays, NumpyProgram, ProgramSource
 from .messages import STATE, Parameters
 from .topics import UNLEARNED, VEHICLE
 
-BLEND = 5  # ticks over which a jump in the command at a swap is faded out
+BLEND = 5  # ticks over which the pilot fades out a jump in the command at a swap
 
 
 @dataclass(frozen=True)
@@ -18,15 +18,15 @@ class ControllerSource:
     """A controller and the structure of its parameters, prepared before take-off."""
 
     init: ProgramSource
-    """(parameters, state) -> memory"""
+    """(parameters, state) -> memory."""
     decide: ProgramSource
-    """(parameters, [memory, time, age, state]) -> command, stage of the controller and its cause, memory"""
+    """(parameters, [memory, time, age, state]) -> command, stage of the controller and its cause, memory."""
     accepted: ProgramSource
-    """(parameters, [memory, command]) -> memory, if the plant accepted a different command from the one issued"""
+    """(parameters, [memory, command]) -> memory, if the plant accepted a command that differs from the issued one."""
     target: ProgramSource
-    """(parameters, time) -> target position of the vehicle"""
+    """(parameters, time) -> target position of the vehicle."""
     predicted: ProgramSource
-    """(parameters, [state, command]) -> acceleration that the corrected model predicts"""
+    """(parameters, [state, command]) -> acceleration that the corrected model predicts."""
     parameters: Mapping[str, Mapping[str, Any]]
     """Initial parameters, by part (``policy``, ``residual``, ``reference``, ``vehicle``) and name, in the order of the
     programs."""
@@ -56,13 +56,13 @@ class LivePilot:
         self._jump, self._left, self._swapped = np.zeros(4), 0, False
 
     def reset(self, x: np.ndarray) -> None:
-        """Start a flight in the state ``x`` (p, R by rows, v)."""
+        """Start a flight in the state ``x``, a vector of p, R by rows and v."""
         self._memory = self._init.step(self._prepared[0], self._state(x))
         self._left, self._swapped, self._jump = 0, False, np.zeros(4)
         self.condition = 0, 0
 
     def target(self, t: float) -> np.ndarray:
-        """Return the target position of the vehicle at flight time ``t`` [s], world [m]."""
+        """Return the vehicle's target position in the world frame [m] at flight time ``t`` [s]."""
         return np.asarray(self._target.step(self._prepared[4], [self._scalar(t)])[0], dtype=float)
 
     def act(self, t: float, age: float, x: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ class LivePilot:
         Args:
             t: Time since the start of the flight [s].
             age: Age of the measurement [s].
-            x: p, R by rows, v.
+            x: Measured state: p, R by rows, v.
         """
         inputs = [self._scalar(t), self._scalar(age), *self._state(x)]
         decide, memory = self._prepared[1], self._memory
@@ -89,24 +89,24 @@ class LivePilot:
         return u
 
     def rehearse(self, t: float, age: float, x: np.ndarray) -> None:
-        """Compute a command and discard it; the result of :meth:`act` does not change."""
+        """Compute a command and discard it; the pilot's memory does not change."""
         self._decide.step(self._prepared[1], [*self._memory, self._scalar(t), self._scalar(age), *self._state(x)])
 
     def accepted(self, u: np.ndarray) -> None:
-        """Correct the memory: the plant accepted ``u`` instead of the command that was issued last."""
+        """Correct the memory if the plant accepted ``u`` instead of the last issued command."""
         command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
         self._memory = self._accepted.step(self._prepared[2], [*self._memory, *command])
 
     def predicted(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Return the acceleration that the corrected model predicts, world [m/s^2]."""
+        """Return the acceleration that the corrected model predicts in the world frame [m/s^2]."""
         command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
         return np.asarray(self._predicted.step(self._prepared[3], [*self._state(x), *command])[0], dtype=float)
 
     def swap(self, parameters: Parameters) -> None:
         """Use new parameters from the next tick on.
 
-        The command is blended into that of the new controller within a few ticks. New parameters of the vehicle are not
-        blended, because the controller itself follows them slowly.
+        The pilot blends the old command into that of the new controller within a few ticks. It does not blend after new
+        vehicle parameters, because the controller itself follows these parameters slowly.
         """
         half = parameters.half
         self._parameters[half] = list(parameters.arrays.values())
@@ -137,15 +137,15 @@ class LivePilot:
             self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:
-        """Return a part's parameters as examples of their shapes and types."""
+        """Return the initial parameters of a part, which define the expected shapes and types."""
         return self._source.parameters[half]
 
     def proven(self, version: int) -> None:
-        """Record that a policy has flown long enough without harm, and discard the earlier ones."""
+        """Record that a policy has flown long enough without harm, and discard the earlier policies."""
         self._policies = {v: leaves for v, leaves in self._policies.items() if v >= version}
 
     def back(self) -> list[int]:
-        """Return to the last proven policy; return the versions that were given up."""
+        """Roll back to the last proven policy; return the versions that were given up."""
         version = min(self._policies)
         given_up = sorted(v for v in self._policies if v > version)
         self._policies = {version: self._policies[version]}

@@ -9,7 +9,7 @@ from .pilot import ControllerSource
 
 @dataclass(frozen=True)
 class ControlPlan:
-    """Start parameters of the process."""
+    """Start parameters of the control process."""
 
     folder: Path
     """Folder of the bus."""
@@ -17,11 +17,11 @@ class ControlPlan:
     limits: Limits
     dt: float
     delay_ticks: int
-    """Declared command delay of the plant."""
+    """Declared command delay of the plant [ticks]."""
     window: int
-    """Number of ticks that are published for the learners and for the log."""
+    """Number of ticks in each report for the learners and the log."""
     seconds: float
-    """Flight time after which the vehicle lands by itself [s]."""
+    """Flight time after which the vehicle lands automatically [s]."""
     cores: frozenset[int]
     priority: int
     parent: int

@@ -1,4 +1,4 @@
-"""Detection of a flight's hanging processes, which are alive but do not send heartbeats."""
+"""Detect a flight's hanging processes, which are alive but do not send heartbeats."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -7,11 +7,11 @@ from ..transport.bus import Bus
 from .heartbeat import beat_topic
 
 SILENCE = 2.0  # [s] without a heartbeat, after which a process counts as hanging
-LOOK = 0.25  # [s], most that one check counts, since a stall of the machine is not silence of the process
+LOOK = 0.25  # [s], longest silence that one check adds, since a stall of the machine is not silence of the process
 
 
 class Pulses:
-    """Measures how long each process has been silent. The durations are updated at each check."""
+    """Measures how long each process has been silent. Each check updates the durations."""
 
     def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic, silence: float = SILENCE) -> None:
         """Begin without processes.
@@ -29,8 +29,8 @@ class Pulses:
 
         Args:
             role: Role of the process.
-            within: Time limit for the first heartbeat [s], since a process compiles at its start; None for the limit of
-                later heartbeats.
+            within: Time limit for the first heartbeat [s], which may include compilation; None for the limit of later
+                heartbeats.
         """
         self._versions[role], self._silent[role] = self._version(role), 0.0
         self._allowed[role] = self._silence if within is None else within

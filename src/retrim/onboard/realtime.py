@@ -1,4 +1,4 @@
-"""Operating system settings for a process with deadlines; failed settings are reported."""
+"""Operating-system settings for a process with deadlines, and waits on the monotonic clock."""
 
 import contextlib
 import ctypes
@@ -12,7 +12,7 @@ LATER = 2e-5  # [s]
 
 
 def be_punctual(priority: int, cores: set[int]) -> list[str]:
-    """Request real-time scheduling, locked memory and specific cores, and switch garbage collection off.
+    """Request real-time scheduling, locked memory and specific cores, and disable garbage collection.
 
     Args:
         priority: Priority under SCHED_FIFO, 1 to 99.
@@ -25,7 +25,7 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
     gc.collect()
     gc.freeze()
     gc.disable()
-    # Locking touches all the memory and takes a while, so it precedes the real-time priority.
+    # Locking touches all the memory and takes a while, so lock before raising the priority.
     try:
         if ctypes.CDLL(None, use_errno=True).mlockall(LOCK_NOW_AND_LATER) != 0:
             refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
@@ -37,7 +37,7 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
     except (OSError, AttributeError) as error:
         refused.append(f"cores {sorted(cores)}: {error}")
     try:
-        for thread in _threads():  # the threads of a pool that computes for this process are as urgent as the process
+        for thread in _threads():  # a thread pool that computes for this process is as urgent as the process
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         refused.append(f"SCHED_FIFO: {error}")
@@ -52,7 +52,7 @@ def _threads() -> list[int]:
 
 
 def cores_of(role: str, allowed: set[int] | None = None) -> set[int]:
-    """Return the cores of a role: the first core for control, the others for learning; a single core is shared.
+    """Return the cores of a role: the first core to fly, the other cores to learn; both roles share a single core.
 
     Args:
         role: ``fly`` or ``learn``.
@@ -64,16 +64,16 @@ def cores_of(role: str, allowed: set[int] | None = None) -> set[int]:
 
 
 def sleep_until(instant: float) -> None:
-    """Sleep until ``instant`` of the monotonic clock [s]; return at once if it has passed."""
+    """Sleep until ``instant`` on the monotonic clock [s]; return immediately if the instant has passed."""
     while (left := instant - time.monotonic()) > LATER:
         time.sleep(left)
 
 
 def wait_until(instant: float) -> float:
-    """Wait until ``instant`` of the monotonic clock [s] without sleeping, so that no wake-up delay occurs.
+    """Wait until ``instant`` on the monotonic clock [s] without sleeping, which avoids wake-up delays.
 
     Returns:
-        The current time [s], which is later if the instant has passed.
+        The current time [s], which may be later than ``instant``.
     """
     while (now := time.monotonic()) < instant:
         pass
@@ -81,7 +81,7 @@ def wait_until(instant: float) -> float:
 
 
 class ParentWatch:
-    """Detects the end of another process, immediately and without its cooperation."""
+    """Detects immediately when another process ends, without the cooperation of that process."""
 
     def __init__(self, pid: int) -> None:
         """Watch a process on this machine."""

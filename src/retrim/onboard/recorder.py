@@ -1,7 +1,7 @@
-"""The recorder process: it writes the log during the flight. The log stays readable if the process ends early.
+"""The recorder process, which writes the log during the flight. The log stays readable if the process ends early.
 
-Two processes report ticks: the control process, and the watchdog when it takes over. Late reports are written late,
-and a tick that both processes have commanded is written twice; :func:`read_log` sorts the ticks.
+Two processes report ticks: the control process, and the watchdog if it takes over. The log may therefore contain ticks
+out of order, and a tick that both processes have commanded twice; :func:`read_log` sorts the ticks.
 """
 
 import contextlib
@@ -24,12 +24,12 @@ from .timing_stats import accounted
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
 ENDS = tuple(mode.name.lower() for mode in OVER)
-LINGER = 5  # ticks after the end of a flight, in which control and watchdog may still report their last ticks
+LINGER = 5  # ticks after the end of a flight, during which control and the watchdog may report their last ticks
 
 
 @dataclass(frozen=True)
 class RecorderPlan:
-    """Start parameters of the process."""
+    """Start parameters of the recorder process."""
 
     folder: Path
     """Folder of the bus."""
@@ -37,13 +37,13 @@ class RecorderPlan:
     """Path of the log, a CSV file with one line per tick."""
     dt: float
     parent: int
-    """Id of the process that removes the bus; if it has ended, the recorder removes the bus."""
+    """Id of the process that removes the bus; if that process has ended, the recorder removes the bus."""
     spare: tuple[Path, ...] = ()
     """Folders for the log if it cannot be written to ``path``."""
 
 
 class Recorder:
-    """Appends new ticks to the log. It fills gaps from the last few seconds of flight, which every report contains."""
+    """Appends new ticks to the log. Each report contains the last few seconds of flight, so later reports fill gaps."""
 
     def __init__(self, path: Path, bus: Bus, spare: Sequence[Path] = ()) -> None:
         """Continue a log, or create one.
@@ -56,9 +56,9 @@ class Recorder:
         self._bus, self._paths = bus, (path, *(folder / path.name for folder in spare))
         self._versions = {"flight": 0, "fallback.flight": 0}
         self.failed: str | None = None
-        """Reason for the end of the log; None while it continues."""
+        """Reason why the log has ended; None while the log continues."""
         self.moved = ""
-        """Reason for a change of the file, and the new file; empty if there was no change."""
+        """Message about a change of the file, with the reason and the new file; empty if there was no change."""
         self._written: set[tuple[int, bool, bool]] = set()
         self._file: LogFile | None = None
         try:
@@ -68,7 +68,7 @@ class Recorder:
             self._move(error)
 
     def step(self) -> int:
-        """Write new ticks and return their number. A full disk ends the log but not the flight."""
+        """Write new ticks and return their number. A write error may end the log, but it does not end the flight."""
         return self._take("flight") + self._take("fallback.flight")
 
     def tell(self) -> None:
@@ -104,7 +104,7 @@ class Recorder:
         return 0
 
     def _move(self, why: OSError) -> None:
-        """Continue the log in another file with its whole content; if that is impossible, the log has failed."""
+        """Copy the log to a different file and continue there; record a failure if no file can be written."""
         reason = f"{self._paths[0]}: {why.strerror or why}"
         for path in self._paths:
             with contextlib.suppress(OSError):
@@ -125,16 +125,16 @@ class Recorder:
         self.tell()
 
     def _note(self, rows: np.ndarray) -> None:
-        """Record the written rows; once a tick has any row, the row of a merely observing watchdog is redundant."""
+        """Record the written rows; a row from a watchdog that did not command is redundant if the tick has any row."""
         for tick, has, flew in _authors(rows):
             self._written |= {(tick, has, flew), (tick, False, False)}
 
 
 def read_log(path: Path) -> np.ndarray:
-    """Return the ticks of a log in order, in the columns of :data:`retrim.onboard.messages.COLUMNS`.
+    """Return the ticks of a log in order, with the columns in :data:`retrim.onboard.messages.COLUMNS`.
 
-    For a tick that the watchdog commanded, the row of the watchdog is returned, with the accounts of the late control
-    process if they exist. An incomplete last line is left out.
+    For a tick that the watchdog commanded, the result contains the watchdog's row, with the deadline statistics of the
+    late control process if it reported any. An incomplete last line is omitted.
 
     Raises:
         OSError: There is no such file.
@@ -161,13 +161,13 @@ def _rows(data: bytes) -> np.ndarray:
 
 
 def _authors(rows: np.ndarray) -> list[tuple[int, bool, bool]]:
-    """Return for each row the tick, whether the control process reported it, and whether the watchdog commanded it."""
+    """Return each row's tick, whether the control process reported it, and whether the watchdog commanded it."""
     flew = rows[:, -1] == Mode.WATCHDOG
     return list(zip(rows[:, 0].astype(int).tolist(), accounted(rows).tolist(), flew.tolist(), strict=True))
 
 
 def record(plan: RecorderPlan) -> None:
-    """Write until the flight is over, as the main function of the process."""
+    """Write the log until the flight is over; this is the main function of the process."""
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus, plan.spare)
     recorder.tell()

@@ -1,4 +1,4 @@
-"""Detection of new policies that fly clearly worse than the last proven one in an unchanged world."""
+"""Detect new policies that fly clearly worse than the last proven policy in an unchanged world."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -8,16 +8,16 @@ import numpy as np
 
 
 class Judgement(NamedTuple):
-    """Result of a tick."""
+    """Judgement of the unproven policies after one tick."""
 
     proven: int | None = None
-    """Version that has flown long enough without harm."""
+    """Version that is now proven; None if there is none."""
     worse: bool = False
     """Whether all versions after the last proven one must be rolled back."""
 
 
 class Watched(NamedTuple):
-    """A policy that is not proven yet."""
+    """A policy that is not yet proven."""
 
     version: int
     since: int
@@ -30,15 +30,15 @@ class Watched(NamedTuple):
 
 @dataclass
 class FlownError:
-    """Compares the distance from the target before and after swaps; further swaps may come before the verdict.
+    """Compares the distance from the target before and after swaps; further swaps may occur before the judgement.
 
-    Policies are clearly worse if the mean error of the last half second exceeds both ``factor`` times the error before
-    the first of them and ``least``. The check begins ``settle_s`` after the first swap.
+    The policies are clearly worse if the mean error of the last half second exceeds both ``least`` and ``factor`` times
+    the error before the first swap. The check begins ``settle_s`` after the first swap.
     """
 
     dt: float
     factor: float = 3.0
-    """Largest ratio of the error to the error before the first unproven policy."""
+    """Largest allowed ratio of the error to the error before the first unproven policy."""
     least: float = 0.1
     """Error below which policies do not count as worse [m]."""
     settle_s: float = 0.5
@@ -46,7 +46,7 @@ class FlownError:
     watch_s: float = 2.0
     """Flight time after which a policy is proven [s]."""
     surprise: float = 1.0
-    """Increase of the model's acceleration error since the swap [m/s^2] above which the world has changed."""
+    """Increase in the model's acceleration error since the swap above which the world counts as changed [m/s^2]."""
     _seen: deque[tuple[float, float]] = field(default_factory=deque)
     _watched: deque[Watched] = field(default_factory=deque)
     _tick: int = 0
@@ -57,7 +57,7 @@ class FlownError:
             self._watched.append(Watched(version, self._tick, *self._means()))
 
     def take(self, error: float, missed: float) -> Judgement:
-        """Process one tick.
+        """Process one tick, and judge the unproven policies.
 
         Args:
             error: Distance from the target [m].
@@ -72,7 +72,7 @@ class FlownError:
         error, missed = self._means()
         first = self._watched[0]
         flown_s = (self._tick - first.since) * self.dt
-        if missed > first.missed + self.surprise:  # the world has changed, so errors are not comparable: keep the last
+        if missed > first.missed + self.surprise:  # the world has changed: errors are not comparable
             last = self._watched[-1].version
             self._watched.clear()
             return Judgement(proven=last)

@@ -1,8 +1,8 @@
-"""Stalls of the machine: intervals in which even the process with the highest priority did not run.
+"""Detect stalls of the machine: intervals in which even the process with the highest priority did not run.
 
 The watchdog wakes up every two milliseconds with the highest priority and does very little work. If its wake-up is
-delayed, every process on its core was delayed, by the kernel or by the host of a virtual machine. A slow control
-or plant process is not the cause of ticks missed in such an interval.
+late, the kernel or the host of a virtual machine has delayed every process on its core. A slow control or plant process
+is not the cause of ticks missed in such an interval.
 """
 
 from collections import deque
@@ -12,7 +12,7 @@ from typing import Any
 from .messages import pack_note
 
 STALL = 0.003  # [s]
-KEPT = 100  # the newest stalls are kept
+KEPT = 100  # number of stalls that are kept, the newest ones
 
 
 class Stalls:
@@ -50,7 +50,7 @@ class Stalls:
 
 
 def lost_in(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]], dt: float) -> int:
-    """Return the number of ticks missed during a stall or within one tick after it, while the plant caught up.
+    """Return the number of ticks missed during a stall or within one tick after the stall, while the plant caught up.
 
     Args:
         stalls: Start and end of each stall [s].

@@ -1,4 +1,4 @@
-"""Deadline accounts: lateness and duration of each step, and missed ticks."""
+"""Statistics of lateness and durations, and rows of ticks without a measurement."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ EDGES_MS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 
 def summary(seconds: np.ndarray) -> dict[str, Any]:
-    """Return the p50, p99 and maximum [ms], and the counts between successive ``EDGES_MS`` and outside them.
+    """Return the p50, p99 and maximum [ms], and the histogram with the edges ``EDGES_MS`` and two open outer bins.
 
     Args:
         seconds: Durations [s].
@@ -25,10 +25,10 @@ def summary(seconds: np.ndarray) -> dict[str, Any]:
 
 
 def accounted(rows: np.ndarray) -> np.ndarray:
-    """Return which ticks the control process reported; only these have a step duration, unlike those of the watchdog.
+    """Return which ticks the control process reported; rows from the watchdog do not contain a step duration.
 
     Args:
-        rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.
+        rows: Rows with the columns in :data:`retrim.onboard.messages.COLUMNS`.
     """
     result: np.ndarray = rows[:, ACCOUNTS["step"]] > 0.0
     return result
@@ -37,15 +37,15 @@ def accounted(rows: np.ndarray) -> np.ndarray:
 def blind_row(
     sample: Sample, stamp: Stamp, now: float, start: float, dt: float, u: np.ndarray, mode: Mode
 ) -> np.ndarray:
-    """Return the row of a command without a new measurement; it contains the last known state and its age.
+    """Return the row of a command without a new measurement, with the last known state and its age.
 
     Args:
-        sample: The last measurement.
+        sample: Last measurement.
         stamp: Stamp of the last message from the plant; the state in that message may have been refused.
         now: Current time of the monotonic clock [s].
         start: Time of the first measurement on the plant's clock [s].
         dt: Control tick [s].
-        u: The command.
+        u: Command [c, omega].
         mode: Active mode of the guard.
     """
     after = max(stamp.tick - sample.tick, int((now - sample.sent) / dt), 1)
@@ -55,10 +55,10 @@ def blind_row(
 
 
 def measured(rows: np.ndarray) -> np.ndarray:
-    """Return which ticks answered a measurement; the other ticks contain an old state.
+    """Return which rows contain a new measurement; the other rows contain an old state.
 
     Args:
-        rows: Columns as in :data:`retrim.onboard.messages.COLUMNS`.
+        rows: Rows with the columns in :data:`retrim.onboard.messages.COLUMNS`.
     """
     result: np.ndarray = accounted(rows) | ~np.isin(rows[:, -1], (Mode.BLIND, Mode.DROP))
     return result

@@ -1,21 +1,21 @@
-"""Names of topics that are transmitted between machines."""
+"""Names of the topics that are transmitted between machines."""
 
 LAYERS = ("residual", "policy")
 SLOTS = 2
-"""Number of complete updates of each layer that stay on the bus."""
+"""Number of complete updates of each layer that the bus holds."""
 
 
 def slot(layer: str, version: int) -> str:
-    """Return the topic of an update."""
+    """Return the topic for an update of a layer."""
     return f"update.{layer}.{version % SLOTS}"
 
 
 REFERENCE = "reference"
-"""Parameters of a controller that define its reference; learners do not change them."""
+"""Part of a controller's parameters that defines its reference; learners do not change this part."""
 VEHICLE = "vehicle"
-"""Parameters of a controller that describe the vehicle; they are identified during the flight."""
+"""Part of a controller's parameters that describes the vehicle and is identified during the flight."""
 UNLEARNED = (REFERENCE, VEHICLE)
-"""Parameters that stay in use when the learned parameters are not used."""
+"""Parts that stay in use when the learned parameters are not in use."""
 OUT = ("mission", "flight", "status", "ended", "learning", f"parameters.{REFERENCE}")
 """Topics from the flight to the learners."""
 INTO = (
@@ -25,6 +25,6 @@ INTO = (
 )
 """Topics from the learners to the flight."""
 SLOWLY = ("flight",)
-"""Topics that are published each tick, although the learners need them only a few times per second."""
+"""Topics with messages on each tick, which the learners need only a few times per second."""
 MOST = 64 * 2**20
 """Size of the longest message between machines [bytes]."""

@@ -1,4 +1,4 @@
-"""The watchdog process: it runs only the fallback, and sends commands when the control process has died or hangs."""
+"""The watchdog process, which runs only the fallback and sends commands if the control process has died or hangs."""
 
 import time
 from collections import deque
@@ -19,28 +19,28 @@ from .timing_stats import blind_row
 
 PATIENCE = 1.6  # ticks without a command
 CHECK_EVERY = 0.002  # [s]
-ROWS = 50  # rows of a report, including ticks from before the takeover
+ROWS = 50  # rows of a report, including ticks before the takeover
 
 
 @dataclass(frozen=True)
 class WatchdogPlan:
-    """Start parameters of the process."""
+    """Start parameters of the watchdog process."""
 
     folder: Path
     limits: Limits
     dt: float
     home: np.ndarray
-    """Position to hold if control never sent a target, world [m]."""
+    """Position in the world frame that the vehicle holds if control has never sent a target [m]."""
     cores: frozenset[int]
     priority: int
     control: int
     """Process id of the control process, which the watchdog watches."""
     parent: int
-    """Process id of the supervisor; if it has ended, the watchdog ends with the flight."""
+    """Process id of the supervisor; the watchdog ends if the supervisor and control end before the first sample."""
 
 
 class Watchdog:
-    """Decides on each tick whether to send a command, and computes it."""
+    """Decides whether a command is due, and computes the command."""
 
     def __init__(self, plan: WatchdogPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
@@ -94,12 +94,12 @@ class Watchdog:
             said = Setpoint.unpack(data)
         except MessageError:
             return
-        self.heard = now  # only here: an unreadable command counts as silence
+        self.heard = now  # an unreadable command returns above, and so counts as silence
         self._fallback.rest()
         self._target, self.done = said.target, self.done or said.landed
 
     def _look(self) -> bool:
-        """Read a new sample, if there is one; return whether there is one to answer."""
+        """Read a new sample if one has arrived; return whether it needs an answer."""
         message = self.bus.latest("sample", self._seen)
         if message is None:
             return False
@@ -129,7 +129,7 @@ class Watchdog:
 
 
 def watch(plan: WatchdogPlan) -> None:
-    """Watch until the flight is over, as the main function of the process."""
+    """Watch until the flight is over; this is the main function of the process."""
     refused = be_punctual(plan.priority, set(plan.cores))
     bus = SharedMemoryBus(plan.folder)
     watchdog, control, parent = Watchdog(plan, bus), ParentWatch(plan.control), ParentWatch(plan.parent)

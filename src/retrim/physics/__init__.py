@@ -1,4 +1,4 @@
-"""Physics: pure, differentiable, unbatched functions, without networks and without input or output.
+"""Model vehicles with pure, differentiable, unbatched functions that use neither networks nor input and output.
 
 Random keys are used only at construction.
 """

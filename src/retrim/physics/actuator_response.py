@@ -1,11 +1,11 @@
-"""Response of thrust and body rates to the commands that arrive.
+"""Model the response of thrust and body rates to arriving commands.
 
 Thrust follows through a gain and a first-order lag, and each body rate through a gain and a second-order loop,
 
     tau_c c' + c = k_c c_cmd,    (tau kappa / 2)^2 w'' + tau w' + w = k w_cmd,
 
 with tau = 2 zeta / omega_n and kappa = 1 / zeta. For kappa = 0, the loop is of first order with the time constant tau.
-All values are arrays, so that a different lag or damping does not need a new compilation.
+All values are arrays, so a different lag or damping does not require recompilation.
 """
 
 import equinox as eqx
@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 from .state import Command
 
 FASTEST = 1e-6  # [s], shortest time constant of an exponential; a faster loop has settled after any step
-STIFFEST = 1e-6  # smallest kappa of the fast mode of a loop, which has decayed after any step
-NEAR_CRITICAL = 0.25  # square of the angle below which its functions are computed as series
-SERIES = 7  # number of terms, for double precision up to NEAR_CRITICAL
+STIFFEST = 1e-6  # smallest kappa for the fast mode of a loop; below it, that mode has decayed after any step
+NEAR_CRITICAL = 0.25  # squared angle below which the functions of the angle are computed as series
+SERIES = 7  # number of series terms that give double precision up to NEAR_CRITICAL
 
 
 class ActuatorState(eqx.Module):
@@ -26,7 +26,7 @@ class ActuatorState(eqx.Module):
     command: Command
     """Present thrust [m/s^2] and body rates [rad/s]."""
     slope: Float[Array, "3"]
-    """Change of the body rates within their time constant, tau w' [rad/s]."""
+    """Slope of the body rates times their time constant, tau w' [rad/s]."""
 
     @classmethod
     def at(cls, u: Command) -> "ActuatorState":
@@ -35,14 +35,14 @@ class ActuatorState(eqx.Module):
 
 
 class ActuatorResponse(eqx.Module):
-    """Response of thrust and body rates to the commands that arrive."""
+    """Response of thrust and body rates to arriving commands."""
 
     thrust_gain: Float[Array, ""]
-    """Thrust over commanded thrust."""
+    """Ratio of thrust to commanded thrust."""
     thrust_lag: Float[Array, ""]
     """Time constant of the thrust [s]."""
     rate_gain: Float[Array, "3"]
-    """Body rates over commanded body rates: roll, pitch, yaw."""
+    """Ratio of body rates to commanded body rates: roll, pitch, yaw."""
     rate_lag: Float[Array, "3"]
     """Time constant 2 zeta / omega_n of each body rate [s]."""
     inverse_damping: Float[Array, "3"]
@@ -58,24 +58,24 @@ class ActuatorResponse(eqx.Module):
         thrust_gain: float | Float[Array, ""] = 1.0,
         rate_gain: float | Float[Array, "*axes"] = 1.0,
     ) -> "ActuatorResponse":
-        """Return a response; a scalar applies to all axes.
+        """Return a response; scalar rate parameters apply to all axes.
 
         Args:
             thrust_lag: Time constant of the thrust [s].
-            rate_lag: Time constant 2 zeta / omega_n of roll, pitch and yaw [s].
+            rate_lag: Time constant 2 zeta / omega_n of the roll, pitch and yaw rates [s].
             inverse_damping: 1 / zeta of each rate loop; zero means a first-order loop.
-            thrust_gain: Thrust over commanded thrust.
-            rate_gain: Body rates over commanded body rates.
+            thrust_gain: Ratio of thrust to commanded thrust.
+            rate_gain: Ratio of body rates to commanded body rates.
         """
         axes = [jnp.broadcast_to(strong_array(each), (3,)) for each in (rate_gain, rate_lag, inverse_damping)]
         return cls(strong_array(thrust_gain), strong_array(thrust_lag), *axes)
 
     @property
     def settling_time(self) -> Float[Array, ""]:
-        """Three time constants of the response that moves the vehicle [s].
+        """Three times the longest time constant of thrust, roll and pitch [s].
 
-        Yaw does not count: a turn about the thrust axis does not move the vehicle, and may take a second. A loop that
-        rings settles with its envelope.
+        Yaw is excluded: a turn about the thrust axis does not move the vehicle, and may take a second. For a loop that
+        rings, the time constant is that of its envelope.
         """
         envelope = self.rate_lag * jnp.maximum(1.0, 0.5 * self.inverse_damping**2)
         return 3.0 * jnp.maximum(self.thrust_lag, jnp.max(envelope[:2]))
@@ -85,21 +85,21 @@ class ActuatorResponse(eqx.Module):
         return Command(self.thrust_gain.astype(u.c.dtype) * u.c, self.rate_gain.astype(u.omega.dtype) * u.omega)
 
     def __call__(self, s: ActuatorState, u: Command, time: float | Float[Array, ""]) -> tuple[Command, ActuatorState]:
-        """Advance under a constant command; the result is exact, and differentiable in all arguments.
+        """Advance under a constant command; the result is exact, and differentiable with respect to all arguments.
 
         Args:
             s: State at the beginning.
-            u: Command that arrives, held constant.
+            u: Arriving command, held constant.
             time: Duration [s]; zero is allowed.
 
         Returns:
             Thrust and body rates minus :meth:`target`, integrated over the duration [m/s, rad], and the
-            state at its end.
+            state at the end of the duration.
         """
         dtype, target = u.c.dtype, self.target(u)
         h = jnp.asarray(time, dtype)
         thrust, c = self.thrust(s.command.c, target.c, h)
-        # The integral follows from the equation of the loop, which saves an exponential.
+        # Computing the integral from the loop equation saves an exponential.
         rate_lag, kappa = self.rate_lag.astype(dtype), self.inverse_damping.astype(dtype)
         error, quarter = s.command.omega - target.omega, 0.25 * kappa**2
         mean, half = _modes(h / jnp.maximum(rate_lag, FASTEST), kappa)
@@ -128,19 +128,19 @@ class ActuatorResponse(eqx.Module):
 
 
 def strong_array(value: float | Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return a strongly typed array, since a weakly typed one would need a separate compilation."""
+    """Return a strongly typed array, since a weakly typed one would require a separate compilation."""
     return jnp.asarray(value, dtype=float)
 
 
 def _modes(x: Float[Array, "3"], kappa: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Return the mean of the loop's two modes, and their difference over rho = sqrt(1 - kappa^2), smooth at rho = 0.
+    """Return the mean of the loop's two modes, and their difference divided by rho; both are smooth at rho = 0.
 
     Args:
-        x: Time over the time constant.
+        x: Time divided by the time constant.
         kappa: 1 / zeta.
 
     Returns:
-        exp(-b) cosh(b rho) and 2 exp(-b) sinh(b rho) / rho, with b = 2 x / kappa^2.
+        exp(-b) cosh(b rho) and 2 exp(-b) sinh(b rho) / rho, with b = 2 x / kappa^2 and rho = sqrt(1 - kappa^2).
     """
     b = 2.0 * x / jnp.maximum(kappa, STIFFEST) ** 2
     square = b**2 * (1.0 - kappa**2)

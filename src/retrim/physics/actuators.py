@@ -1,4 +1,4 @@
-"""Actuators in front of a model. Without them, a steep reward leads to gains that slow motors cannot follow."""
+"""Place actuators in front of a model; without them, a steep reward leads to gains that slow motors cannot follow."""
 
 import dataclasses
 from typing import Any, Generic, TypeVar
@@ -12,7 +12,7 @@ from .actuator_response import ActuatorResponse, ActuatorState
 from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
 
-AT_LIMIT = 0.05  # share of the range around a limit within which a command counts as at the limit
+AT_LIMIT = 0.05  # a command within this share of the range from a limit counts as being at the limit
 
 X = TypeVar("X")
 U = TypeVar("U")
@@ -29,11 +29,11 @@ def lagged(acting: U, u: U, dt: float, tau: Float[Array, "*axes"] | Command) -> 
     """Return the output of a first-order lag for a command over a tick.
 
     Args:
-        acting: Command at the actuators at the beginning of the tick, or arrays of commands.
-        u: Command that reaches them, of the same kind.
+        acting: Command, or arrays of commands, at the actuators at the beginning of the tick.
+        u: Command that reaches the actuators, with the same structure as ``acting``.
         dt: Length of the tick [s].
-        tau: Time constant [s]: one for all parts of a command, or one for each. An array broadcasts with arrays of
-            commands.
+        tau: Time constant [s]: one for all parts of a command, or one for each. An array is broadcast against
+            arrays of commands.
 
     Returns:
         Mean output over the tick, and the output at its end.
@@ -64,7 +64,7 @@ def is_followed(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
 
 
 class RateBiased(AbstractWrapper[X]):
-    """A model whose body rates exceed the commanded ones by a constant."""
+    """A model whose body rates differ from the commanded ones by a constant bias."""
 
     base: AbstractDynamics[X]
     bias: Float[Array, "3"]
@@ -76,7 +76,7 @@ class RateBiased(AbstractWrapper[X]):
 
 
 class Lagged(AbstractDynamics[LagState[X]]):
-    """A model with the response of the actuators and the rate loop in front of it."""
+    """A model whose commands first pass through the response of the actuators and the rate loop."""
 
     base: AbstractDynamics[X]
     response: ActuatorResponse
@@ -89,7 +89,7 @@ class Lagged(AbstractDynamics[LagState[X]]):
     @property
     def settling_ticks(self) -> Float[Array, ""]:
         """Settling time of the response, in addition to that of the base model [ticks]."""
-        # A number of ticks that is whole except for rounding counts as whole.
+        # A number of ticks that is whole up to rounding errors counts as whole.
         return jnp.ceil(self.response.settling_time / self.dt - 0.01) + self.base.settling_ticks
 
     def init(self, x: State) -> LagState[X]:
@@ -101,7 +101,7 @@ class Lagged(AbstractDynamics[LagState[X]]):
         return self.base.state(s.inner)
 
     def with_state(self, s: LagState[X], x: State) -> LagState[X]:
-        """Replace (p, R, v); the hidden state is kept."""
+        """Return ``s`` with (p, R, v) replaced; the hidden state is kept."""
         return LagState(self.base.with_state(s.inner, x), s.actuators)
 
     def actuators(self, s: LagState[X]) -> ActuatorState:
@@ -109,17 +109,17 @@ class Lagged(AbstractDynamics[LagState[X]]):
         return s.actuators
 
     def step(self, s: LagState[X], u: Command, a_ext: Float[Array, "3"]) -> LagState[X]:
-        """Advance one tick under the mean thrust and body rates over it."""
+        """Advance one tick under the mean thrust and body rates over the tick."""
         away, actuators = self.response(s.actuators, u, self.dt)
         mean = jax.tree.map(lambda target, each: target + each / self.dt, self.response.target(u), away)
         return LagState(self.base.step(s.inner, mean, a_ext), actuators)
 
 
 def with_response(model: AbstractDynamics[Any], response: ActuatorResponse) -> AbstractDynamics[Any]:
-    """Return a model with a different actuator response; actuators are added to a model without them.
+    """Return a model with a different actuator response; actuators are added if the model does not have them.
 
     Args:
-        model: A model, or wrappers around one.
+        model: A model, which may be wrapped.
         response: Response of thrust and body rates.
     """
     if isinstance(model, Lagged):

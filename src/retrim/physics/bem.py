@@ -1,4 +1,4 @@
-"""The realistic plant at 1 kHz: blade-element rotors, body drag, the firmware's rate controller, and motors."""
+"""Simulate the realistic plant at 1 kHz: blade-element rotors, body drag, the firmware's rate controller and motors."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -23,12 +23,12 @@ class BemState(eqx.Module):
 
     body: RotorState
     inflow: Inflow
-    """Inflow of the four rotors; every leaf has 4 numbers."""
+    """Inflow of the four rotors; each leaf has four entries."""
 
 
 @runtime_checkable
 class RateController(Protocol):
-    """Turns commands into rotor speeds, once per millisecond; an ``eqx.Module``."""
+    """Protocol of an ``eqx.Module`` that turns commands into rotor speeds once per millisecond."""
 
     thrust_map: Float[Array, ""]
     """Coefficient c in Omega = sqrt(F / 4 c) that the controller assumes for its propellers [N s^2]."""
@@ -36,7 +36,7 @@ class RateController(Protocol):
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command, /
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
-        """Return the commanded rotor speeds [rad/s], integral of the rate error [rad], and slow command [rad/s]."""
+        """Return the rotor speeds [rad/s], the integral of the rate error [rad], and the filtered command [rad/s]."""
         ...
 
 
@@ -69,14 +69,14 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
             dt: Control tick [s], a whole number of milliseconds.
             thrust_error: Relative thrust error: in still air, u_hover gives (1 + thrust_error) m g.
 
-        T / Omega^2 of a propeller in still air is constant, so one number calibrates the whole range.
+        In still air, T / Omega^2 is constant for a propeller, so one number calibrates the whole range of speeds.
         """
         blades = hover_coefficient(vehicle.propeller, vehicle.hover_speed)
         thrust_map = FRAME_FACTOR * blades / (1.0 + thrust_error)
         return cls(vehicle, Betaflight.suited(vehicle, thrust_map, blades), dt)
 
     def init(self, x: State) -> BemState:
-        """Return the state of a vehicle that hovers at ``x``, with the rotor speeds of u_hover and settled inflow."""
+        """Return the state of a vehicle that hovers at ``x``, with the rotor speeds for u_hover and settled inflow."""
         vehicle, zero = self.vehicle, jnp.zeros_like(x.p)
         speed = jnp.sqrt(vehicle.mass * STANDARD_GRAVITY / (4.0 * self.loop.thrust_map))
         body = RotorState(x, zero, jnp.ones(4, dtype=x.p.dtype) * speed, zero, zero, zero)
@@ -89,7 +89,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return s.body.x
 
     def with_state(self, s: BemState, x: State) -> BemState:
-        """Replace (p, R, v)."""
+        """Return ``s`` with (p, R, v) replaced."""
         b = s.body
         return BemState(RotorState(x, b.omega, b.motors, b.integral, b.omega_dot, b.wanted_slow), s.inflow)
 
@@ -103,7 +103,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         return s.body
 
     def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
-        """Advance one millisecond with constant loads."""
+        """Advance one millisecond under constant loads."""
         vehicle, b = self.vehicle, s.body
         commanded, integral, wanted_slow = self.loop(vehicle, b, u)
         motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
@@ -122,7 +122,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         *,
         steps: int = 2,
     ) -> tuple[BladeForces, Inflow]:
-        """Return the forces of the four rotors, each for the air velocity at its own hub."""
+        """Return the forces and the inflow of the four rotors, each at the air velocity of its own hub."""
         air = self.hub_velocities(b, wind)
         v_hor = jnp.sqrt(air[:, 0] ** 2 + air[:, 1] ** 2 + 1e-12)
 
@@ -140,11 +140,11 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     def places(self) -> Float[Array, "4 3"]:
         """Return the hub positions in the body frame [m]."""
         arm = self.vehicle.arm
-        turn = signs(arm.dtype)  # a rotor at (x, y) turns the body about x by its y, about y by -x
+        turn = signs(arm.dtype)  # the lever of a rotor at (x, y) is y about the x axis, and -x about the y axis
         return jnp.stack([-arm[0] * turn[1], arm[1] * turn[0], jnp.zeros(4, dtype=arm.dtype)], axis=1)
 
     def loads(self, b: RotorState, motors: Float[Array, "4"], blades: BladeForces, effects: ExternalEffects) -> Loads:
-        """Return the force and torque of rotors, body drag, the motors' yaw reaction and gyroscopic effects."""
+        """Return the force and torque from the rotors, body drag, the motors' yaw reaction and gyroscopic effects."""
         vehicle = self.vehicle
         air = self.hub_velocities(b, effects.wind)
         along = air[:, :2] / jnp.sqrt(air[:, :1] ** 2 + air[:, 1:2] ** 2 + 1e-12)

@@ -1,4 +1,4 @@
-"""Rate controller of flight firmware at 1 kHz: PID in throttle units, mixer and speed controllers."""
+"""Simulate the rate controller of flight firmware at 1 kHz: PID in throttle units, mixer and speed controllers."""
 
 import dataclasses
 
@@ -13,11 +13,11 @@ from .vehicle import Vehicle
 
 # Throttle per unit of gain, and per rad/s, rad and rad/s^2: the firmware's scaling of its P, I and D settings.
 P_SCALE, I_SCALE, D_SCALE = 1.818e-3, 14.0e-3, 31.25e-6
-RELAX_RATE, RELAX_CUTOFF = 0.698, 15.0  # [rad/s], [Hz]; limits at which the integral pauses (40 deg/s)
+RELAX_RATE, RELAX_CUTOFF = 0.698, 15.0  # [rad/s], [Hz]; the integral pauses if the high-passed command exceeds 40 deg/s
 
 
 class Betaflight(eqx.Module):
-    """Gains in the units of the firmware's settings, and the thrust map that turns newtons into rotor speed."""
+    """Gains in the units of the firmware's settings, and the thrust map that converts a thrust to a rotor speed."""
 
     kp: Float[Array, "3"]
     ki: Float[Array, "3"]
@@ -31,7 +31,7 @@ class Betaflight(eqx.Module):
     def of(cls, thrust_map: Float[Array, ""]) -> "Betaflight":
         """Return the settings of the Agilicious platform: P 40, 40, 30; I 80, 80, 60; D 20, 20, 0.
 
-        The limit of the integral is that of the firmware, 40 % of the throttle.
+        The integral limit is that of the firmware: 40 % of the throttle.
         """
         return cls(
             kp=jnp.array([40.0, 40.0, 30.0]),
@@ -48,7 +48,7 @@ class Betaflight(eqx.Module):
 
         Args:
             vehicle: Vehicle constants.
-            thrust_map: As in :meth:`of`.
+            thrust_map: Coefficient c in Omega = sqrt(F / 4 c) that the controller assumes [N s^2].
             coefficient: True T / Omega^2 of one rotor [N s^2].
         """
         result, power = cls.of(thrust_map), authority(vehicle, coefficient)
@@ -72,11 +72,11 @@ class Betaflight(eqx.Module):
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
-        """Return the commanded rotor speeds [rad/s], the integral of the rate error [rad], and the slow command."""
+        """Return the rotor speeds [rad/s], the integral of the rate error [rad], and the filtered command [rad/s]."""
         low, high = vehicle.command_min, vehicle.command_max
         wanted = jnp.clip(u.omega, low.omega, high.omega)
         error = wanted - s.omega
-        # The integral pauses while the command changes fast, so that it does not wind up in a turn.
+        # The integral pauses while the command changes fast, which prevents windup in a turn.
         relaxed = jnp.maximum(0.0, 1.0 - jnp.abs(wanted - s.wanted_slow) / RELAX_RATE)
         grown = s.integral + SUBSTEP * error * relaxed
         integral = jnp.clip(grown, -self.integral_max, self.integral_max)

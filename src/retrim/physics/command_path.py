@@ -1,8 +1,8 @@
-"""The command path of a vehicle, from the controller to the motion.
+"""Model the command path of a vehicle, from the controller to the motion.
 
 A command acts after a transport delay. Thrust and body rates then follow it with the response of
-:class:`~retrim.physics.actuator_response.ActuatorResponse`. Commands wait in a queue of fixed length, so that a
-different delay does not need a new compilation.
+:class:`~retrim.physics.actuator_response.ActuatorResponse`. Commands wait in a queue of fixed length, so a
+different delay does not require recompilation.
 """
 
 import math
@@ -56,7 +56,7 @@ class CommandQueue(eqx.Module):
     def arrival(self, delay: Float[Array, ""], dt: float) -> Command:
         """Return the mean command that arrives during the tick that begins now.
 
-        It is a weighted mean of two neighbours in the queue.
+        The result is a weighted mean of two neighbouring commands in the queue.
 
         Args:
             delay: Transport delay [s], at most the longest that the queue can hold.
@@ -65,7 +65,7 @@ class CommandQueue(eqx.Module):
         return self.combine(self.weights(delay, dt))
 
     def pieces(self, delay: Float[Array, ""], dt: float) -> tuple[Command, Command, Float[Array, ""]]:
-        """Return the two commands that arrive during the tick that begins now, and the time of the change [s].
+        """Return the two commands that arrive in the tick that begins now, and the time of the change between them [s].
 
         Args:
             delay: Transport delay [s], at most the longest that the queue can hold.
@@ -77,7 +77,7 @@ class CommandQueue(eqx.Module):
         return before, after, (ticks - n) * dt
 
     def substeps(self, delay: Float[Array, ""], dt: float, n: int) -> Command:
-        """Return the mean command that arrives in each of ``n`` equal parts of the tick that begins now (leading axis).
+        """Return the mean arriving command for each of ``n`` equal parts (leading axis) of the tick that begins now.
 
         Args:
             delay: Transport delay [s], at most the longest that the queue can hold.
@@ -104,7 +104,7 @@ class CommandQueue(eqx.Module):
 
     def _age(self, delay: Float[Array, ""], dt: float) -> Float[Array, ""]:
         """Return the age in ticks of the command that arrives when the tick begins."""
-        # Beyond the end of the queue, its oldest command acts, since a traced delay cannot be rejected.
+        # A delay beyond the end of the queue selects the oldest command, since a traced delay cannot be rejected.
         return jnp.minimum(whole_steps(delay.astype(self.commands.c.dtype), dt), self.commands.c.shape[0] - 1.0)
 
     def _hat(self, age: Float[Array, ""]) -> Float[Array, " n"]:
@@ -114,7 +114,7 @@ class CommandQueue(eqx.Module):
 
 
 class PathState(eqx.Module):
-    """Commands under way and state of the actuators."""
+    """Commands under way, and the state of the actuators."""
 
     queue: CommandQueue
     actuators: ActuatorState
@@ -138,7 +138,7 @@ class CommandPath(eqx.Module):
         return cls(strong_array(delay), ActuatorResponse.of() if response is None else response)
 
     def init(self, u: Command, dt: float, *, longest: float = LONGEST_DELAY) -> PathState:
-        """Return the state of a vehicle at rest under ``u``; see :meth:`CommandQueue.of`."""
+        """Return the state of a vehicle that has always been commanded ``u``; see :meth:`CommandQueue.of`."""
         return PathState(CommandQueue.of(u, dt, longest=longest), ActuatorState.at(u))
 
     def __call__(self, s: PathState, u: Command, dt: float) -> tuple[Command, PathState]:
@@ -160,7 +160,7 @@ class CommandPath(eqx.Module):
         """Advance the actuators by the tick for which the newest command in the queue was issued.
 
         Args:
-            queue: Commands.
+            queue: Queue of issued commands.
             actuators: State at the beginning of the tick.
             dt: Length of the tick [s].
 
@@ -178,7 +178,7 @@ class CommandPath(eqx.Module):
         """Advance only the thrust, by the tick for which the newest command in the queue was issued.
 
         Args:
-            queue: Commands.
+            queue: Queue of issued commands.
             c: Thrust at the beginning of the tick [m/s^2].
             dt: Length of the tick [s].
 
@@ -214,7 +214,7 @@ def queue_length(dt: float, longest: float = LONGEST_DELAY) -> int:
 
 
 def whole_steps(time: Float[Array, "*shape"], dt: float) -> Float[Array, "*shape"]:
-    """Return a time in steps of ``dt``; a number that is whole up to rounding errors is made whole."""
+    """Return a time in steps of ``dt``; a number that is whole up to rounding errors is rounded."""
     steps = time / dt
     nearest = jnp.round(steps)
     rounding = jnp.where(jnp.abs(steps - nearest) < ROUNDING, nearest - steps, 0.0)

@@ -1,7 +1,7 @@
-"""Disturbances: functions (t, x) -> :class:`ExternalEffects`. This module contains pushes; see also wind and faults.
+"""Define disturbances as functions (t, x) -> :class:`ExternalEffects`.
 
-Disturbances belong to the plant; the nominal model does not contain them. Their random numbers are drawn at
-construction, so that a disturbance is repeatable.
+This module contains pushes; see also the modules ``wind`` and ``faults``. Disturbances belong to the plant; the nominal
+model does not contain them. Their random numbers are drawn at construction, so a disturbance is repeatable.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def effects_at(times: ArrayLike, x: State, disturbance: Disturbance) -> External
 
 
 class Push(eqx.Module):
-    """A disturbance from a function (t, x) -> external acceleration, world [m/s^2]."""
+    """A disturbance defined by a function (t, x) -> external acceleration in the world frame [m/s^2]."""
 
     a_ext: Callable[[Float[Array, ""], State], Float[Array, "3"]]
 
@@ -54,7 +54,7 @@ class SumOfDisturbances(eqx.Module):
 
 
 class HeldEffects(eqx.Module):
-    """Constant effects of any kind; the owner may replace them with others in flight."""
+    """Constant effects of any kind; the owner may replace the effects in flight."""
 
     effects: ExternalEffects
 
@@ -95,15 +95,15 @@ class Kick(eqx.Module):
     """Duration [s]."""
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Return ``a`` [m/s^2] from ``since`` on, for ``duration``."""
+        """Return the push ``a`` [m/s^2] from ``since`` on, for ``duration``, and zero otherwise."""
         acts = (t >= self.since) & (t < self.since + self.duration)
         return ExternalEffects.of(x.p.dtype, push=jnp.where(acts, self.a, jnp.zeros_like(self.a)))
 
 
 class Reversing(eqx.Module):
-    """An acceleration of alternately ``+a`` and ``-a``, reversed every ``period`` seconds.
+    """An acceleration that alternates between ``a`` and ``-a`` every ``period`` seconds.
 
-    In the paper, it is reversed every 15 s (Sec. IV-B.3).
+    In the paper, the period is 15 s (Sec. IV-B.3).
     """
 
     a: Float[Array, "3"]
@@ -121,9 +121,9 @@ class Reversing(eqx.Module):
 
 
 class RandomWalk(eqx.Module):
-    """An acceleration that wanders within ``+-bound`` per axis, linear between points ``every`` seconds apart.
+    """An acceleration that wanders within ±``bound`` per axis, linearly between points ``every`` seconds apart.
 
-    The walk is a Brownian path folded back at the bounds; after its last point it is retraced backwards.
+    The walk is a Brownian path folded back at the bounds. After its last point, the walk is retraced backwards.
     """
 
     points: Float[Array, "n 3"]

@@ -1,6 +1,6 @@
-"""Motion models: x_{t+1} = f(x_t, u_t) for one control tick.
+"""Define motion models: x_{t+1} = f(x_t, u_t) for one control tick.
 
-The configurations of the paper's runtime study (Sec. IV-C) are expressions, with rotors = LinearDragQuadrotor.of(...)::
+With rotors = LinearDragQuadrotor.of(...), the configurations of the paper's runtime study (Sec. IV-C) are::
 
     Hybrid(PointMass(dt), r)                                    # the paper's choice
     Hybrid(PointMass(dt), r, backprop=True)
@@ -126,7 +126,7 @@ def runge_kutta(s: State, u: Command, a_ext: Float[Array, "3"], h: float | Float
 
 @runtime_checkable
 class Residual(Protocol):
-    """Predicts the acceleration that a model misses, in the world frame [m/s^2]. It may be any function of (x, u)."""
+    """Any function of (x, u) that predicts the acceleration that a model misses, in the world frame [m/s^2]."""
 
     def __call__(self, x: State, u: Command, /) -> Float[Array, "3"]:
         """Return the missing acceleration in the state ``x`` while ``u`` acts."""
@@ -157,7 +157,7 @@ class AbstractWrapper(AbstractDynamics[X]):
         return self.base.state(s)
 
     def with_state(self, s: X, x: State) -> X:
-        """Replace (p, R, v); the hidden state is kept."""
+        """Return ``s`` with (p, R, v) replaced; the hidden state is kept."""
         return self.base.with_state(s, x)
 
     def actuators(self, s: X) -> ActuatorState | None:
@@ -168,8 +168,8 @@ class AbstractWrapper(AbstractDynamics[X]):
 class Hybrid(AbstractWrapper[X]):
     """A model plus a residual, which is evaluated once per tick and held over it (paper, Sec. III-E).
 
-    With ``backprop=False``, gradients do not flow through the residual, neither to its weights nor to the state and the
-    command at its inputs. This is the paper's back-propagation "through the analytical model only".
+    With ``backprop=False``, gradients flow through the residual neither to its weights nor to its inputs, the state and
+    the command. This is the paper's back-propagation "through the analytical model only".
     """
 
     base: AbstractDynamics[X]
@@ -183,7 +183,7 @@ class Hybrid(AbstractWrapper[X]):
 
 
 class StraightThrough(AbstractDynamics[X]):
-    """The value of the model ``forward`` with the gradient of the model ``backward``.
+    """A model with the value of ``forward`` and the gradient of ``backward``.
 
     Only (p, R, v) carry a gradient; the hidden state of the forward model does not.
     """
@@ -215,7 +215,7 @@ class StraightThrough(AbstractDynamics[X]):
         return self.forward.state(s)
 
     def with_state(self, s: X, x: State) -> X:
-        """Replace (p, R, v); the hidden state is kept."""
+        """Return ``s`` with (p, R, v) replaced; the hidden state is kept."""
         return self.forward.with_state(s, x)
 
     def actuators(self, s: X) -> ActuatorState | None:

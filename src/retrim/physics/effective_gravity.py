@@ -1,9 +1,10 @@
-"""The frame of the effective gravity: a constant disturbance tilts and scales gravity.
+"""Transform states and commands to the frame of the effective gravity.
 
-With the effective gravity gamma = g + d, let Q be the smallest rotation that takes -gamma/|gamma| to the vertical, and
-s = |g| / |gamma|. If p, R, v satisfy Eq. (1) of the paper with the thrust c and the disturbance d, then s Q p, Q R,
-s Q v satisfy Eq. (1) with the thrust s c and without disturbance. The equation is equivariant under rotations, and
-under a change of the unit of length with an unchanged unit of time.
+A constant disturbance tilts and scales gravity. With the effective gravity gamma = g + d, let Q be the smallest
+rotation that takes -gamma/|gamma| to the vertical, and s = |g| / |gamma|. If p, R and v satisfy Eq. (1) of the paper
+with the thrust c and the disturbance d, then s Q p, Q R and s Q v satisfy Eq. (1) with the thrust s c and without a
+disturbance. The equation is equivariant under rotations, and under a change of the unit of length with an unchanged
+unit of time.
 """
 
 import equinox as eqx
@@ -21,13 +22,13 @@ class EffectiveGravityFrame(eqx.Module):
     Q: Float[Array, "3 3"]
     """Rotation into the frame."""
     scale: Float[Array, ""]
-    """Length in the frame of one metre in the world."""
+    """Length in the frame that corresponds to one metre in the world."""
     d: Float[Array, "3"]
     """Disturbance that is part of the frame's gravity, world [m/s^2]."""
 
     @classmethod
     def of(cls, d: Float[Array, "3"]) -> "EffectiveGravityFrame":
-        """Return the frame of g + ``d``, world [m/s^2].
+        """Return the frame of g + ``d``, with ``d`` in the world frame [m/s^2].
 
         The frame is defined for every ``d`` whose vertical part is smaller than gravity, but not for a weightless
         vehicle.

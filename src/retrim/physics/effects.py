@@ -1,4 +1,4 @@
-"""External effects on a vehicle at one instant: push, wind, rotor faults and load."""
+"""Combine the external effects on a vehicle at one instant: push, wind, rotor faults and load."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ class ExternalEffects(eqx.Module):
     wind: Float[Array, "3"]
     """Air velocity at the vehicle, world [m/s]; it acts through the aerodynamics."""
     gain: Float[Array, "4"]
-    """Factor on the thrust and torque of each rotor."""
+    """Factor that multiplies the thrust and torque of each rotor."""
     mass: Float[Array, ""]
     """Mass of a load, in addition to that of the vehicle [kg]."""
     inertia: Float[Array, "3"]

@@ -1,4 +1,4 @@
-"""Faults of the vehicle itself: a load, a sagging battery or a weak rotor."""
+"""Model faults of the vehicle itself: a load, a sagging battery or a weak rotor."""
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ class Payload(eqx.Module):
     """Time at which the load is dropped [s]; infinity if it is kept."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` for a load without mass, or one that is dropped before it is picked up."""
+        """Raise ``ValueError`` if the mass is not positive, or the load is dropped before it is picked up."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
             return
         if not self.mass > 0 or not self.dropped > self.picked:
@@ -31,7 +31,7 @@ class Payload(eqx.Module):
 
     @classmethod
     def of(cls, mass: float, *, picked: float = 0.0, dropped: float = float("inf")) -> "Payload":
-        """Return a small cube under the vehicle as a load; see :func:`payload_inertia`."""
+        """Return a load in the form of a small cube under the vehicle; see :func:`payload_inertia`."""
         return cls(jnp.array(mass), payload_inertia(mass), jnp.array(picked), jnp.array(dropped))
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
@@ -41,7 +41,7 @@ class Payload(eqx.Module):
 
 
 class BatterySag(eqx.Module):
-    """Thrust that decreases with the battery voltage, at a constant rate, down to a floor."""
+    """A sagging battery: the thrust decreases at a constant rate down to a floor."""
 
     rate: Float[Array, ""]
     """Share of the thrust lost per second [1/s]."""
@@ -62,14 +62,14 @@ class BatterySag(eqx.Module):
 
 
 class WeakRotor(eqx.Module):
-    """Reduced thrust and torque of one rotor at a given speed, e.g. with a chipped propeller."""
+    """One rotor with reduced thrust and torque at a given speed, e.g. because of a chipped propeller."""
 
     gain: Float[Array, "4"]
     """Gains of the rotors: front-right, back-left, back-right, front-left."""
 
     @classmethod
     def of(cls, rotor: int, share: float) -> "WeakRotor":
-        """Return a fault of the rotor ``rotor`` (0 to 3), which keeps ``share`` of its thrust."""
+        """Return a fault of rotor number ``rotor`` (0 to 3), which keeps ``share`` of its thrust."""
         if rotor not in range(4) or not 0 < share <= 1:
             raise ValueError(f"WeakRotor: rotor = {rotor} must be 0 to 3, share = {share} in (0, 1]")
         return cls(jnp.ones(4).at[rotor].set(share))

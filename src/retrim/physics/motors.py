@@ -1,4 +1,4 @@
-"""Externally commanded rotor speeds, instead of a rate controller."""
+"""Command rotor speeds externally, without a rate controller."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -14,10 +14,10 @@ class CommandedSpeeds(eqx.Module):
     speeds: Float[Array, "4"]
     """Rotor speeds [rad/s]."""
     thrust_map: Float[Array, ""]
-    """Thrust map as in a rate controller; it is not used."""
+    """Thrust map, as in a rate controller; unused."""
 
     def __call__(
         self, vehicle: Vehicle, s: RotorState, u: Command
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
-        """Return the given speeds, and the unchanged memory of the rate controller."""
+        """Return the given speeds and the unchanged memory of the rate controller."""
         return self.speeds, s.integral, s.wanted_slow

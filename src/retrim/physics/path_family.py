@@ -1,9 +1,9 @@
-"""A family of vehicles: the range of command paths for which one policy is trained, and the belief about a vehicle.
+"""Define a family of vehicles by the command paths for which one policy is trained, and the belief about a vehicle.
 
-A policy commands thrust per mass and body rates. The size, mass and inertia of a vehicle therefore affect only its
-command path: the delay of a command, and the lag of thrust and rates. A path has four coordinates in [-1, 1]: the
+A policy commands mass-normalised thrust and body rates. The size, mass and inertia of a vehicle therefore affect only
+its command path: the delay of a command, and the lag of thrust and rates. A path has four coordinates in [-1, 1]: the
 delay, the logarithm of the rate lag, the ringing of the rate loop, and the logarithm of the thrust lag. The belief
-about a vehicle is an interval of each coordinate; see :class:`PathBelief`.
+about a vehicle is an interval for each coordinate; see :class:`PathBelief`.
 """
 
 from typing import Any
@@ -36,7 +36,7 @@ class PathBelief(eqx.Module):
 
     @classmethod
     def between(cls, low: Coordinates, high: Coordinates) -> "PathBelief":
-        """Return the belief for an interval of each coordinate; parts outside the family are cut off.
+        """Return the belief with the given intervals; parts outside the family are cut off.
 
         Args:
             low: Lower ends of the intervals.
@@ -66,7 +66,7 @@ class Member(eqx.Module):
     path: CommandPath
     belief: PathBelief
     lateness: Float[Array, ""] | None = None
-    """Longest sum of delay and rate lag within the belief [s]; None outside a flight."""
+    """Largest sum of delay and rate lag within the belief [s]; None outside a flight."""
 
 
 class PathFamily(eqx.Module):
@@ -103,7 +103,7 @@ class PathFamily(eqx.Module):
             least_frequency: Smallest natural frequency of a drawn rate loop [rad/s].
 
         Raises:
-            ValueError: A range is empty, or a lag is not positive.
+            ValueError: A range is empty, or a lag, the damping or the frequency is not positive.
         """
         for name, (low, high) in {"delay": delay, "rate_lag": rate_lag, "thrust_lag": thrust_lag}.items():
             if not (0.0 <= low < high and (low > 0.0 or name == "delay")):
@@ -143,7 +143,7 @@ class PathFamily(eqx.Module):
     def draw(self, key: Key[Array, ""]) -> Member:
         """Draw a vehicle and a true belief about it; the key is consumed.
 
-        The vehicle is uniformly distributed within its belief, so that a belief is neither too narrow nor too wide.
+        The vehicle is uniformly distributed within its belief, so a belief is neither too narrow nor too wide.
         Vehicles at the edges of the family and narrow beliefs are more frequent than others, because they are harder to
         fly. Half of the vehicles are known equally well in all coordinates. A rate loop below the smallest natural
         frequency rings less than its belief implies, since the vehicle could not be flown otherwise.

@@ -1,6 +1,6 @@
 """Set the precision of matrix products on accelerators at the first import; a user's choice takes precedence.
 
-By default, GPUs round the factors of products to ten bits, so that flights would differ from those on a CPU.
+By default, GPUs round the factors of products to ten bits, so flights would differ from those on a CPU.
 """
 
 import jax

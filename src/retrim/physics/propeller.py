@@ -1,8 +1,8 @@
-"""A propeller model by blade-element momentum theory (NeuroBEM, arXiv 2106.08015).
+"""Model propellers with blade-element momentum theory (NeuroBEM, arXiv 2106.08015).
 
-Numbers in brackets are those of its equations. The air velocity at the hub is ``v_hor`` in the rotor's plane and
-``v_ver`` along its axis, **positive when descending**. All speeds are in m/s, rotor speeds in rad/s. Flapping is left
-out, since it has no visible effect below 3 m/s.
+Numbers in brackets refer to the equations of that paper. The air velocity at the hub is ``v_hor`` in the rotor's plane
+and ``v_ver`` along its axis, **positive when descending**. All speeds are in m/s, rotor speeds in rad/s. Flapping is
+left out, since it has no visible effect below 3 m/s.
 """
 
 from typing import NamedTuple
@@ -14,13 +14,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 AIR_DENSITY = 1.204  # [kg/m^3], at 20 degrees Celsius
-OMEGA_FLOOR = 10.0  # [rad/s]; below it the model is not valid
+OMEGA_FLOOR = 10.0  # [rad/s]; below this speed, the model is not valid
 V_HOR_FLOOR = 1e-6  # [m/s]; keeps square roots differentiable at hover
 
 # Gauss-Legendre quadrature on [0, 1] with six points: abscissae and weights.
 _RADII = (0.0337652428984, 0.1693953067669, 0.3806904069584, 0.6193095930416, 0.8306046932331, 0.9662347571016)
 _RADII_W = (0.0856622461896, 0.1803807865241, 0.2339569672863, 0.2339569672863, 0.1803807865241, 0.0856622461896)
-# Eight equally spaced azimuths; the integrands depend only on sin(psi), so only five differ.
+# Eight equally spaced azimuths; the integrands depend only on sin(psi), so only five values differ.
 _SIN_PSI = (-1.0, -0.7071067811865476, 0.0, 0.7071067811865476, 1.0)
 _SIN_PSI_W = (0.125, 0.25, 0.25, 0.25, 0.125)
 
@@ -67,8 +67,8 @@ def five_inch() -> Propeller:
 def three_inch() -> Propeller:
     """Return a proposed propeller for the paper's small quadrotor, whose own propeller is unpublished.
 
-    It is the 5.1 in propeller, scaled in radius and chord. Its cd0 is chosen so that hover gives the published
-    c_T = 2.05e-7 N s^2 and kappa = 0.00804 m.
+    This is the 5.1 in propeller with a scaled radius and chord. The coefficient cd0 is chosen so that hover gives the
+    published c_T = 2.05e-7 N s^2 and kappa = 0.00804 m.
     """
     big, radius = five_inch(), jnp.array(0.03903)
     scale = radius / big.radius
@@ -97,7 +97,7 @@ class BladeForces(NamedTuple):
 
 
 class Inflow(eqx.Module):
-    """Induced velocities of one rotor, kept from one millisecond to the next as the start of the search."""
+    """Induced velocities of one rotor, kept from one millisecond to the next as the start of the iteration."""
 
     v_i: Float[Array, ""]
     """Induced velocity that solves the momentum balance [m/s]."""
@@ -106,7 +106,7 @@ class Inflow(eqx.Module):
 
     @classmethod
     def above(cls, dtype: jnp.dtype) -> "Inflow":
-        """Return a start above every root, from which Newton's method converges to the largest; see :func:`solved`."""
+        """Return a start above every root, from which Newton's method finds the largest one; see :func:`solved`."""
         return cls(jnp.array(40.0, dtype=dtype), jnp.array(40.0, dtype=dtype))
 
 
@@ -117,7 +117,7 @@ def blade_forces(
     v_ver: Float[Array, ""],
     v_i: Float[Array, ""],
 ) -> BladeForces:
-    """Evaluate the blade-element integrals [6-15] for the induced velocity ``v_i``."""
+    """Evaluate the blade-element integrals [6-15] at the induced velocity ``v_i``."""
     dtype = v_i.dtype
     x, wx = jnp.array(_RADII, dtype=dtype)[:, None], jnp.array(_RADII_W, dtype=dtype)[:, None]
     sin_psi, wpsi = jnp.array(_SIN_PSI, dtype=dtype)[None, :], jnp.array(_SIN_PSI_W, dtype=dtype)[None, :]
@@ -151,9 +151,10 @@ def solved(
 ) -> Float[Array, ""]:
     """Solve for the largest root v_i of T(v_i) = 2 rho A v_i sqrt(v_hor^2 + (v_ver - v_i)^2) [5], by Newton's method.
 
-    Above the largest root, the balance is decreasing and concave, so that Newton's steps approach the root
-    monotonically. A start just below the root jumps above it first. The gradient is that of the root: by the implicit
-    function theorem, one differentiable step from the root suffices. Gradients do not flow through ``start``.
+    Above the largest root, the balance is decreasing and concave, so Newton iterates approach the root
+    monotonically. From a start just below the root, the first iterate jumps above the root. The gradient is that of the
+    root: by the implicit function theorem, one differentiable step from the root suffices. Gradients do not flow
+    through ``start``.
     """
     disk = 2.0 * AIR_DENSITY * prop.area
 
@@ -168,7 +169,7 @@ def solved(
         return jnp.clip(v - (thrust - disk * v * speed) / lax.stop_gradient(slope), -20.0, 60.0)
 
     v = start
-    if steps > 2:  # a loop of many steps compiles as fast as one step
+    if steps > 2:  # the loop compiles as fast as one step
         v = lax.fori_loop(0, steps - 2, lambda _, v: step(v), v)
     for _ in range(min(steps, 2)):
         v = step(v)
@@ -176,7 +177,7 @@ def solved(
 
 
 def vortex_ring(inflow: Inflow, v_ver: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the induced velocity [m/s] by the momentum balance, or by the empirical rule [18, 19] in slow descent."""
+    """Return the induced velocity [m/s] from the momentum balance or, in slow descent, the empirical rule [18, 19]."""
     v_i, v_h = inflow.v_i, inflow.v_h
     x = v_ver / v_h
     ring = v_h * (1.0 + x * (1.125 + x * (-1.372 + x * (1.718 - 0.655 * x))))
@@ -193,10 +194,10 @@ def rotor(
     *,
     steps: int = 2,
 ) -> tuple[BladeForces, Inflow]:
-    """Return the forces of one rotor and its inflow, after ``steps`` of Newton's method for each root.
+    """Return the forces of one rotor and its inflow, after ``steps`` Newton iterations for each root.
 
-    From the inflow one millisecond earlier, two steps are exact to float32 in any usual manoeuvre. From
-    :meth:`Inflow.above`, use 16 steps.
+    From the inflow one millisecond earlier, two iterations are exact to float32 precision in any usual manoeuvre. From
+    :meth:`Inflow.above`, use 16 iterations.
     """
     omega, v_hor = jnp.maximum(omega, OMEGA_FLOOR), jnp.maximum(v_hor, V_HOR_FLOOR)
     result = Inflow(
@@ -208,7 +209,7 @@ def rotor(
 
 @eqx.filter_jit
 def hover_coefficient(prop: Propeller, omega: Float[Array, ""]) -> Float[Array, ""]:
-    """Return c_T = T / omega^2 of a rotor in still air [N s^2]; it does not depend on the speed."""
+    """Return c_T = T / omega^2 of a rotor in still air [N s^2]; it does not depend on the rotor speed."""
     zero = jnp.zeros_like(omega)
     forces, _ = rotor(prop, omega, zero, zero, Inflow.above(omega.dtype), steps=16)
     return forces.thrust / omega**2

@@ -1,7 +1,8 @@
-"""Gains of a simulated rate loop: the platform's gains if they suit the vehicle, otherwise gains from its constants.
+"""Choose the gains of a simulated rate loop: the platform's gains if suitable, otherwise gains for the vehicle.
 
 About an axis, motors with the time constant tau turn the body: tau w'' + w' = A (u + lead u'). The loop u = P e +
-I int(e) - D w' has the polynomial tau s^3 + (1 + b + a lead) s^2 + (a + i lead) s + i, with a, i, b = A P, A I, A D.
+I int(e) - D w' has the characteristic polynomial tau s^3 + (1 + b + a lead) s^2 + (a + i lead) s + i, with a = A P,
+i = A I and b = A D.
 """
 
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from .vehicle import Vehicle
 LEAST_DAMPING, LEAST_MARGIN = 0.41, 2.7
 """Smallest damping and margin with the platform's gains; a loop that just reaches both overshoots by 40 %."""
 DAMPING, MARGIN, LEAST_D = 0.8, 20.0, 2.0
-"""Damping, margin and smallest D term of gains from the vehicle's constants; such a loop overshoots by a tenth."""
+"""Damping, margin and smallest derivative term of gains for the vehicle; such a loop overshoots by a tenth."""
 
 
 class Gains(NamedTuple):
@@ -33,9 +34,9 @@ class Authority(NamedTuple):
     """Effect of the throttle on the rotation of a hovering vehicle, per axis."""
 
     alpha: Float[Array, "3"]
-    """Angular acceleration A per throttle [rad/s^2]."""
+    """Angular acceleration A per unit of throttle [rad/s^2]."""
     lead: Float[Array, "3"]
-    """Angular acceleration per rate of throttle, over A [s]; about yaw, it is the reaction of accelerating rotors."""
+    """Angular acceleration per unit of throttle rate, over A [s]: about yaw, the reaction of accelerating rotors."""
 
 
 def authority(vehicle: Vehicle, coefficient: Float[Array, ""]) -> Authority:
@@ -63,8 +64,8 @@ def is_damped(
         gains: Gains of the loop.
         lead: Lead of the :class:`Authority` [s].
         tau: Motor time constant [s].
-        least_margin: Smallest margin, as a multiple of that at the limit of stability; larger for an integral that does
-            not pause.
+        least_margin: Smallest margin, as a multiple of that at the limit of stability; it should be larger for an
+            integral that does not pause.
     """
     a, i, b = gains
     damping = 1.0 + b + a * lead
@@ -76,11 +77,11 @@ def is_damped(
 def tuned(gains: Gains, tau: Float[Array, ""]) -> Gains:
     """Return gains from the motor time constant.
 
-    The damping is 0.8, and the integral does not change it.
+    The damping is 0.8; the integral does not change the damping.
 
     Args:
-        gains: Gains of the platform. The D term is not smaller than theirs, and the ratio of integral gain to error
-            gain is not larger.
+        gains: Gains of the platform. The result's derivative term is not smaller than the platform's, and its ratio of
+            integral gain to error gain is not larger.
         tau: Motor time constant [s].
     """
     b = jnp.maximum(gains.b, LEAST_D)

@@ -1,7 +1,7 @@
-"""A rotor-level model at 1 kHz: rate loop, mixer, motors with lag, thrust-map error, rotor drag and rigid body.
+"""Simulate rotors at 1 kHz with a rate loop, mixer, motor lag, thrust-map error, rotor drag and a rigid body.
 
-It is the first realistic plant, and a high-fidelity model for :class:`StraightThrough`. Rotors are ordered front-right,
-back-left, back-right, front-left; the first two turn so that their drag torque acts towards -z.
+The model is the first realistic plant, and a high-fidelity model for :class:`StraightThrough`. Rotors are ordered
+front-right, back-left, back-right, front-left; the first two turn so that their drag torque acts towards -z.
 """
 
 import equinox as eqx
@@ -29,7 +29,7 @@ class RateLoop(eqx.Module):
 
 
 def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
-    """Return gains that settle in about 0.1 s on both quadrotors of the paper, or gains tuned for slow motors.
+    """Return gains with which both of the paper's quadrotors settle in about 0.1 s, or gains tuned for slow motors.
 
     Args:
         motor_tau: Motor time constant [s].
@@ -43,7 +43,7 @@ def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
 class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
     """Rotor-level quadrotor under a CTBR command.
 
-    ``thrust_gain`` is a factor on the true thrust, which models the error of the thrust map. ``drag`` [1/s] is the
+    ``thrust_gain`` multiplies the true thrust, to model the error of the thrust map. ``drag`` [1/s] is the
     linear rotor drag per body axis at hover speed; the drag is proportional to the rotor speeds (blade-element theory,
     first order).
     """
@@ -81,7 +81,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         return s.x
 
     def with_state(self, s: RotorState, x: State) -> RotorState:
-        """Replace (p, R, v)."""
+        """Return ``s`` with (p, R, v) replaced."""
         return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot, s.wanted_slow)
 
     @property

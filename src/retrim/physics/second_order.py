@@ -1,7 +1,7 @@
-"""A point mass with a second-order rate loop: the plant for vehicles whose command path is given in numbers.
+"""Simulate a point mass with a second-order rate loop, for vehicles whose command path is given by numbers.
 
 Thrust and body rates follow their commands as in :class:`~retrim.physics.actuator_response.ActuatorResponse`, exactly
-in each millisecond. The model does not have rotors, so that every combination of lag, damping and gain is a possible
+in each millisecond. The model does not have rotors, so every combination of lag, damping and gain is a possible
 vehicle.
 """
 
@@ -56,7 +56,7 @@ class SecondOrderQuadrotor(AbstractSubstepDynamics[SecondOrderState]):
         return s.x
 
     def with_state(self, s: SecondOrderState, x: State) -> SecondOrderState:
-        """Replace (p, R, v)."""
+        """Return ``s`` with (p, R, v) replaced."""
         return SecondOrderState(x, s.actuators)
 
     def body_rates(self, s: SecondOrderState) -> Float[Array, "3"]:
@@ -64,7 +64,7 @@ class SecondOrderQuadrotor(AbstractSubstepDynamics[SecondOrderState]):
         return s.actuators.command.omega
 
     def substep(self, s: SecondOrderState, u: Command, effects: ExternalEffects) -> SecondOrderState:
-        """Advance one millisecond under the mean thrust and the mean body rates over it."""
+        """Advance one millisecond under the mean thrust and the mean body rates over that time."""
         h, x = SUBSTEP, s.x
         away, actuators = self.response(s.actuators, u, h)
         target = self.response.target(u)

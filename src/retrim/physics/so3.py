@@ -1,4 +1,4 @@
-"""Rotations: hat, exponential and logarithm of SO(3), with finite gradients at zero rotation.
+"""Compute the hat map, exponential and logarithm of SO(3), with finite gradients at zero rotation.
 
 A rotation ``R`` maps body to world coordinates. The direction of a rotation vector is the axis; its length
 is the angle [rad].
@@ -7,7 +7,7 @@ is the angle [rad].
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_SMALL = 1e-6  # [rad^2]; below it the Taylor series is exact to rounding, also in float32
+_SMALL = 1e-6  # [rad^2]; below this value, the Taylor series is exact to rounding, even in float32
 
 
 def hat(w: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -1,6 +1,6 @@
-"""State x = (p, R, v) and command u = (c, omega) of a quadrotor.
+"""Define the state x = (p, R, v) and the command u = (c, omega) of a quadrotor.
 
-Frames, here and everywhere: the world frame has z up; the body frame is forward-left-up; ``R`` maps body to world.
+Throughout the library, the world frame has z up, the body frame is forward-left-up, and ``R`` maps body to world.
 """
 
 from typing import Any, TypeVar
@@ -75,7 +75,7 @@ class Command(eqx.Module):
         return cls(vector[0], vector[1:])
 
     def within(self, low: "Command", high: "Command") -> "Command":
-        """Return the command clipped to limits, entry by entry, in its own precision."""
+        """Return the command clipped to limits, entry by entry, in the command's own precision."""
         return Command(
             jnp.clip(self.c, low.c.astype(self.c.dtype), high.c.astype(self.c.dtype)),
             jnp.clip(self.omega, low.omega.astype(self.omega.dtype), high.omega.astype(self.omega.dtype)),

@@ -1,4 +1,4 @@
-"""The step response of a vehicle's simulated rate loop, about each axis, from hover."""
+"""Compute the step response of a vehicle's simulated rate loop about each axis, from hover."""
 
 import math
 from typing import NamedTuple
@@ -20,7 +20,7 @@ class StepResponse(NamedTuple):
     overshoot: float
     """Excess of the largest rate over the step, as a share of the step."""
     rise: float
-    """Time to 63 % of the step [s]; infinite if it is not reached within 2 s."""
+    """Time to 63 % of the step [s]; infinite if this rate is not reached within 2 s."""
 
 
 def step_responses(vehicle: Vehicle) -> tuple[StepResponse, StepResponse, StepResponse]:

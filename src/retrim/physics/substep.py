@@ -1,4 +1,4 @@
-"""Models that advance in substeps of one millisecond: realistic plants and high-fidelity dynamics."""
+"""Define models that advance in substeps of one millisecond: realistic plants and high-fidelity dynamics."""
 
 import abc
 from typing import TypeVar
@@ -70,7 +70,7 @@ class RotorState(eqx.Module):
     integral: Float[Array, "3"]
     """Integral of the rate error [rad]."""
     omega_dot: Float[Array, "3"]
-    """Body angular acceleration over the last millisecond [rad/s^2], for the D term."""
+    """Body angular acceleration over the last millisecond [rad/s^2], for the derivative term."""
     wanted_slow: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Low-pass filtered commanded body rates [rad/s], for controllers that use the rate of change of commands."""
 
@@ -86,7 +86,7 @@ def rigid_body(
     push: Float[Array, "3"],
     wanted_slow: Float[Array, "3"] | None = None,
 ) -> RotorState:
-    """Advance one semi-implicit millisecond under ``force`` [N] and ``torque`` [Nm] in the body frame.
+    """Advance by one semi-implicit step of a millisecond under the body-frame ``force`` [N] and ``torque`` [Nm].
 
     The attitude stays on SO(3).
     """

@@ -1,6 +1,7 @@
-"""Constants of quadrotors, each with its source.
+"""Define the constants of quadrotors, each with its source.
 
-The quadrotors are functions rather than constants, since creating an array at import would start a JAX backend.
+The quadrotors are returned by functions, not stored as constants, since creating an array at import would start a JAX
+backend.
 """
 
 import dataclasses
@@ -73,13 +74,13 @@ class Vehicle(eqx.Module):
     propeller: Propeller
     esc: Esc
     rate_lag: Float[Array, "3"] | None = None
-    """Time constants with which the body rates follow their commands, if they are known [s]. Training models use them;
+    """Time constants with which the body rates follow their commands, if known [s]. Training models use these;
     the time constants of a plant follow from its motors and its rate loop."""
     rate_damping: Float[Array, "3"] | None = None
     """Damping ratios of the rate loops; None for first-order loops."""
 
     def __check_init__(self) -> None:
-        """Raise ``ValueError`` naming the field if such a vehicle cannot exist; traced values are not checked."""
+        """Raise a ``ValueError`` that names the field if such a vehicle cannot exist; traced values are not checked."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
             return
         for field in dataclasses.fields(self):
@@ -108,7 +109,7 @@ class Vehicle(eqx.Module):
 
     @property
     def hover_speed(self) -> Float[Array, ""]:
-        """Rotor speed that carries the weight, from c_T [rad/s]."""
+        """Rotor speed at which the thrust carries the weight, computed from c_T [rad/s]."""
         return jnp.sqrt(self.mass * STANDARD_GRAVITY / (4.0 * self.thrust_coefficient))
 
 
@@ -116,9 +117,9 @@ def small() -> Vehicle:
     """Return the paper's small quadrotor.
 
     Mass, inertia, arm length (0.06 m), thrust and motor time constant are from Table IV of the paper. The description
-    published with the paper gives the inertia to three digits. It also gives the rate limits, c_T, kappa, the speeds,
-    the rotor inertia and the speed controllers' curve at 17 V. The propeller is :func:`three_inch`. The drag area is
-    that of the kingfisher, scaled with the square of the arm.
+    published with the paper gives the inertia to three digits. It also contains the rate limits, c_T, kappa, the
+    speeds, the rotor inertia and the speed controllers' curve at 17 V. The propeller is :func:`three_inch`. The drag
+    area is that of the kingfisher, scaled with the square of the arm length.
     """
     return Vehicle(
         mass=jnp.array(0.19),
@@ -147,7 +148,8 @@ def small() -> Vehicle:
 def kingfisher() -> Vehicle:
     """Return the research quadrotor of the Agilicious platform, with the constants published with that platform.
 
-    The exception is kappa, which is from blade-element theory for these 5.1 in rotors (the description lists 0.022 m).
+    The exception is kappa, which is computed from blade-element theory for these 5.1 in rotors (the description lists
+    0.022 m).
     """
     return Vehicle(
         mass=jnp.array(0.752),

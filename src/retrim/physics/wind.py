@@ -1,4 +1,4 @@
-"""Steady wind, Dryden gusts and the jet of a fan.
+"""Model steady wind, Dryden gusts and the jet of a fan.
 
 Wind acts through the relative air velocity at the rotors and the body.
 """
@@ -52,9 +52,9 @@ class Turbulence(eqx.Module):
     ) -> "Turbulence":
         """Draw frozen eddies with the scale ``length`` [m] that pass at ``speed`` [m/s].
 
-        Sinusoid k has a frequency from the k-th n-quantile of the spectrum, so that each carries the same energy:
-        with s = L omega / V, the energy below s is 2 atan(s) / pi along the wind, and (2 atan(s) - s / (1 + s^2)) / pi
-        across it (MIL-F-8785C).
+        The frequency of sinusoid k is from the k-th n-quantile of the spectrum, so all sinusoids carry the same energy.
+        With s = L omega / V, the share of the energy below s is 2 atan(s) / pi along the wind, and
+        (2 atan(s) - s / (1 + s^2)) / pi across it (MIL-F-8785C).
         """
         rate, phase = _eddies(speed, length, key, n)
         return cls(rate, phase, sigma)
@@ -100,8 +100,8 @@ class Dryden(eqx.Module):
     def of(cls, mean: Float[Array, "3"], *, key: Key[Array, ""], altitude: float = 10.0 * FEET) -> "Dryden":
         """Draw the gusts of a horizontal mean wind at an ``altitude`` of at least 3.048 m.
 
-        sigma_w is 0.1 of the wind at 20 ft, here ``mean``. The lengths and the other sigmas depend on the altitude in
-        feet.
+        sigma_w is 0.1 times the wind speed at 20 ft, here that of ``mean``. The lengths and the other sigmas depend on
+        the altitude in feet.
         """
         speed = float(jnp.linalg.norm(mean))
         if not speed > 0 or float(mean[2]) != 0.0 or altitude < 10.0 * FEET - 1e-9:
@@ -123,7 +123,7 @@ class Dryden(eqx.Module):
 class Fan(eqx.Module):
     """A round, turbulent jet; its force depends on the vehicle's position, attitude and velocity.
 
-    Far from the outlet, a jet widens in proportion to the distance. Its momentum flux is constant, so that speed times
+    Far from the outlet, a jet widens in proportion to the distance. Its momentum flux is constant, so speed times
     width is constant. The profile across the jet is a Gaussian.
     """
 

@@ -1,4 +1,4 @@
-"""Plants, one per file; packages that only one plant needs are imported when that plant is created."""
+"""Plants, one per file; a package that only one plant needs is imported when that plant is created."""
 
 from .crazyflow import CrazyflowPlant as CrazyflowPlant
 from .mujoco import MujocoPlant as MujocoPlant

@@ -17,7 +17,7 @@ from .external import ExternalPlant, Pose, thrust_limits, whole_steps
 from .extras import import_extra
 
 DRONE = "cf21B_500"
-FREQUENCY = 500  # [Hz], of dynamics and rate loop
+FREQUENCY = 500  # [Hz], rate of the dynamics and of the rate loop
 ORDER = [0, 2, 1, 3]  # our rotors in crazyflow's order: front-right, back-right, back-left, front-left
 
 _building = threading.Lock()
@@ -25,20 +25,21 @@ _building = threading.Lock()
 
 @contextlib.contextmanager
 def _its_jax() -> Iterator[None]:
-    """Set JAX's defaults within the context, since crazyflow needs them: single precision and free promotion."""
+    """Within the context, set the JAX options that crazyflow needs: single precision and free promotion."""
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
 class CrazyflowPlant(ExternalPlant):
-    """crazyflow's first-principles Crazyflie 2.1 Brushless (43 g, lifts 38 g more), in single precision.
+    """crazyflow's first-principles model of the Crazyflie 2.1 Brushless, in single precision.
 
-    The plant uses crazyflow's stages without its scene, so there is neither a floor nor a MuJoCo model. crazyflow's
-    rate loop is the firmware's Mellinger controller, which also levels the vehicle. Its attitude gains are zero here,
-    as crazyflow itself recommends for tracking body rates.
+    The vehicle weighs 43 g and can lift another 38 g. The plant uses crazyflow's stages without its scene, so
+    there is neither a floor nor a MuJoCo model. crazyflow's rate loop is the firmware's Mellinger controller, which
+    also levels the vehicle. The controller's attitude gains are set to zero here, as crazyflow itself recommends for
+    tracking body rates.
 
-    crazyflow does not model wind. Since its body drag is linear in the velocity, the effect of wind is exactly the drag
-    at the velocity -wind, which is applied as a force at each step. Conditions are constant during a tick.
+    crazyflow does not model wind. Since its body drag is linear in velocity, the effect of wind is exactly the drag at
+    the velocity -wind. This drag is applied as a force at each step. External effects are constant during a tick.
     """
 
     def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:
@@ -52,7 +53,7 @@ class CrazyflowPlant(ExternalPlant):
     def _launch(self, x: Pose) -> None:
         q = self._rotation.from_matrix(x.R).as_quat()  # scalar last, as in crazyflow
         with _its_jax():
-            # on its device, since one array that is not bound to a device would cause a second compilation
+            # bound to the device, since an array without one would cause a second compilation
             p, q, v = jax.device_put([a[None, None].astype(np.float32) for a in (x.p, q, x.v)], _device())
             self._data = self._hovering.replace(states=self._hovering.states.replace(pos=p, quat=q, vel=v))
 
@@ -76,7 +77,7 @@ def _device() -> jax.Device:
 def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffects], Any], np.ndarray]:
     """Return a hovering Crazyflie, the compiled function for ``steps`` steps, and a rotor's thrust limits [N].
 
-    All plants share them.
+    All plants share these three objects.
     """
     sim = import_extra("crazyflow.sim.sim", "crazyflow")
     parts, functional = (

@@ -20,11 +20,11 @@ class Pose(NamedTuple):
     """A :class:`State` in NumPy, double precision."""
 
     p: np.ndarray
-    """Position, world [m]."""
+    """Position in the world frame [m]."""
     R: np.ndarray
     """Attitude, body to world."""
     v: np.ndarray
-    """Velocity, world [m/s]."""
+    """Velocity in the world frame [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
 
@@ -33,7 +33,8 @@ class ExternalPlant(Plant, abc.ABC):
     """A simulator with its own steps and a delay of one tick: the command from one tick acts in the next.
 
     A subclass implements :meth:`_launch` and :meth:`_advance`. The disturbance is evaluated at ``instants`` evenly
-    spaced times of each tick, for the state at its start. Commands beyond the ``limits`` of [c, omega] are clipped.
+    spaced times in each tick, with the state at the start of the tick. Commands are clipped to the ``limits`` of
+    [c, omega].
     """
 
     def __init__(
@@ -50,18 +51,18 @@ class ExternalPlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def _launch(self, x: Pose) -> None:
-        """Start a steady hover at ``x``, without rotation."""
+        """Start in a steady hover at ``x``, without rotation."""
 
     @abc.abstractmethod
     def _advance(self, u: np.ndarray, effects: ExternalEffects) -> Pose:
-        """Advance one tick under ``u`` = [c [m/s^2], body rates [rad/s]].
+        """Advance one tick under the command ``u`` = [c [m/s^2], body rates [rad/s]].
 
-        The leaves of ``effects`` are NumPy arrays with the instants on the leading axis. An implementation raises
-        ``PlantError`` before the first step for effects that the simulator does not support.
+        The leaves of ``effects`` are NumPy arrays with the instants on the leading axis. If the
+        simulator does not support an effect, an implementation raises ``PlantError`` before the first step.
         """
 
     def reset(self, x0: State | None) -> Measurement:
-        """Start hovering at ``x0``, or 1 m above the ground if it is None."""
+        """Start hovering at ``x0``, or 1 m above the ground if ``x0`` is None."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
         at_rest = jnp.zeros_like(start.p)
         pose = Pose(*(np.asarray(a, dtype=np.float64) for a in (start.p, start.R, start.v, at_rest)))
@@ -88,7 +89,7 @@ class ExternalPlant(Plant, abc.ABC):
         return Measurement(self._ticks * self.dt, self._x, omega, a, truth=self._x), accepted
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Change the disturbance in flight; new numbers for the same kind do not cause recompilation."""
+        """Change the disturbance in flight; new parameters of the same kind do not cause recompilation."""
         self._disturbance = disturbance
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Packages that only one plant or method needs, which are imported when it is created and never with ``retrim``."""
+"""Import optional packages when the plant or method that needs them is created, never together with ``retrim``."""
 
 import contextlib
 import importlib

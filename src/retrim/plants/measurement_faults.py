@@ -1,7 +1,7 @@
 """Faults of a measurement system: measured states that are wrong, late, repeated or missing.
 
-A fault is a pure function of the last few measurements and the number of the newest one, so that a flight is
-reproducible. Faults are not announced: a measurement's age and validity remain as in the sensor model.
+A fault is a pure function of the last few measurements and the number of the newest one, so a flight is reproducible.
+Faults are not announced: a measurement's age and validity remain as in the sensor model.
 """
 
 import abc
@@ -34,7 +34,7 @@ class AbstractMeasurementFault(eqx.Module):
 
         Args:
             past: Correct measurements, oldest first (leading axis ``memory`` + 1); the last one is due now.
-            tick: Number of the measurement since the start of the flight.
+            tick: Number of the measurement, counted from the start of the flight.
             key: Seed of this measurement; consumed.
         """
 
@@ -50,31 +50,31 @@ class AbstractMeasurementFault(eqx.Module):
 
 
 class VelocitySpikes(AbstractMeasurementFault):
-    """One velocity is periodically wrong, as when a motion-capture system swaps two markers."""
+    """A single velocity is periodically wrong, as happens when a motion-capture system swaps two markers."""
 
     v: Float[Array, "3"]
-    """Error, world [m/s]."""
+    """Error in the world frame [m/s]."""
     every: Int[Array, ""]
     """Period [ticks]."""
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Add the error to the last of every ``every`` velocities."""
+        """Add the error to the last velocity in each period of ``every`` ticks."""
         x = _newest(past)
         return State(x.p, x.R, x.v + jnp.where(_last_of(tick, self.every), self.v, 0.0).astype(x.v.dtype))
 
 
 class SwappedMarkers(AbstractMeasurementFault):
-    """One pose is periodically rotated and shifted, as for a rigid body with confused markers."""
+    """A single pose is periodically rotated and shifted, as happens when a rigid body's markers are confused."""
 
     p: Float[Array, "3"]
-    """Shift, world [m]."""
+    """Shift in the world frame [m]."""
     rotation: Float[Array, "3"]
-    """Rotation vector, body frame [rad]."""
+    """Rotation vector in the body frame [rad]."""
     every: Int[Array, ""]
     """Period [ticks]."""
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Rotate and shift the last of every ``every`` poses."""
+        """Rotate and shift the last pose in each period of ``every`` ticks."""
         x = _newest(past)
         now = _last_of(tick, self.every).astype(x.p.dtype)
         turned = so3.mul(x.R, so3.exp(now * self.rotation.astype(x.p.dtype)))
@@ -110,7 +110,7 @@ class Frozen(AbstractMeasurementFault):
         return self.duration
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Return the state at the tick before the stop, or the newest state outside a stop."""
+        """Return the state at the tick before the current stop, or the newest state if there is no stop."""
         since = tick % self.every
         frozen = (tick >= self.every) & (since < self.duration)
         row = self.duration - jnp.where(frozen, since + 1, 0)
@@ -118,7 +118,7 @@ class Frozen(AbstractMeasurementFault):
 
 
 class Repeated(AbstractMeasurementFault):
-    """A measurement is lost with some probability, and the one before it is reported again."""
+    """Each measurement is lost with a given probability; the previous measurement is then reported again."""
 
     probability: Float[Array, ""]
 
@@ -150,9 +150,9 @@ class Biased(AbstractMeasurementFault):
     """Velocity and attitude have constant errors."""
 
     v: Float[Array, "3"]
-    """World [m/s]."""
+    """Velocity error in the world frame [m/s]."""
     rotation: Float[Array, "3"]
-    """Rotation vector, body frame [rad]."""
+    """Rotation vector in the body frame [rad]."""
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
         """Add the errors."""
@@ -164,7 +164,7 @@ class DriftingPosition(AbstractMeasurementFault):
     """The position drifts back and forth, as a camera-based estimate does; the velocity does not contain the drift."""
 
     amplitude: Float[Array, "3"]
-    """Amplitude, world [m]."""
+    """Amplitude in the world frame [m]."""
     period: Float[Array, ""]
     """Period [ticks]."""
 

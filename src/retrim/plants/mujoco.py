@@ -38,13 +38,14 @@ MODEL = """
   </actuator>
 </mujoco>
 """
-"""MuJoCo model in SI units. Density and viscosity are those of air. The thrust has the motors' time constant."""
+"""MuJoCo model in SI units. Density and viscosity are those of air. The thrust lags with the motors' time constant."""
 
 
 def semi_axes(drag_area: np.ndarray) -> np.ndarray:
-    """Return the semi-axes [m] of the ellipsoid whose silhouette along each axis is ``drag_area`` [m^2].
+    """Return the semi-axes [m] of the ellipsoid whose silhouette along each axis has the area ``drag_area`` [m^2].
 
-    The silhouettes are pi b c, pi a c and pi a b. MuJoCo's drag is density k A v^2; with k = 0.5, A is our c A.
+    The silhouettes have the areas pi b c, pi a c and pi a b. MuJoCo's drag is density k A v^2; with k = 0.5, MuJoCo's A
+    is our c A.
     """
     return math.sqrt(np.prod(drag_area) / math.pi**3) / (drag_area / math.pi)
 

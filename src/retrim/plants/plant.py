@@ -1,4 +1,4 @@
-"""The imperative interface to the world: simulators, other engines and vehicles implement the same three calls."""
+"""The imperative interface to the world; simulators and vehicles implement the same three calls."""
 
 import math
 from types import TracebackType
@@ -18,13 +18,13 @@ class Measurement(NamedTuple):
     """Measurement from a plant at the end of a tick."""
 
     t: float
-    """Time on the plant's clock [s], whose origin is arbitrary."""
+    """Time on the plant's clock, whose origin is arbitrary [s]."""
     x: State
     """Measured position, attitude and velocity."""
     omega: Float[Array, "3"] | None = None
     """Body rates [rad/s], if they are measured."""
     a: Float[Array, "3"] | None = None
-    """Mean acceleration over the tick, world [m/s^2], if it is measured."""
+    """Mean acceleration over the tick in the world frame [m/s^2], if it is measured."""
     motor_speeds: Float[Array, "4"] | None = None
     """Rotor speeds [rad/s], if they are measured."""
     battery: float | None = None
@@ -32,11 +32,11 @@ class Measurement(NamedTuple):
     age: float = 0.0
     """Time since the state was valid [s]."""
     truth: State | None = None
-    """True state, if it is available in addition to the measured one; for scores, never for pilots."""
+    """True state, if it is available in addition to the measured state; used for scores, never by pilots."""
 
     @property
     def p(self) -> Float[Array, "3"]:
-        """Measured position, world [m]."""
+        """Measured position in the world frame [m]."""
         return self.x.p
 
     @property
@@ -46,7 +46,7 @@ class Measurement(NamedTuple):
 
     @property
     def v(self) -> Float[Array, "3"]:
-        """Measured velocity, world [m/s]."""
+        """Measured velocity in the world frame [m/s]."""
         return self.x.v
 
     @property
@@ -75,7 +75,7 @@ class Plant(Protocol):
             The first measurement.
 
         Raises:
-            PlantError: The plant cannot start there.
+            PlantError: The plant cannot start at ``x0``.
         """
         ...
 
@@ -115,11 +115,11 @@ def as_numpy(u: Command) -> np.ndarray:
 
 
 def check_command(u: Command, plant: str) -> np.ndarray:
-    """Refuse a command that is not finite; every plant calls this first.
+    """Raise an error if a command is not finite; every plant calls this function first.
 
     Args:
         u: The command.
-        plant: Name of the plant, for the message.
+        plant: Name of the plant, for the error message.
 
     Returns:
         The command as returned by :func:`as_numpy`.

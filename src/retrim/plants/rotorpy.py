@@ -16,11 +16,11 @@ STEPS = 2  # rotorpy's rate loop runs once per integrator step: at 100 Hz, as in
 
 
 class RotorpyPlant(ExternalPlant):
-    """rotorpy's AscTec Hummingbird (0.5 kg): its rate loop, motors (5 ms), rotor and body drag, and integrator.
+    """rotorpy's AscTec Hummingbird (0.5 kg), with its rate loop, motors (5 ms), rotor drag, body drag and integrator.
 
     Wind and push are constant during a tick. The push is an external acceleration, for which rotorpy does not have an
-    input. It is therefore added to the weight, a force in the world frame that rotorpy uses for no other purpose. The
-    ground is not modelled.
+    input. The push is therefore added to the weight, which is a force in the world frame that rotorpy uses for no other
+    purpose. The ground is not modelled.
     """
 
     def __init__(self, disturbance: Disturbance, *, dt: float = 0.02) -> None:

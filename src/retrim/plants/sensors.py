@@ -1,4 +1,4 @@
-"""Sensor model: state samples at a fixed rate with latency, noise and dropouts, and an inertial unit."""
+"""Sensor model: an inertial unit, and state samples at a fixed rate with latency, noise and dropouts."""
 
 import equinox as eqx
 import jax
@@ -11,14 +11,14 @@ from ..physics.state import State, where
 
 
 class SensorModel(eqx.Module):
-    """A motion-capture system or an estimator, at 100 Hz as in the paper."""
+    """Model of a motion-capture system or a state estimator, by default at 100 Hz as in the paper."""
 
     position: Float[Array, ""]
-    """Standard deviation per axis [m]."""
+    """Standard deviation of the position per axis [m]."""
     velocity: Float[Array, ""]
-    """Standard deviation per axis [m/s]."""
+    """Standard deviation of the velocity per axis [m/s]."""
     attitude: Float[Array, ""]
-    """Standard deviation of a rotation about each body axis [rad]."""
+    """Standard deviation of the attitude about each body axis [rad]."""
     dropout: Float[Array, ""]
     """Probability that a sample is lost; the previous sample is then reused."""
     latency: int = eqx.field(static=True)
@@ -80,7 +80,7 @@ class SensorModel(eqx.Module):
 
     @property
     def held(self) -> int:
-        """Number of samples in the queue: those in transit, and the one that has arrived."""
+        """Number of samples in the queue: the samples in transit, and the sample that has arrived."""
         return -(-self.latency // self.period) + 1
 
     @property
@@ -96,12 +96,12 @@ class SensorModel(eqx.Module):
         return State(x.p + self.position * p, x.R @ so3.exp(self.attitude * r), x.v + self.velocity * v)
 
     def received(self, queue: State, xs: State, key: Key[Array, ""]) -> State:
-        """Sample true states.
+        """Sample true states, and add the samples to the queue.
 
         Args:
             queue: The :attr:`held` samples, oldest first.
             xs: True states, one per period (leading axis).
-            key: Seed of noise and dropouts; consumed.
+            key: Seed of the noise and dropouts; consumed.
 
         Returns:
             The queue after the last sample.

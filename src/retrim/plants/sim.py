@@ -41,15 +41,15 @@ class SimState(eqx.Module):
     queue: CommandQueue
     """Issued commands, including those that have already acted."""
     samples: State
-    """Samples of the state, oldest first: the one that has arrived, and those still delayed by the latency."""
+    """State samples, oldest first: the sample that has arrived, and the samples still in transit."""
     a: Float[Array, "3"]
-    """Mean acceleration over the last tick, world [m/s^2]."""
+    """Mean acceleration over the last tick in the world frame [m/s^2]."""
     reports: Reports | None = None
     """Memory of the measurement fault; None without a fault."""
 
 
 class Simulation(eqx.Module):
-    """The constant part of a simulated plant: a flight is a pure function of it, the initial state and the commands."""
+    """The constant part of a simulated plant; a flight is a pure function of it, the initial state and the commands."""
 
     model: AbstractSubstepDynamics[Any]
     """The vehicle."""
@@ -58,11 +58,11 @@ class Simulation(eqx.Module):
     sensors: SensorModel | None
     """Sensor model; None for exact measurements."""
     key: Key[Array, ""]
-    """Seed of noise and dropouts, which depend only on it and the tick, so that a flight is reproducible."""
+    """Seed of noise and dropouts; they depend only on the seed and the tick, so a flight is reproducible."""
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.02))
     """Transport delay of commands [s]; a change does not cause recompilation."""
     fault: AbstractMeasurementFault | None = None
-    """Fault of the measurements."""
+    """Measurement fault; None for correct measurements."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
     """Longest delay that the command queue can hold [s]."""
 
@@ -98,13 +98,13 @@ class Simulation(eqx.Module):
     def advance(self, s: SimState, u: Command, tick: Int[ArrayLike, ""]) -> SimState:
         """Return the state one control tick later, computed in steps of 1 ms.
 
-        ``u`` acts :attr:`delay` after the start of the tick. In the millisecond in which the acting command changes,
-        the mean of the two commands acts.
+        ``u`` takes effect :attr:`delay` after the start of the tick. In the millisecond in which the acting command
+        changes, the mean of the two commands acts.
 
         Args:
             s: State at the start of the tick.
             u: Command, within the vehicle's limits.
-            tick: Number of the tick since the start of the flight.
+            tick: Number of the tick, counted from the start of the flight.
         """
         per_tick, queue = round(self.model.dt / SUBSTEP), s.queue.push(u)
 
@@ -134,7 +134,7 @@ class Simulation(eqx.Module):
     def time(self, tick: Int[ArrayLike, ""], dtype: Any) -> Float[Array, ""]:
         """Return the time since the start of the flight [s].
 
-        It is not accumulated, since a sum would drift in single precision.
+        The time is not accumulated, since a sum would drift in single precision.
         """
         return jnp.asarray(tick, dtype) * self.model.dt
 
@@ -145,7 +145,7 @@ class Simulation(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
 
     def inertial(self, s: SimState, tick: Int[ArrayLike, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]] | None:
-        """Return the measured body rates [rad/s] and acceleration, world [m/s^2]; None for a model without rates.
+        """Return the measured body rates [rad/s] and world acceleration [m/s^2]; None for a model without body rates.
 
         Args:
             s: State at the end of a tick.
@@ -197,8 +197,8 @@ class SimPlant(Plant):
             disturbance: External effects, as a function of the time since the reset and the state.
             delay_s: Transport delay of commands [s].
             sensors: Sensor model; None for exact measurements.
-            fault: Fault of the measurements; None for correct measurements.
-            seed: Seed of sensor noise and dropouts, which depend only on it and the tick, so that a flight is
+            fault: Measurement fault; None for correct measurements.
+            seed: Seed of sensor noise and dropouts; they depend only on the seed and the tick, so a flight is
                 reproducible.
 
         Raises:
@@ -217,7 +217,7 @@ class SimPlant(Plant):
         self._ticks = 0
 
     def reset(self, x0: State | None) -> Measurement:
-        """Start hovering at ``x0``, or 1 m above the ground if it is None."""
+        """Start hovering at ``x0``, or 1 m above the ground if ``x0`` is None."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
         self._state = _launch(self.simulation.undisturbed(), start)  # one compilation for all disturbances
         self._ticks = 0
@@ -238,7 +238,7 @@ class SimPlant(Plant):
         return self._measurement(), accepted
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Change the disturbance in flight; new numbers for the same kind do not cause recompilation."""
+        """Change the disturbance in flight; new parameters of the same kind do not cause recompilation."""
         self.simulation = dataclasses.replace(self.simulation, disturbance=disturbance)
 
     def _measurement(self) -> Measurement:

@@ -1,4 +1,4 @@
-"""Replay of flight logs: the nominal model's error, its prediction, and the identification of the vehicle."""
+"""Replays flight logs: measures the nominal model's error, predicts this error, and identifies the vehicle."""
 
 from .identification import Identified as Identified
 from .identification import identify as identify

@@ -1,4 +1,4 @@
-"""Re-trains a policy in a model that a log has corrected."""
+"""Re-trains a policy in a model that was corrected with a log."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Linear least squares with delayed and lagged commands, over a grid of delays and lags, block by block."""
+"""Solves linear least squares with delayed and lagged commands, over a grid of delays and lags, block by block."""
 
 from collections.abc import Callable
 from typing import NamedTuple

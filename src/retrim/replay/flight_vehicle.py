@@ -23,7 +23,7 @@ def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
 
     Args:
         log: The flight.
-        setup: Set-up of the policy that flew.
+        setup: Set-up of the policy that flew the vehicle.
         name: Name of the flight, for the comment.
 
     Raises:

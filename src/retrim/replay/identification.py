@@ -22,7 +22,7 @@ from .rows import acting_commands
 
 BLOCK, DRAWS = 2.0, 200  # length of a block [s], and number of bootstrap samples
 INSIDE = (5.0, 95.0)  # percentiles at the ends of an interval
-WARM = 0.3  # [s], at the beginning of a piece of flight; here a lag depends on commands before the piece
+WARM = 0.3  # [s], at the beginning of a piece of flight, where a lag depends on commands before the piece
 SLOW = 0.3  # [m/s], root-mean-square velocity along an axis below which drag is not observable
 
 
@@ -50,7 +50,7 @@ class Identified:
     thrust_offset: Estimate | None
     """Upward acceleration without a command [m/s^2]."""
     full_thrust: Estimate | None
-    """Acceleration at full thrust [m/s^2], if the commanded thrust is a share of it."""
+    """Acceleration at full thrust [m/s^2], if the commanded thrust is a share of full thrust."""
     thrust_lag: Estimate | None
     """Thrust lag [s]."""
     rate_lag: Estimate | None

@@ -16,7 +16,7 @@ BATCH = 5  # ticks between two estimates; each estimate sets the noise level for
 def path_of_log(log: FlightLog) -> PathEstimate:
     """Return the command path estimated from the attitudes and velocities of a log.
 
-    The body rates in a log are not used, because the autopilot's attitude filter has often smoothed them.
+    The measured body rates in a log are not used, because the autopilot's attitude filter has often smoothed them.
 
     Args:
         log: A flight. Without commanded body rates, only the thrust is identified.

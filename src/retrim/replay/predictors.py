@@ -1,4 +1,4 @@
-"""Predictors of the residual acceleration over the next few seconds: baselines, and residual models by name."""
+"""Predicts the residual acceleration over the next few seconds, with baselines and with residual models by name."""
 
 from collections.abc import Callable
 from typing import Any
@@ -104,7 +104,7 @@ def learnt(name: str, preset: Preset, vehicle: Vehicle, seed: int, **adapt: Any)
         **adapt: Values that override those in the preset's ``adapt`` table.
 
     Raises:
-        ConfigError: There is no model of that name, or a value is invalid.
+        ConfigError: There is no model with that name, or a value is invalid.
     """
     model = make_residual(ResidualRequest(changed(preset, adapt={"residual": name, **adapt}), vehicle))
     return lambda: Learnt(model, seed)

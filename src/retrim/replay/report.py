@@ -1,4 +1,4 @@
-"""Builds the report on a log: its tables and a picture."""
+"""Builds the tables and the picture of the report on a log."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -16,7 +16,7 @@ DAMPINGS = (0.1, 10.0)  # limits for a damping ratio in a vehicle file
 
 
 def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
-    """Return a vehicle file with the identified values; all others come from the preset's vehicle.
+    """Return a vehicle file with the identified values; all other values come from the preset's vehicle.
 
     Args:
         found: The identified parameters.

@@ -1,4 +1,4 @@
-"""Parts of every run: training, a flight with its record and scores, result files, provenance, and the compile cache.
+"""Provides the parts of every run: training, flights with scores, result files, provenance and the compile cache.
 
 Lockstep flights, live flights and the evaluation share these parts. This package never prints.
 """

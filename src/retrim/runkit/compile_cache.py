@@ -1,4 +1,4 @@
-"""JAX's persistent cache of compiled programs, in the user's cache folder."""
+"""Manages JAX's persistent cache of compiled programs, in the user's cache folder."""
 
 import gc
 import os
@@ -14,7 +14,7 @@ ENOUGH = 30_000  # Linux allows a process 65,530 memory maps; at the limit the p
 def release_programs(above: int = ENOUGH) -> bool:
     """Release compiled programs if the process has more than ``above`` memory maps; they are reloaded when needed.
 
-    Each program occupies several maps. A long table compiles thousands of programs, one set for each condition.
+    Each program occupies several maps. Making a long table compiles thousands of programs, one set for each condition.
 
     Returns:
         Whether the programs were released.

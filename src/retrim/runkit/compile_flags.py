@@ -1,4 +1,4 @@
-"""Flags for JAX's compiler, chosen by command; they must be set before JAX starts."""
+"""Sets flags for JAX's compiler, chosen by command; they must be set before JAX starts."""
 
 import os
 from importlib.metadata import entry_points, version

@@ -1,4 +1,4 @@
-"""One renderer for all tables: sections of text cells, written as Markdown and JSON whenever a section is added."""
+"""Renders all tables as sections of text cells, and writes Markdown and JSON whenever a section is added."""
 
 import re
 from collections.abc import Sequence

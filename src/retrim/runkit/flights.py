@@ -1,4 +1,4 @@
-"""One flight of a fleet: its specification and its results."""
+"""Defines the specification and the results of one flight of a fleet."""
 
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ..runtime.events import Event
 from ..runtime.flight import Log
 
 SETTLED = 0.05  # [m]
-LONGEST_SHIFT = 3.0  # [s], half of the longest lap of the paper
+LONGEST_SHIFT = 3.0  # [s], half of the paper's longest lap
 AS_GOOD, AS_GOOD_M = 0.02, 1e-3  # as a share, and [m]: shifts whose errors differ by less count as equally good
 LEARNER_TAG = 2**30 + 2  # folded into a seed, so that learners do not share keys with training, starts or disturbances
 
@@ -63,7 +63,7 @@ class Flight:
     learnt: LearnerState | None = None
     """Learner state at the end of an adapting flight."""
     target: np.ndarray | None = None
-    """The vehicle's target position in each row, world [m]."""
+    """The vehicle's target position in each row, in the world frame [m]."""
 
     @property
     def steady(self) -> float:
@@ -90,7 +90,7 @@ class Flight:
 
     @property
     def behind(self) -> tuple[float, float] | None:
-        """Lag of the flight behind its reference [s], and its mean error without this lag [m].
+        """Lag of the flight behind its reference [s], and the flight's mean error without this lag [m].
 
         The lag is the constant time shift, of at most 3 s, with the smallest mean error over the last few seconds. If
         several shifts are equally good, for example on a lap, the lag is the smallest of them. The result is None for a
@@ -111,7 +111,7 @@ class Flight:
     def effort(self) -> tuple[float, float]:
         """Root mean squares of the commanded body rates and of their change per tick [rad/s].
 
-        They cover the time after the first 5 s, and are NaN for a flight that was terminated.
+        Both cover the time after the first 5 s, and are NaN for a flight that was terminated.
         """
         if self.log.terminated:
             return float("nan"), float("nan")
@@ -126,7 +126,7 @@ class Flight:
 
     @property
     def swaps(self) -> tuple[float, ...]:
-        """Times at which a new policy took over [s]; those after the log, when a live flight lands, are left out."""
+        """Times at which a new policy took over [s], except those after the log ends, when a live flight lands."""
         return tuple(e.t for e in self.log.events if e.kind == "policy" and e.t <= self.log.t[-1])
 
     @property

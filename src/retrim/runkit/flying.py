@@ -1,4 +1,4 @@
-"""Flies the flights of a fleet, one by one, or in batches that run as one program each."""
+"""Flies the flights of a fleet, one by one, or in batches that each run as one program."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -88,7 +88,7 @@ def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashab
         The key; None if the flights cannot run as one program.
 
     Raises:
-        PlantError: The package of the plant is not installed.
+        PlantError: The plant's package is not installed.
     """
     if len(specs) < 2:
         return None

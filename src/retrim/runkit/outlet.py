@@ -1,4 +1,4 @@
-"""Output of a run, with temporary folders in case its own folder cannot be written."""
+"""Writes the output of a run, to a temporary folder if the run's own folder cannot be written."""
 
 import contextlib
 import copy
@@ -22,7 +22,7 @@ def spare_folders(folder: Path) -> tuple[Path, ...]:
     """Return temporary substitutes for a folder, in order of preference; they are not created yet.
 
     Args:
-        folder: The folder; its name is part of theirs.
+        folder: The folder; its name becomes part of the substitutes' names.
     """
     bases = dict.fromkeys((Path(tempfile.gettempdir()), *([SHARED_MEMORY] if SHARED_MEMORY.is_dir() else [])))
     name = f"kept-{folder.resolve().name[:80]}-{secrets.token_hex(4)}"
@@ -36,7 +36,7 @@ class Outlet:
         """Create the outlet for a run's folder."""
         self.folder, self.spare = folder, spare_folders(folder)
         self.faults: list[str] = []
-        """One line for each file that is in a different folder or could not be written."""
+        """One line for each file that was written to a different folder or could not be written."""
 
     def write(self, name: str, put: Callable[[Path], T]) -> T | None:
         """Write one output.
@@ -66,7 +66,7 @@ class Outlet:
         return None
 
     def write_results(self, run: Run, rows: Sequence[dict[str, Any]], **more: Any) -> Path | None:
-        """Write a run's results like :meth:`Run.write_results`, with all faults so far; return their path."""
+        """Write a run's results like :meth:`Run.write_results`, with all faults so far; return the file's path."""
 
         def put(folder: Path) -> Path:
             elsewhere = copy.copy(run)

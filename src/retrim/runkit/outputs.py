@@ -1,4 +1,4 @@
-"""Output files of a run: a trained policy, and the flights' events, logs and learned parameters."""
+"""Writes the output files of a run: a trained policy, and the flights' events, logs and learned parameters."""
 
 import json
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from .run import Run
 def write_trained(
     run: Run, setup: Setup, policy: AbstractPolicy, losses: Sequence[float], *, seed: int, error_m: float | None = None
 ) -> Path:
-    """Write ``policy.safetensors`` and its ``results.json``; Ctrl-C takes effect after both.
+    """Write ``policy.safetensors`` and its ``results.json``; Ctrl-C takes effect after both are written.
 
     Args:
         run: Run whose folder receives the files.

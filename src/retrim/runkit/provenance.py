@@ -1,4 +1,4 @@
-"""Provenance of results: the commit, versions, hardware and command line."""
+"""Determines the provenance of results: the commit, versions, hardware and command line."""
 
 import contextlib
 import functools
@@ -49,7 +49,7 @@ def commit() -> str:
 
 @functools.cache
 def code() -> str:
-    """Return a digest of this distribution's files; it does not depend on commits or the installation."""
+    """Return a digest of this distribution's files; the digest does not depend on commits or the installation."""
     here, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
     for path in sorted(path for folder in FOLDERS for path in (here / folder).rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:

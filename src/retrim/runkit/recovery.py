@@ -1,4 +1,4 @@
-"""Times at which a disturbance changes, and a flight's recovery times."""
+"""Determines the times at which a disturbance changes, and a flight's recovery times."""
 
 from collections.abc import Sequence
 
@@ -49,7 +49,7 @@ def change_times(name: str, home: Array, seconds: float) -> list[float]:
 def recoveries(
     t: np.ndarray, error: np.ndarray, changes: Sequence[float], limit: float, *, terminated: bool = False
 ) -> list[float]:
-    """Return the recovery time after each change [s]; then the error stays below ``limit`` until the next change.
+    """Return the time after each change [s] from which the error stays below ``limit`` until the next change.
 
     Args:
         t: Times in a flight [s].

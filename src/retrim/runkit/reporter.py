@@ -1,4 +1,4 @@
-"""Interface for progress reports on long tasks; the library itself never prints."""
+"""Defines the interface for progress reports on long tasks; the library itself never prints."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext

@@ -1,4 +1,4 @@
-"""The folder of a run: it is created once, files are written atomically, and an interruption is recorded."""
+"""Manages a run's folder: creates it once, writes files atomically, and records an interruption."""
 
 import contextlib
 import json
@@ -39,7 +39,7 @@ class Run:
         """Choose the folder and check that it can be written.
 
         Args:
-            command: Name of the command; if ``out`` is None, a new folder under ``runs/`` has this name and the time.
+            command: Name of the command; if ``out`` is None, it and the time name a new folder under ``runs/``.
             out: The folder.
             stop: Set when the run should end early.
             remark: Remark in the documents on how they were made.

@@ -1,4 +1,4 @@
-"""Pretraining with progress reports, and a policy's error in its own model."""
+"""Pretrains policies with progress reports, and measures a policy's error in its own model."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from .reporter import Reporter, Silent
 
 
 class Trained(NamedTuple):
-    """Result of pretraining; after an interruption, its last state."""
+    """Result of pretraining; after an interruption, the last state of training."""
 
     policy: AbstractPolicy
     losses: list[float]

@@ -1,4 +1,4 @@
-"""A flight of a simulated plant as one program. The code handles one vehicle; use ``jax.vmap`` for many."""
+"""Fly a simulated plant as one program. The code handles one vehicle; use ``jax.vmap`` for many."""
 
 from typing import Any
 

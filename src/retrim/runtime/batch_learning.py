@@ -1,7 +1,7 @@
-"""Learning for a batch of flights, on the virtual clock.
+"""Learn for a batch of flights on the virtual clock.
 
 Only periods and latencies determine when learners are offered windows and when their updates become visible. Between
-two such instants, all flights therefore run as one program. So do the fits and the updates of all flights.
+two such instants, all flights therefore run as one program. The same holds for the fits and the updates of all flights.
 """
 
 from collections.abc import Callable, Sequence
@@ -76,7 +76,7 @@ class Plan:
 
     @classmethod
     def of(cls, pilot: AdaptivePilot) -> "Plan | None":
-        """Return a pilot's plan; None if the pilot has different learners, or if its latencies are measured."""
+        """Return a pilot's plan; return None if the pilot has different learners, or if its latencies are measured."""
         learners = [each.learner for each in pilot.learners]
         if [type(getattr(each, "worker", None)) for each in learners] != [ResidualWorker, PolicyWorker]:
             return None  # a worker of a different class may compute something else

@@ -1,4 +1,4 @@
-"""Flights that advance in step, as arrays with a leading axis of flights, and their record."""
+"""Advance flights in step, as arrays with a leading axis of flights, and record them."""
 
 import threading
 from collections.abc import Callable, Sequence

@@ -64,10 +64,10 @@ def vehicle_events(vehicles: VehicleReport | None, t: Float[np.ndarray, " n"]) -
 
 @runtime_checkable
 class Observer(Protocol):
-    """Follows a flight. It must not block."""
+    """Follows a flight; its methods must not block."""
 
     def measurement(self, measurement: Measurement, u: Command) -> None:
-        """Receive each measurement and the command accepted for the tick that it ends (hover for the first one)."""
+        """Receive each measurement and the command accepted for the tick that ends with it (hover for the first)."""
         ...
 
     def event(self, event: Event) -> None:

@@ -1,4 +1,4 @@
-"""Learning for many vehicles at once: one program for all updates that are due, and a base that all vehicles share."""
+"""Learn for many vehicles at once, with one program for all due updates and a base that all vehicles share."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def learn_together(
     Args:
         workers: One worker for each vehicle. All have the same layer and learner, and states of the same structure.
         windows: The window of each worker.
-        base: The base to which low-rank policies add their deltas from now on; by default each keeps its own. The gate
+        base: The base to which low-rank policies add their deltas from now on; by default, each keeps its own. The gate
             compares the result with the policy in flight.
 
     Returns:

@@ -24,11 +24,11 @@ class States(NamedTuple):
     """States of a flight as NumPy arrays with a leading time axis."""
 
     p: np.ndarray
-    """Positions, world [m]."""
+    """Positions in the world frame [m]."""
     R: np.ndarray
     """Attitudes, body to world."""
     v: np.ndarray
-    """Velocities, world [m/s]."""
+    """Velocities in the world frame [m/s]."""
 
     def as_state(self) -> State:
         """Return the same states as a :class:`State` of JAX arrays."""
@@ -57,7 +57,7 @@ class Log(NamedTuple):
 
     @property
     def p(self) -> np.ndarray:
-        """True positions, world [m]."""
+        """True positions in the world frame [m]."""
         return self.true.p
 
     @property
@@ -67,12 +67,12 @@ class Log(NamedTuple):
 
     @property
     def v(self) -> np.ndarray:
-        """True velocities, world [m/s]."""
+        """True velocities in the world frame [m/s]."""
         return self.true.v
 
     @property
     def missed_ticks(self) -> int:
-        """Number of ticks without a measurement, by the plant's clock."""
+        """Number of ticks without a measurement, on the plant's clock."""
         return int(np.sum(np.maximum(np.round(np.diff(self.t) / self.dt).astype(int) - 1, 0)))
 
     def window(self, ticks: int, *, end: int | None = None) -> Window:
@@ -96,7 +96,7 @@ class Log(NamedTuple):
 
 
 class Recorder:
-    """An observer that keeps the whole flight."""
+    """An observer that records the whole flight."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, State, State, Command, float]] = []

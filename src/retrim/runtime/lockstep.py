@@ -1,4 +1,4 @@
-"""Learning on a virtual clock, which is equivalent to a live run but repeatable bit for bit.
+"""Learn on a virtual clock; the result is equivalent to a live run but repeatable bit for bit.
 
 Compute time is charged to flight time. The learner processes a window at the tick of its submission; the result becomes
 visible only after the latency of the computation, as if the learner had run in parallel with the flight.

@@ -27,7 +27,7 @@ class Pilot(abc.ABC):
         """Start a flight. Keep learned parameters, and drop the memory of earlier flights.
 
         Args:
-            measurement: First measurement of the flight. Its time, by the plant's clock, is time zero of the flight.
+            measurement: First measurement of the flight. Its time, on the plant's clock, is time zero of the flight.
         """
 
     @abc.abstractmethod
@@ -44,7 +44,7 @@ class Pilot(abc.ABC):
         self.act(measurement)
 
     def accepted(self, u: Command) -> None:
-        """Receive the command ``u`` that the plant accepted instead of the last issued one."""
+        """Receive the command ``u`` that the plant accepted instead of the command issued last."""
         del u
 
     def take_events(self) -> list[Event]:
@@ -69,7 +69,7 @@ class FunctionPilot(Pilot):
 class ControllerPilot(Pilot):
     """Pilot that calls a controller. ``controller`` may be replaced in flight; the new one takes over the memory.
 
-    It issues an event for each change of the controller's stage and for the vehicle that the controller has identified.
+    The pilot issues an event for each change of the controller's stage and for the identified vehicle.
     """
 
     def __init__(self, controller: AbstractController[Any]) -> None:

@@ -1,4 +1,4 @@
-"""Many flights at once, as a batch in step. Each flight equals that of its pilot alone."""
+"""Fly many flights in step, as one batch. Each flight equals the flight of its pilot alone."""
 
 import threading
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Tasks: starts, rewards, observations, termination and errors."""
+"""Tasks, which define starts, rewards, observations, termination and errors."""
 
 from .abstract_reference import AbstractReference as AbstractReference
 from .abstract_reference import TurnedReference as TurnedReference

@@ -17,17 +17,17 @@ class Point(NamedTuple):
     """A reference at one instant."""
 
     p: Float[Array, "3"]
-    """Position, world [m]."""
+    """Position in the world frame [m]."""
     v: Float[Array, "3"]
-    """Velocity, world [m/s]."""
+    """Velocity in the world frame [m/s]."""
     u: Float[Array, "4"]
     """Command that a point mass needs (differential flatness): c [m/s^2] and body rates [rad/s]; hover at a jump."""
     heading: Float[Array, ""]
     """Heading [rad]."""
     a: Float[Array, "3"]
-    """Acceleration, world [m/s^2]; this and the following fields are zero where ``u`` is hover."""
+    """Acceleration in the world frame [m/s^2]; this and the following fields are zero where ``u`` is hover."""
     jerk: Float[Array, "3"]
-    """Jerk, world [m/s^3]."""
+    """Jerk in the world frame [m/s^3]."""
     heading_rate: Float[Array, ""]
     """Heading rate [rad/s]."""
 
@@ -89,7 +89,7 @@ class TurnedReference(AbstractReference):
         return Point(vector(here.p), vector(here.v), u, here.heading, a, jerk, here.heading_rate)
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the cross-track error in metres of the frame."""
+        """Return the cross-track error, measured in the frame [m]."""
         return self.frame.scale * self.reference.distance(so3.act(self.frame.Q.T, p) / self.frame.scale)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "TurnedReference":

@@ -16,7 +16,7 @@ JUMP = 30.0  # [m/s^2]; a larger acceleration is treated as a velocity jump, whi
 STEP = 1e-3  # [s], step of the finite differences for velocity and acceleration
 NO_THRUST = 1e-3  # [m/s^2]; for a smaller thrust the attitude is undefined
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
-FULL_TURN = 2.0 * math.pi  # [rad]; headings that differ by it are the same
+FULL_TURN = 2.0 * math.pi  # [rad]; headings that differ by this angle are the same
 
 
 def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
@@ -106,7 +106,7 @@ def _points(path: Path3, times: np.ndarray) -> np.ndarray:
 def _attitudes(a: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the body axes for each acceleration as columns: z along the thrust, x towards the heading.
 
-    The second array is true where they are defined.
+    The second array is true where the axes are defined.
     """
     thrust = np.linalg.norm(a + UP, axis=1)
     z = (a + UP) / np.maximum(thrust, NO_THRUST)[:, None]

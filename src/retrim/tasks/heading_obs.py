@@ -1,4 +1,4 @@
-"""Observation in axes that turn with the heading, so that it is the same for every heading."""
+"""Observation in axes that turn with the heading, so the observation is the same for every heading."""
 
 import dataclasses
 from typing import Any, TypeVar
@@ -19,14 +19,14 @@ class HeadingObs(AbstractObservation[M]):
     """Observation of the state turned about the vertical through ``origin``, so that the heading is zero.
 
     Hover is the same for every heading: thrust and body rates are commands in body axes, and the reward does not depend
-    on the heading. A policy that observes the heading must learn every heading, and it oscillates at some headings and
-    rests at others. The heading is the twist of the attitude about the vertical, which is smooth up to a tilt of 180
-    degrees.
+    on the heading. A policy that observes the heading must learn every heading, and then oscillates at some headings
+    and rests at others. The heading is the twist of the attitude about the vertical, which is smooth up to a tilt of
+    180 degrees.
     """
 
     inner: AbstractObservation[M]
     origin: Float[Array, "3"]
-    """Point on the vertical, world [m]."""
+    """Point on the vertical in the world frame [m]."""
 
     @property
     def size(self) -> int:

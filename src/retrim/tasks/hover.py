@@ -21,14 +21,14 @@ RewardRule = Callable[[Float[Array, "3"], State, Command], Float[Array, ""]]
 
 
 class AbstractHover(AbstractTask):
-    """Fly to ``goal`` and stay there; subclasses differ in their reward.
+    """Fly to ``goal`` and stay there; subclasses differ in their rewards.
 
     The task terminates when the vehicle is farther than ``box`` [m] from the goal along any axis. The box is wide,
-    since in a narrow one a strong disturbance would end every flight before the learner has data.
+    since in a narrow box a strong disturbance would end every flight before the learner has data.
     """
 
     goal: Float[Array, "3"]
-    """Hover position, world [m]."""
+    """Hover position in the world frame [m]."""
     observation: AbstractObservation[Any]
     box: Float[Array, ""]
     """Half the side of the box [m]."""
@@ -50,11 +50,11 @@ class AbstractHover(AbstractTask):
         return type(self).target is AbstractHover.target
 
     def home(self) -> Float[Array, "3"]:
-        """Return the goal, world [m]."""
+        """Return the goal in the world frame [m]."""
         return self.goal
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the goal, world [m].
+        """Return the goal in the world frame [m].
 
         A subclass may move the goal; reward, bounds and error then use the moved goal.
         """
@@ -63,8 +63,8 @@ class AbstractHover(AbstractTask):
     def reset(self, key: Key[Array, ""]) -> Start:
         """Draw a start near the goal.
 
-        Each coordinate is within 1 m of the goal, the yaw within ``heading``, and pitch and roll within 18 degrees. The
-        standard deviation of the velocity is 0.1 m/s per axis.
+        Each coordinate is within ±1 m of the goal, the yaw within ±``heading``, and the pitch and roll within
+        ±18 degrees. The standard deviation of the velocity is 0.1 m/s per axis.
         """
         kp, ka, kv = random.split(key, 3)
         p = self.goal + random.uniform(kp, (3,), minval=-1.0, maxval=1.0)
@@ -100,7 +100,7 @@ class Hover(AbstractHover):
     """Hover with the paper's reward."""
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
-        """Return r_pos + r_vel + r_act of the paper; the rate term acts on the commanded body rates."""
+        """Return r_pos + r_vel + r_act of the paper; the rate term penalises the commanded body rates."""
         return _printed(self.target(t), x, u)
 
 
@@ -127,7 +127,7 @@ class L2Hover(AbstractHover):
 class StiffHover(AbstractHover):
     """Hover with a reward for stiffness: the command cost is a tenth of the paper's, and the velocity cost a fifth.
 
-    A stiff policy moves less when pushed. It needs a model with the vehicle's delay and lag.
+    A stiff policy moves less when pushed. Such a policy needs a model with the vehicle's delay and lag.
     """
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""Observation from a camera: pixels of seven keypoints on the ground in five frames, and the last commands."""
+"""Observation from a camera: pixels of seven keypoints on the ground in five frames, and the last three commands."""
 
 import dataclasses
 import functools
@@ -44,7 +44,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
     the points that a camera can see.
 
     ``noise`` is the standard deviation of a pixel coordinate [px]. It is drawn from a key that depends on the start, so
-    that roll-outs are repeatable.
+    roll-outs are repeatable.
     """
 
     camera: Camera
@@ -80,7 +80,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         whitened: bool = True,
         dt: float = 0.02,
     ) -> "Keypoints":
-        """Return the observation; by default, pixels are whitened over a fixed set of random short motions."""
+        """Return the observation; by default, pixels are whitened with statistics of fixed random short motions."""
         plain = cls(Camera.published(), goal, omega_max, jnp.array(noise), jnp.zeros(70), jnp.eye(70), dt)
         if not whitened:
             return plain
@@ -97,7 +97,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
     def init(self, x: State) -> KeypointMemory:
         """Return the memory of a vehicle that has moved in a straight line, without turning, under hover commands.
 
-        It is the memory of one tick ago, since the first call adds the frame of ``x``.
+        The memory is that of one tick ago, since the first call adds the frame for ``x``.
         """
         commands = jnp.zeros((COMMANDS, 4), dtype=x.p.dtype)
         before = State(x.p - self.dt * x.v, x.R, x.v)
@@ -134,7 +134,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return jnp.clip(seen.pixel, -FAR, FAR), seen.visible
 
     def ground(self) -> Float[Array, "7 3"]:
-        """Return the keypoints on the ground, world [m]."""
+        """Return the keypoints on the ground in the world frame [m]."""
         flat = jnp.array(PATTERN, dtype=self.goal.dtype)
         return self.goal[None] + jnp.concatenate([flat, jnp.full((7, 1), -BELOW, dtype=flat.dtype)], axis=1)
 
@@ -155,7 +155,7 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         return (2.0 * self.noise / self.camera.size)[None] * random.normal(key, (7, 2), dtype)
 
     def command(self, scaled: Float[Array, "4"]) -> Command:
-        """Return the command for numbers as returned by :meth:`scaled`."""
+        """Return the command from its scaled numbers; the inverse of :meth:`scaled`."""
         return Command((scaled[0] + 1.0) * STANDARD_GRAVITY, scaled[1:] * self.omega_max)
 
     def scaled(self, u: Command) -> Float[Array, "4"]:
@@ -183,7 +183,7 @@ def _whitening(plain: Keypoints) -> Statistics:
     frames = jax.vmap(lambda k: plain.stacked(plain.history(*NEAR.draw(k, plain.goal))))(keys)
     mean = jnp.mean(frames, axis=0)
     centred = frames - mean[None]
-    # The symmetric matrix is unique, so that a policy is the same on every machine; the floor is one pixel's variance.
+    # The symmetric matrix is unique, so a policy is the same on every machine; the floor is one pixel's variance.
     lam, V = jnp.linalg.eigh(centred.T @ centred / frames.shape[0])
     scale = (jnp.maximum(lam, 0.0) + 1e-5) ** -0.5
     return mean, (V * scale[None]) @ V.T

@@ -1,4 +1,4 @@
-"""Random motions near a goal, drawn without a roll-out: possible camera views before a policy's first flight."""
+"""Random motions near a goal, drawn without a roll-out; they give camera views before a policy's first flight."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ class Motions(NamedTuple):
     """A distribution of states and body rates."""
 
     box: float
-    """Largest distance of positions from the goal, per axis [m]."""
+    """Largest distance between a position and the goal, per axis [m]."""
     tilt: float
     """Standard deviation of the attitude about each axis [rad]."""
     turn: float
@@ -36,6 +36,6 @@ class Motions(NamedTuple):
 NEAR = Motions(box=1.2, tilt=0.2, turn=0.4, speed=0.7, rates=1.0)
 """Motions of a hovering policy."""
 WILD = Motions(box=1.5, tilt=0.5, turn=0.4, speed=2.0, rates=2.0)
-"""Motions about as wide as those of the authors' random policy, on whose flights they pretrain."""
+"""Motions about as wide as those of the authors' random policy, on whose flights the authors pretrain."""
 MOTIONS = {"near": NEAR, "wild": WILD}
 """Motions, by their names in presets."""

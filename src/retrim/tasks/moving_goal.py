@@ -33,7 +33,7 @@ class GoalObs(AbstractObservation[M]):
     """Observation of a hover task at the origin."""
     path: GoalPath = eqx.field(static=True)
     frame: EffectiveGravityFrame | None = None
-    """Frame of the states; None for the world."""
+    """Frame of the states; None for the world frame."""
 
     @property
     def size(self) -> int:
@@ -72,7 +72,7 @@ class MovingGoal(AbstractTask):
     """Hover task whose goal is the origin."""
     path: GoalPath = eqx.field(static=True)
     frame: EffectiveGravityFrame | None = None
-    """Frame of the states; None for the world."""
+    """Frame of the states; None for the world frame."""
 
     @property
     def dt(self) -> float:
@@ -104,7 +104,7 @@ class MovingGoal(AbstractTask):
         return p if self.frame is None else self.frame.vector(p)
 
     def setpoint(self, t: Float[Array, ""]) -> Point:
-        """Return the goal's position, derivatives and command at time ``t`` [s]; its heading is zero."""
+        """Return the goal's position, derivatives and command at time ``t`` [s]; the heading is zero."""
         one = jnp.ones_like(t)
 
         def velocity(t: Float[Array, ""]) -> Float[Array, "3"]:

@@ -20,7 +20,7 @@ VELOCITY_SCALE = 5.0  # [m/s], the same
 
 
 class AbstractObservation(eqx.Module, Generic[M]):
-    """Observation h(x) with a memory between ticks (``M``, of fixed shape)."""
+    """Observation h(x) with a memory of type ``M`` between ticks; the memory has a fixed shape."""
 
     @property
     @abc.abstractmethod
@@ -46,12 +46,12 @@ class AbstractObservation(eqx.Module, Generic[M]):
         """
 
     def at_rest(self, x: State) -> Float[Array, " o"]:
-        """Return the observation of a vehicle at rest in ``x``; noisy observations override it to omit the noise."""
+        """Return the observation of a vehicle at rest in ``x``; noisy observations override this to omit the noise."""
         o, _ = self(self.init(x), jnp.zeros_like(x.p[0]), x, Command.hover(x.p.dtype))
         return o
 
     def with_belief(self, belief: PathBelief) -> "AbstractObservation[M]":
-        """Return the same observation with a belief about the vehicle; by default the belief is not observed.
+        """Return the same observation with a belief about the vehicle; by default, the belief is not observed.
 
         Args:
             belief: Belief about the command path.
@@ -60,7 +60,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
         return self
 
     def with_actuators(self, actuators: ActuatorState) -> "AbstractObservation[M]":
-        """Return the same observation with the current thrust and rates; by default they are not observed.
+        """Return the same observation with the current thrust and rates; by default, they are not observed.
 
         Args:
             actuators: Current thrust and body rates.
@@ -80,8 +80,8 @@ class AbstractObservation(eqx.Module, Generic[M]):
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p, R, v] and the last ``history`` commands, oldest first: 15 + 4 ``history`` numbers.
 
-    The paper has ``history=0`` (15 numbers). The authors' code has ``history=3`` (27 numbers), which restores the
-    Markov property under a command delay of up to three ticks. The position is relative to ``origin``, and every entry
+    The paper uses ``history=0`` (15 numbers). The authors' code uses ``history=3`` (27 numbers), which restores the
+    Markov property for a command delay of up to three ticks. The position is relative to ``origin``, and every entry
     is scaled to order one.
     """
 

@@ -1,4 +1,4 @@
-"""In-flight observation of keypoints in a camera image, some of which are outside the image, noisy or missed."""
+"""In-flight observation of keypoints in a camera image; some points are outside the image, noisy or missed."""
 
 import dataclasses
 from typing import NamedTuple
@@ -34,9 +34,9 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
 
     A point outside the image is not observed, and a point inside it is missed with probability ``dropout``. A filter
     estimates the pose from the other points and the commands. The policy receives the image that corresponds to the
-    estimated pose. Each correction also changes the past images, so that it does not look like motion.
+    estimated pose. Each correction also changes the past images, so the correction does not look like motion.
 
-    Use it in flight only, since gradients do not pass through the filter.
+    Use this observation only in flight, since gradients do not pass through the filter.
     """
 
     full: Keypoints
@@ -67,7 +67,7 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
     def init(self, x: State) -> OccludedMemory:
         """Return the memory of a vehicle that has moved in a straight line, without turning, under hover commands.
 
-        It is the memory of one tick ago, since the first call adds the frame of ``x``.
+        The memory is that of one tick ago, since the first call adds the frame for ``x``.
         """
         key, k_pose = random.split(key_of(x))
         pose = PoseFilter.near(State(x.p - self.full.dt * x.v, x.R, x.v), k_pose)

@@ -19,7 +19,7 @@ JERK_SCALE = 20.0  # [m/s^3]
 class Preview(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p_ref(t + 0 ... 0.4 s) - p, v_ref(t, t + 0.2 s) - v, R, v, heading, last commands].
 
-    The observation does not contain the absolute position, so that one policy can fly the same shape anywhere. Every
+    The observation does not contain the absolute position, so one policy can fly the same shape anywhere. Every
     entry is scaled to order one.
     """
 

@@ -1,7 +1,7 @@
 """Trajectories to track: position, velocity, heading and the required command, as functions of time.
 
 Every reference is a table of the same type, which a policy takes as data. A new trajectory therefore does not need a
-new compilation, and a policy trained on a family can fly a member that it was not trained on.
+new compilation, and a policy trained on a family can fly a member on which it was not trained.
 """
 
 import math
@@ -43,9 +43,9 @@ class Reference(AbstractReference):
         """Sample a path.
 
         Args:
-            path: Function of the time since take-off [s]. It returns the world coordinates x, y, z [m] and, if it is
-                not 0, the heading [rad], which may jump by whole turns. The function is evaluated in [0, ``seconds``],
-                and a few milliseconds beyond if there is a lap.
+            path: Function of the time since take-off [s]. The function returns the world coordinates x, y, z [m] and,
+                optionally, the heading [rad] (default 0), which may jump by whole turns. The function is evaluated in
+                [0, ``seconds``], and a few milliseconds beyond if there is a lap.
             seconds: End of the table [s].
             lap: Start of the repeating lap, which extends to the end [s]; None if the end is held.
             points: Number of rows. References with the same number of rows share one compiled program.
@@ -67,7 +67,7 @@ class Reference(AbstractReference):
         return cls(jnp.asarray(rows), jnp.array(times[1]), jnp.array(ends), jnp.array(joins))
 
     def __call__(self, t: Float[Array, ""]) -> Point:
-        """Return the reference at time ``t`` [s], linearly interpolated between rows; hover once the end is held."""
+        """Return the reference at time ``t`` [s], linearly interpolated between rows, or hover once the end is held."""
         start, end = self.lap[0], self.lap[1]
         length = end - start
         folded = start + (t - start) % jnp.where(length > 0, length, 1.0)
@@ -105,7 +105,7 @@ class Reference(AbstractReference):
         return TurnedReference(self, frame)
 
     def infeasibility(self, vehicle: Vehicle) -> str | None:
-        """Return the reasons why the vehicle cannot fly the reference, in words; None if it can fly all of it.
+        """Return the reasons why the vehicle cannot fly the reference, in words; None if the vehicle can fly all of it.
 
         Possible reasons are a start or end at speed, velocity jumps, a lap that does not close, excessive thrust, a
         descent faster than free fall, excessive body rates, and positions below the ground.
@@ -122,11 +122,11 @@ def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, ev
 
     Args:
         references: The members.
-        seconds: Duration of each member [s]; roll-outs of up to 4 s stay within it.
+        seconds: Duration of each member [s]; roll-outs of up to 4 s stay within a member.
         every: Time between rows [s].
 
     Returns:
-        A reference without a lap. A roll-out may start in any member, but not within 5 s of its end.
+        A reference without a lap. A roll-out may start in any member, but not within 5 s of that member's end.
 
     Raises:
         ValueError: The family is empty, or the duration is too short.

@@ -1,4 +1,4 @@
-"""Built-in trajectories: the circle, figure-8 and star of the paper, each with a smooth start from rest."""
+"""Built-in trajectories: the paper's circle, figure-8 and star, each with a smooth start from rest."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,7 @@ def smooth_start(t: float, ramp: float = RAMP) -> float:
         ramp: Time until the full speed is reached [s].
 
     Returns:
-        Time along the lap [s]; from ``ramp`` on it is ``t - ramp / 2``.
+        Time along the lap [s]; from ``ramp`` onwards, it is ``t - ramp / 2``.
     """
     x = min(t / ramp, 1.0)
     return ramp * (7.0 * x**5 - 14.0 * x**6 + 10.0 * x**7 - 2.5 * x**8) + max(t - ramp, 0.0)
@@ -77,7 +77,7 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Refere
 
 
 def lissajous(period: float = 5.5, ramp: float = RAMP) -> Reference:
-    """Return a horizontal 2 m x 1 m figure-8 from (0, 0, 1), the size in RAPTOR's flights (5.5 s, 10 s).
+    """Return a horizontal 2 m x 1 m figure-8 from (0, 0, 1), the size used in RAPTOR's flights (5.5 s, 10 s).
 
     Args:
         period: Duration of a lap [s].
@@ -87,13 +87,13 @@ def lissajous(period: float = 5.5, ramp: float = RAMP) -> Reference:
 
 
 def circle_at(speed: float) -> Reference:
-    """Return the circle at ``speed`` [m/s]; its radius grows to limit the vehicle's acceleration."""
+    """Return a circle at ``speed`` [m/s]; the radius grows to limit the vehicle's acceleration."""
     radius = max(1.0, speed**2 / SIDEWAYS)
     return circle(radius, 2.0 * math.pi * radius / speed, ramp=max(RAMP, speed))
 
 
 def figure8_at(speed: float, length: float = 3.0, width: float = 1.0) -> Reference:
-    """Return a figure-8 with a given top speed; its size grows to limit the vehicle's acceleration.
+    """Return a figure-8 with a given top speed; the size grows to limit the vehicle's acceleration.
 
     Args:
         speed: Top speed [m/s].
@@ -109,12 +109,12 @@ def figure8_at(speed: float, length: float = 3.0, width: float = 1.0) -> Referen
 
 
 def lissajous_at(speed: float) -> Reference:
-    """Return :func:`lissajous` with a top speed of ``speed`` [m/s]; its size grows as in :func:`figure8_at`."""
+    """Return :func:`lissajous` with a top speed of ``speed`` [m/s]; the size grows as in :func:`figure8_at`."""
     return figure8_at(speed, 2.0, 1.0)
 
 
 def star_at(speed: float) -> Reference:
-    """Return the star with a radius of 1 m at a constant ``speed`` [m/s], including the corners."""
+    """Return the star with a radius of 1 m at a constant ``speed`` [m/s], even at the corners."""
     edge = 2.0 * math.sin(math.radians(72.0))
     return star(1.0, 5.0 * edge / speed)
 

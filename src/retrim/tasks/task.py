@@ -35,7 +35,7 @@ SPEED = 0.1  # [m/s]: standard deviation of a start's velocity, relative to the 
 
 
 class AbstractTask(eqx.Module):
-    """Base class of tasks, each for one vehicle.
+    """Base class of tasks for one vehicle.
 
     Times are in seconds since the start; positions are in world coordinates [m].
 
@@ -81,7 +81,7 @@ class AbstractTask(eqx.Module):
 
     @property
     def rests(self) -> bool:
-        """Whether the vehicle comes to rest at home, so that ``adapt.trim`` applies; by default for fixed targets."""
+        """Whether the vehicle comes to rest at home, so ``adapt.trim`` applies; by default, true for fixed targets."""
         return type(self).target is AbstractTask.target
 
     @property
@@ -101,10 +101,10 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def home(self) -> Float[Array, "3"]:
-        """Return the position around which flights start, world [m]."""
+        """Return the position around which flights start, in the world frame [m]."""
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the vehicle's target position at time ``t`` [s], world [m]."""
+        """Return the vehicle's target position at time ``t`` [s], in the world frame [m]."""
         return self.home()
 
     def setpoint(self, t: Float[Array, ""]) -> Point:
@@ -115,10 +115,10 @@ class AbstractTask(eqx.Module):
         return Point(p, rest, hover, none, rest, rest, none)
 
     def reset(self, key: Key[Array, ""]) -> Start:
-        """Draw a start; by default, near the target at a random time of a flight.
+        """Draw a start; by default, near the target at a random time in a flight.
 
-        The default position is within 1 m of the target and the attitude within 18 degrees of level, both per axis. The
-        standard deviation of the velocity relative to the target is 0.1 m/s per axis.
+        The default position is within ±1 m of the target and the attitude within ±18 degrees of level, both per axis.
+        The standard deviation of the velocity relative to the target is 0.1 m/s per axis.
 
         Args:
             key: Random key; consumed.
@@ -143,7 +143,7 @@ class AbstractTask(eqx.Module):
     def terminated(self, t: Float[Array, ""], x: State) -> Bool[Array, ""]:
         """Return whether the vehicle has left the bounds; by default, more than 5 m from the target along any axis.
 
-        It must also be true for a state that is not finite.
+        The result must also be true for a state that is not finite.
         """
         return ~within(jnp.array(BOX), x, self.target(t))
 
@@ -154,8 +154,8 @@ class AbstractTask(eqx.Module):
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractTask":
         """Return the same task for states and commands in ``frame``.
 
-        By default, reward, bounds and error are evaluated for the state in the world and the command in the frame. In
-        the frame, hovering requires the hover command.
+        By default, reward, bounds and error are evaluated with the state in the world frame and the command in
+        ``frame``. In ``frame``, hovering requires the hover command.
 
         Raises:
             FrameError: The observation does not support other frames.
@@ -168,7 +168,7 @@ class AbstractTask(eqx.Module):
 
 
 class FramedTask(AbstractTask):
-    """A task for states and commands in a frame."""
+    """A task for states and commands in a given frame."""
 
     task: AbstractTask
     """The task in the world frame."""
@@ -209,8 +209,8 @@ def within(box: Float[Array, ""], x: State, centre: Float[Array, "3"]) -> Bool[A
 def huber(y: Float[Array, " n"]) -> Float[Array, ""]:
     """Return the Huber loss of the 2-norm of ``y``, with threshold 1: |y|^2 / 2 up to 1, and |y| - 1/2 beyond.
 
-    The paper uses "the Huber loss" of a vector and leaves open whether it applies to the norm or to each component. The
-    norm is used here because it does not depend on the choice of axes. The value and gradient are exact at zero.
+    The paper uses "the Huber loss" of a vector and leaves open whether it applies to the norm or to each component.
+    The norm is used here because it does not depend on the choice of axes. The value and gradient are exact at zero.
     """
     squared = jnp.sum(y * y)
     inside = squared <= 1.0

@@ -20,7 +20,7 @@ NOISE = 0.1 * math.pi  # [rad]
 
 
 class AbstractTrack(AbstractTask):
-    """Follow a reference in space and time; subclasses differ in their reward.
+    """Follow a reference in space and time; subclasses differ in their rewards.
 
     The task terminates when the vehicle is farther than ``box`` [m] from the reference along any axis.
     """
@@ -37,8 +37,8 @@ class AbstractTrack(AbstractTask):
     def reset(self, key: Key[Array, ""]) -> Start:
         """Draw a start near the reference, at a random time in one of its spans.
 
-        The position deviates by at most ``spread`` and the attitude by at most 18 degrees, both per axis. The standard
-        deviation of the velocity is 0.3 m/s per axis.
+        The position is within ±``spread`` of the reference and the attitude within ±18 degrees, both per axis. The
+        standard deviation of the velocity is 0.3 m/s per axis.
         """
         k_join, k_time, kp, ka, kv = random.split(key, 5)
         joins = self.reference.joins
@@ -66,11 +66,11 @@ class AbstractTrack(AbstractTask):
         return 10.0
 
     def home(self) -> Float[Array, "3"]:
-        """Return the start of the reference, world [m]."""
+        """Return the start of the reference in the world frame [m]."""
         return _start(self.reference)
 
     def target(self, t: Float[Array, ""]) -> Float[Array, "3"]:
-        """Return the reference position at time ``t`` [s], world [m]."""
+        """Return the reference position at time ``t`` [s] in the world frame [m]."""
         return self.reference(t).p
 
     def setpoint(self, t: Float[Array, ""]) -> Point:
@@ -112,7 +112,7 @@ class Track(AbstractTrack):
 class L2Track(AbstractTrack):
     """Tracking with a reward that is five times as steep in position and centred on the reference's own command.
 
-    The paper's reward accepts centimetres of error for less tilt, even without a disturbance.
+    The paper's reward accepts centimetres of error in exchange for less tilt, even without a disturbance.
     """
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:

@@ -1,7 +1,7 @@
 """Observations of a tracking policy that contain the tracking error: state-based tracking as in the paper.
 
-The paper gives o = [p, R, v] for both hover and tracking. Taken literally for tracking, this observation does not
-contain the phase of the reference (the observation ``blind``). The two classes here implement the other readings.
+The paper gives o = [p, R, v] for both hover and tracking. Taken literally for tracking, this observation (``blind``)
+does not contain the phase of the reference. The two classes here implement the other readings.
 """
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from .observation import POSITION_SCALE, VELOCITY_SCALE, AbstractObservation, St
 class RelativeObs(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p - p_ref(t), R, v - v_ref(t)] and the last ``history`` commands: 15 + 4 ``history`` numbers.
 
-    The policy observes its error, but not its position on the reference, so that it cannot anticipate the path.
+    The policy observes its error, but not its position on the reference, so it cannot anticipate the path.
     """
 
     reference: AbstractReference

@@ -26,7 +26,7 @@ def from_csv(file: Path, laps: bool | None = None) -> Reference:
     """Return a cubic-spline reference through the points of a file.
 
     A file is closed if its last point is within 1 cm of its first and has the same yaw, up to whole turns. A closed
-    file repeats as laps. A file that ends in motion at an earlier point of its path, in the same direction and at the
+    file repeats as laps. A file that ends in motion at an earlier point on its path, in the same direction and at the
     same speed, repeats from that point. Laps that start in motion begin with a smooth start of 3 s along the path, like
     the built-in shapes. Any other file is flown once, from rest to rest, and its end is held. If the points at an end
     are too close together for a vehicle to stop between them, the reference remains in motion at that end, and
@@ -34,10 +34,10 @@ def from_csv(file: Path, laps: bool | None = None) -> Reference:
 
     Args:
         file: Times, positions and headings; see :func:`retrim.tasks.trajectory_table.read_table` for the format.
-        laps: True requires laps, False flies any file once, and None decides by the ends of the file.
+        laps: True requires laps, False flies any file once, and None decides from the ends of the file.
 
     Returns:
-        The reference, with rows at most 20 ms apart. Its time 0 is that of the first point.
+        The reference, with rows at most 20 ms apart. Time 0 is the time of the first point.
 
     Raises:
         ConfigError: The file cannot be used (the message contains the line), or ``laps`` is true and the file does not
@@ -75,7 +75,7 @@ def _repeated(table: np.ndarray, start: float) -> Reference:
 
 
 def _lap_spline(table: np.ndarray, start: float) -> tuple[Callable[[float], np.ndarray], np.ndarray]:
-    """Return a spline that is smooth between laps, and its change per lap, which is whole turns of yaw."""
+    """Return a spline that is smooth between laps, and its change per lap, which consists of whole turns of yaw."""
     table, period = table.copy(), float(table[-1, 0]) - start
     first = table[0, 1:] if start == 0.0 else _spline(table, (_end(table, 0), "not-a-knot"))(start)
     winding = np.array([0.0, 0.0, 0.0, 2.0 * math.pi * round((table[-1, 4] - first[3]) / (2.0 * math.pi))])

@@ -1,4 +1,4 @@
-"""Reader of trajectory text files: separators, comments, header and numbers; errors contain the faulty line."""
+"""Read trajectory text files with separators, comments, a header and numbers; errors contain the faulty line."""
 
 import csv
 import math
@@ -19,7 +19,7 @@ LEFT_OUT = re.compile(
     r"|(?:v|vel|velocity|a|acc|accel|acceleration|a_lin|a_rot|j|jerk|s|snap|w|omega|rates?|alpha|tau|torque)[_.]?[xyz]"
     r"|(?:q|quat|orientation)[_.]?[wxyz]|q[0-3]|u[_.]?\d|thrust|roll|pitch|yaw_?(?:rate|dot)|d?heading_?rate"
 )
-"""Usual names of columns that are determined by positions and yaw, and names that begin with _; these are not read."""
+"""Usual names of columns that positions and yaw determine, and names that begin with _; such columns are not read."""
 UNITS = {
     "t": ("s", "sec", "second", "seconds"),
     **dict.fromkeys("xyz", ("m", "meter", "meters", "metre", "metres")),
@@ -43,9 +43,9 @@ def read_table(file: Path) -> np.ndarray:
             columns, in any order: t (time, timestamp), x, y, z (p_x, pos_x, position.x), yaw (heading, psi), with or
             without units in brackets. Columns with the usual names of velocities, accelerations, quaternions, rates and
             thrusts are not read, since the positions determine them. Columns whose name begins with ``_`` are not read
-            either. Without a header, the order is t, x, y, z[, yaw]. A comment before the first point that contains the
-            column names is also a header. A point that repeats the previous one, for example where two segments meet,
-            is left out.
+            either. Without a header, the order is t, x, y, z[, yaw]. A comment that comes before the first point and
+            contains the column names is also a header. A point that repeats the previous one, for example
+            where two segments meet, is left out.
 
     Returns:
         One row per point: time since the first point [s], world position x, y, z [m], and unwrapped yaw [rad], which is
@@ -114,7 +114,7 @@ def _lines(text: str) -> Iterator[tuple[int, str, bool]]:
 
 
 def _words(line: str) -> list[str]:
-    """Split a line at its separator: a tab, semicolon or comma if it contains one, otherwise spaces.
+    """Split a line at its separator: a tab, semicolon or comma if the line contains one, otherwise spaces.
 
     Raises:
         ConfigError: A quoted field is too long to be a number.
@@ -173,7 +173,7 @@ def _point(words: list[str], columns: list[str]) -> list[float]:
     """Return t, x, y, z and, if there is a column for it, yaw.
 
     Raises:
-        ConfigError: The words are not the expected number of plausible numbers.
+        ConfigError: The number of words is wrong, or a word is not a plausible number.
     """
     shown = ", ".join(words) if len(words) <= 6 else ", ".join(words[:6]) + ", ..."
     if len(words) != len(columns):

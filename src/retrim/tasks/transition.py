@@ -33,8 +33,8 @@ def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehic
         vehicle: Vehicle of the flight.
 
     Returns:
-        A table with the same sizes as ``old``, so that it can replace ``old`` in a compiled program. It begins one
-        second before ``at``. A roll-out may start in the lap of ``new``.
+        A table with the same sizes as ``old``, so that it can replace ``old`` in a compiled program. The table begins
+        one second before ``at``. A roll-out may start in the lap of ``new``.
     """
     for lasting in LASTING:
         table = _table(old, new, at, lasting)

@@ -19,7 +19,7 @@ class VehicleObs(AbstractObservation[M]):
     """o = [task observation, thrust, body rates and their slope, belief]: 15 more numbers than the task observation.
 
     The task observation should contain as many past commands as the longest delay has ticks, since these may not have
-    acted yet. A slow vehicle continues to turn long after the last of them, so the thrust and rates are also observed.
+    acted yet. A slow vehicle continues to turn long after the last command, so the thrust and rates are also observed.
     The belief contains the centre and half-width of the interval for each coordinate of the command path; see
     :class:`~retrim.physics.path_family.PathBelief`.
     """
@@ -75,6 +75,6 @@ class VehicleObs(AbstractObservation[M]):
         return still(self.init(x), jnp.zeros_like(x.p[0]), x, hover)[0]
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "VehicleObs[M]":
-        """Return the observation in ``frame``; its actuators must also be in that frame."""
+        """Return the observation in ``frame``; the actuators must also be in that frame."""
         turned: AbstractObservation[Any] = self.inner.in_frame(frame)
         return dataclasses.replace(self, inner=turned)

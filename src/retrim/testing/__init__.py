@@ -1,6 +1,6 @@
 """Conformance suites for plants, tasks, controllers, residual models and vehicle links, for use in any test suite.
 
-Each function raises ``AssertionError`` with the broken law::
+Each function raises ``AssertionError``, whose message states the broken law::
 
     def test_my_plant():
         retrim.testing.check_plant(lambda: MyPlant())

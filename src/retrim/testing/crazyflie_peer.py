@@ -1,9 +1,9 @@
-"""A peer that implements CRTP like a Crazyflie and simulates the plant ``bem``, for tests and trials of a link.
+"""Simulate a Crazyflie with CRTP and the plant ``bem``, for tests and trials of a link.
 
-``python -m retrim.testing.crazyflie_peer --disturbance large`` runs until Ctrl-C. It implements only the part of the
-firmware that :mod:`retrim` needs (versions, the log, arming, the firmware's commander, the manual setpoint, and the
-reaction to missing setpoints), and the requests that a client makes first. The vehicle is one of retrim's; only the
-protocol is that of a Crazyflie.
+``python -m retrim.testing.crazyflie_peer --disturbance large`` runs until Ctrl-C. The peer implements only the part of
+the firmware that :mod:`retrim` needs (versions, the log, arming, the firmware's commander, the manual setpoint, and the
+reaction to missing setpoints), and the initial requests of a client. The vehicle is one of retrim's; only the protocol
+is that of a Crazyflie.
 """
 
 import argparse
@@ -20,23 +20,23 @@ from ..plants.bridges import crtp
 from ..plants.bridges.crtp import Packet
 from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
 
-VERSION = 12  # version of the protocol
-LEVELS_S, STOPS_S = 0.5, 2.0  # times without a setpoint until it levels, and until it stops its motors [s]
-READY_S = 0.5  # time after the start before arming is possible [s]
+VERSION = 12  # protocol version
+LEVELS_S, STOPS_S = 0.5, 2.0  # [s]: time without a setpoint until the vehicle levels, and until the motors stop
+READY_S = 0.5  # [s]: time from the start until arming is possible
 FULL = 65_535.0  # full thrust
 VARIABLES = {**crtp.STATUS_LOG, "stateEstimate.x": "f", "stateEstimate.y": "f", **crtp.STATE_LOG}
 UNKNOWN = 2  # error code for an unknown block or variable
 
 
 class CrazyfliePeer:
-    """A simulated Crazyflie. :meth:`step` advances it by 0.01 s."""
+    """A simulated Crazyflie; :meth:`step` advances the simulation by 0.01 s."""
 
     def __init__(self, scenario: Scenario, *, port: int = 19850, seed: int = 0) -> None:
         """Build a vehicle on the ground at the origin, with the nose along x.
 
         Args:
             scenario: Plant, vehicle and disturbance.
-            port: Local port on which it listens.
+            port: Local port on which the peer listens.
             seed: Seed of the disturbance.
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -46,7 +46,7 @@ class CrazyfliePeer:
         self.vehicle = PeerVehicle(scenario, heading=0.0, seed=seed)
         self._began = time.monotonic()
         self.armed = self.locked = self.cut = False
-        """Whether it is armed, whether its supervisor has locked it, and whether the link is cut in both directions."""
+        """Whether the vehicle is armed, whether its supervisor has locked it, and whether the link is cut both ways."""
         self._place: np.ndarray | None = None
         self._yaw = 0.0
         self._lands = False
@@ -59,7 +59,7 @@ class CrazyfliePeer:
 
     @property
     def by_rates(self) -> bool:
-        """Whether it flies with externally commanded thrust and body rates."""
+        """Whether the vehicle flies with externally commanded thrust and body rates."""
         return self.vehicle.flies and self._setpoint is not None
 
     def step(self) -> None:
@@ -149,7 +149,7 @@ class CrazyfliePeer:
         elif (port, channel) == (crtp.SUPERVISOR, 0) and body[0] == 0x0C:
             self._send(packet._replace(body=b"\x8c" + struct.pack("<H", self._info())))
         elif (port, channel) in ((crtp.PARAMETERS, 0), (crtp.MEMORY, 0)):
-            self._send(packet._replace(body=body[:1] + bytes(6)))  # it has no parameters and no memories
+            self._send(packet._replace(body=body[:1] + bytes(6)))  # the peer has no parameters and no memories
         elif port == crtp.LOG:
             self._log(packet)
         elif (port, channel) == (crtp.SETPOINT, 0) and body[0] == crtp.MANUAL:
@@ -194,7 +194,7 @@ class CrazyfliePeer:
             self._send(packet._replace(body=body[:2].ljust(2, b"\0") + bytes([self._ordered(body)])))
 
     def _ordered(self, body: bytes) -> int:
-        """Execute a request about a log block; return its error code, which is 0 on success."""
+        """Execute a request about a log block; return the error code, which is 0 on success."""
         if body[0] == crtp.RESET:
             self._blocks, self._periods = {}, {}
         elif body[0] in (crtp.CREATE, crtp.APPEND):

@@ -1,7 +1,8 @@
-"""A peer that implements MAVLink like PX4 and simulates the plant ``bem``, for tests and trials of a link.
+"""Simulate an autopilot with MAVLink and the plant ``bem``, for tests and trials of a link.
 
-``python -m retrim.testing.mavlink_peer --disturbance large`` runs until Ctrl-C. It implements only the part of PX4 that
-:mod:`retrim` needs: arming, offboard mode, both kinds of setpoints, landing, and the failsafe for missing setpoints.
+``python -m retrim.testing.mavlink_peer --disturbance large`` runs until Ctrl-C. The peer implements only the part of
+PX4 that :mod:`retrim` needs: arming, offboard mode, both kinds of setpoints, landing, and the failsafe for missing
+setpoints.
 """
 
 import argparse
@@ -19,19 +20,19 @@ from ..plants.extras import import_extra
 from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
 
 OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)
-FAILSAFE_S = 1.0  # time without a setpoint until the failsafe [s]
+FAILSAFE_S = 1.0  # [s]: time without a setpoint until the failsafe
 QUADROTOR, PX4, ACTIVE = 2, 12, 4
 
 
 class MavlinkPeer:
-    """An autopilot and its vehicle. :meth:`step` advances both by 0.01 s."""
+    """An autopilot and its vehicle; :meth:`step` advances both by 0.01 s."""
 
     def __init__(self, scenario: Scenario, *, port: int = 14540, seed: int = 0) -> None:
         """Build a vehicle on the ground at the origin, with the nose to the north.
 
         Args:
             scenario: Plant, vehicle and disturbance.
-            port: Local port to which it sends.
+            port: Local port to which the peer sends.
             seed: Seed of the disturbance.
         """
         self._dialect: Any = import_extra("pymavlink.dialects.v20.common", "mavlink", package="pymavlink")
@@ -43,12 +44,12 @@ class MavlinkPeer:
         self.vehicle = PeerVehicle(scenario, heading=math.pi / 2, seed=seed)
         self.mode, self.armed = HOLD, False
         self.cut = False
-        """Whether the link is cut, in both directions."""
+        """Whether the link is cut in both directions."""
         self._rates: np.ndarray | None = None
         self._place, self._yaw = np.zeros(3), math.pi / 2
         self._told, self._tick, self._thrust = -math.inf, 0, 0.0
         self.failsafes = 0
-        """Number of times that setpoints have stopped in offboard mode."""
+        """Number of times that setpoints have stopped arriving in offboard mode."""
         self._takes: dict[str, Callable[[Any], None]] = {
             "SET_ATTITUDE_TARGET": self._take_rates, "SET_POSITION_TARGET_LOCAL_NED": self._take_place,
             "COMMAND_LONG": self._take_command, "TIMESYNC": self._answer_time,
@@ -71,7 +72,7 @@ class MavlinkPeer:
 
     @property
     def by_rates(self) -> bool:
-        """Whether it flies with externally commanded thrust and body rates."""
+        """Whether the vehicle flies with externally commanded thrust and body rates."""
         return self.vehicle.flies and self.mode == OFFBOARD and self._rates is not None
 
     def close(self) -> None:
@@ -80,7 +81,7 @@ class MavlinkPeer:
         self._socket.close()
 
     def _commanded(self) -> np.ndarray:
-        """Return the command that acts on the vehicle: the setpoint, or the output of its own controller."""
+        """Return the command that acts on the vehicle: the setpoint, or the output of the autopilot's controller."""
         stale = time.monotonic() - self._told > FAILSAFE_S
         if self.mode == OFFBOARD and stale:
             self.mode, self.failsafes, self._place, self._rates = HOLD, self.failsafes + 1, self.vehicle.p.copy(), None
@@ -133,7 +134,7 @@ class MavlinkPeer:
             self._send(self._out.timesync_encode(int(self._now() * 1e9), m.ts1))
 
     def _now(self) -> float:
-        """Return the time of its own clock, which has a different origin and runs too slowly."""
+        """Return the time of the autopilot's clock, which has a different origin and runs too slowly."""
         return 0.99 * (time.monotonic() % 1e5)
 
     def _say(self) -> None:

@@ -1,4 +1,4 @@
-"""A simulated vehicle with an autopilot's position controller, used by the peers of all protocols."""
+"""Simulate a vehicle with an autopilot's position controller, for the peers of all protocols."""
 
 import math
 import os
@@ -17,12 +17,12 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..plants.bridges import frames
 from ..plants.plant import as_numpy
 
-DT = 0.01  # tick [s]
-GROUND = 0.05  # height below which a vehicle touches the ground [m]
+DT = 0.01  # [s]: tick
+GROUND = 0.05  # [m]: height below which a vehicle touches the ground
 
 
 class PeerVehicle:
-    """A vehicle on the ground at the origin, until it lifts off; :meth:`step` advances it by 0.01 s."""
+    """A vehicle that stands on the ground at the origin until it lifts off; :meth:`step` advances time by 0.01 s."""
 
     def __init__(self, scenario: Scenario, *, heading: float, seed: int = 0) -> None:
         """Build a vehicle.
@@ -35,7 +35,7 @@ class PeerVehicle:
         vehicle = scenario.make_vehicle("small")
         self._plant = scenario.make("small", dt=DT, seed=seed)
         self.x, self.omega = _standing(0.0, 0.0, heading), np.zeros(3)
-        """State [p, R, v], and body rates."""
+        """State [p, R, v] and body rates."""
         self.flies = False
         low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
         fence = np.full(3, 1e3)
@@ -47,26 +47,26 @@ class PeerVehicle:
 
     @property
     def p(self) -> np.ndarray:
-        """Position [m]."""
+        """Position in the world frame [m]."""
         return self.x[:3]
 
     @property
     def R(self) -> np.ndarray:
-        """Attitude, body to world."""
+        """Attitude, as the rotation from the body to the world frame."""
         return self.x[3:12].reshape(3, 3)
 
     @property
     def v(self) -> np.ndarray:
-        """Velocity [m/s]."""
+        """Velocity in the world frame [m/s]."""
         return self.x[12:]
 
     def lift_off(self) -> None:
-        """Begin to fly at the current position."""
+        """Start flying at the current position."""
         self.flies = True
         self._place(GROUND)
 
     def step(self, u: np.ndarray) -> None:
-        """Apply a command [c, omega] for a tick."""
+        """Apply a command [c, omega] for one tick."""
         x = self._step_plant(u)
         before, after = self.R, np.asarray(x.R, dtype=float)
         turned = (before.T @ after - after.T @ before) / (2 * DT)
@@ -79,7 +79,7 @@ class PeerVehicle:
         self.x = _standing(self.p[0], self.p[1], frames.heading_of(self.R))
 
     def towards(self, place: np.ndarray, yaw: float) -> np.ndarray:
-        """Return the command [c, omega] that flies to a position [m] and heading [rad]."""
+        """Return the command [c, omega] that moves the vehicle to a position [m] and a heading [rad]."""
         u = self._hover.command(self.x, place)
         wrong = yaw - frames.heading_of(self.R)
         u[3] += np.clip(2.0 * math.atan2(math.sin(wrong), math.cos(wrong)), -1.0, 1.0)
@@ -103,7 +103,7 @@ class PeerVehicle:
 
 
 def _standing(x: float, y: float, yaw: float) -> np.ndarray:
-    """Return the state p, R, v of an upright vehicle on the ground."""
+    """Return the state [p, R, v] of an upright vehicle on the ground."""
     R = np.asarray(rotz(jnp.asarray(yaw, jnp.result_type(float))), dtype=float)
     return np.concatenate([[x, y, 0.0], R.ravel(), np.zeros(3)])
 

@@ -17,8 +17,8 @@ def check_plant(make: Callable[[], Plant], *, x0: State | None = None, settle_s:
     """Check a plant in calm air.
 
     Args:
-        make: Builds a plant without disturbances.
-        x0: Start state; by default 1.5 m above the ground.
+        make: Function that builds a plant without disturbances.
+        x0: Start state; by default, 1.5 m above the ground.
         settle_s: Time within which a body rate must be reached, within a factor of two [s].
 
     Raises:

@@ -1,4 +1,4 @@
-"""Runs PX4's own simulation and simulated motion capture on this machine, for flights without a vehicle.
+"""Run PX4's own simulation and simulated motion capture on this machine, for flights without a vehicle.
 
 ``python -m retrim.testing.px4 PACKAGE`` runs both until Ctrl-C. PACKAGE is a folder with ``bin/px4`` and ``etc``. PX4
 listens on every address of the machine; a network namespace can isolate it.
@@ -19,21 +19,21 @@ from ..plants.bridges.mavlink_link import MavlinkLink
 
 GROUND_STATION = 14550  # port to which PX4 sends, in addition to the port for a companion computer
 PAYLOAD = 14030  # a further port to which PX4 sends
-SEEN = 50.0  # rate of the motion capture [Hz]
+SEEN = 50.0  # [Hz]: rate of the motion capture
 MOCAP = {
     "EKF2_EV_CTRL": 15, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3, "EKF2_EV_DELAY": 8, "EKF2_EV_NOISE_MD": 1,
     "EKF2_EVP_NOISE": 0.02, "EKF2_EVV_NOISE": 0.05, "EKF2_EVA_NOISE": 0.05,
 }  # fmt: skip
-"""Parameters with which PX4 uses motion capture instead of GPS."""
+"""PX4 parameters that select motion capture instead of GPS."""
 TIMING = {"IMU_INTEG_RATE": 400, "COM_OBL_RC_ACT": 5}
-"""Parameters for states every 10 ms, and for position hold when setpoints stop."""
+"""PX4 parameters for a state every 10 ms, and for position hold when setpoints stop."""
 
 
 class Px4Simulation:
     """A PX4 process with its own physics; leaving the context ends the process."""
 
     def __init__(self, package: Path, run: Path, **parameters: float) -> None:
-        """Prepare the simulation without starting it.
+        """Prepare the simulation without starting PX4.
 
         Args:
             package: Folder with ``bin/px4`` and ``etc``.
@@ -86,7 +86,7 @@ class Px4Simulation:
 
 
 class MotionCapture:
-    """Sends PX4 its own true state, like a motion capture system."""
+    """A simulated motion capture system, which sends PX4 the true state of its vehicle."""
 
     def __init__(self, port: int = GROUND_STATION) -> None:
         """Listen on the port to which PX4 sends for ground stations."""
@@ -94,7 +94,7 @@ class MotionCapture:
         self._seen = self._asked = 0.0
 
     def step(self, until: float) -> None:
-        """Run until an instant of the monotonic clock [s]."""
+        """Send states until a time on the monotonic clock [s]."""
         while time.monotonic() < until:
             self.link.pump(time.monotonic() + 2e-3)
             truth = self.link.truth

@@ -18,7 +18,7 @@ def check_residual(model: ResidualModel, *, fits: int = 5, tolerance: float = 0.
     Args:
         model: Residual model to check.
         fits: Number of fits after which the model must have learned a constant acceleration.
-        tolerance: Largest error of its prediction after the fits, as a share of the acceleration.
+        tolerance: Largest error of the model's prediction after the fits, as a fraction of the acceleration.
 
     Raises:
         AssertionError: A law is broken.

@@ -1,8 +1,8 @@
-"""A peer on ROS 1 that simulates the plant ``bem``, for tests and trials of a node without a vehicle.
+"""Simulate a vehicle with ROS 1 and the plant ``bem``, for tests and trials of a node.
 
-``python -m retrim.testing.ros_peer http://127.0.0.1:11311 --disturbance large`` runs until Ctrl-C. It flies to the
-start and publishes odometry or only poses. It follows attitude targets while it receives them, and holds its position
-when they stop.
+``python -m retrim.testing.ros_peer http://127.0.0.1:11311 --disturbance large`` runs until Ctrl-C. The vehicle
+flies to the start. It follows attitude targets while the peer receives them, and holds its position when they stop. The
+peer publishes odometry or only poses.
 """
 
 import argparse
@@ -18,11 +18,11 @@ from ..plants.bridges.ros_link import ODOMETRY, POSE, TARGET, attitude_target
 from ..rospy_node import join, system_module
 from .peer_vehicle import PeerVehicle, fly_until_interrupted
 
-FRESH_S = 0.3  # time for which a target is valid [s]
+FRESH_S = 0.3  # [s]: time for which a target is valid
 
 
 class RosPeer:
-    """A vehicle and its autopilot. :meth:`step` advances both by 0.01 s."""
+    """A vehicle and its autopilot; :meth:`step` advances both by 0.01 s."""
 
     def __init__(self, master: str, scenario: Scenario, *, place: np.ndarray, yaw: float, poses: bool = False) -> None:
         """Build a vehicle that is about to take off.
@@ -30,9 +30,9 @@ class RosPeer:
         Args:
             master: URI of the rosmaster.
             scenario: Plant, vehicle and disturbance.
-            place: Position at which it waits, world [m].
-            yaw: Heading with which it waits [rad].
-            poses: Whether it publishes poses instead of odometry.
+            place: Position at which the vehicle waits, world [m].
+            yaw: Heading with which the vehicle waits [rad].
+            poses: Whether the peer publishes poses instead of odometry.
         """
         rospy = join(master)
         self._rospy, self._poses = rospy, poses
@@ -62,7 +62,7 @@ class RosPeer:
         self._told = time.monotonic()
 
     def _say(self) -> None:
-        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
+        from scipy.spatial.transform import Rotation  # local, because this import takes as long as that of retrim
 
         x, message = self.vehicle, self._kind()
         message.header.stamp = self._rospy.Time.from_sec(time.time())

@@ -1,4 +1,4 @@
-"""Conformance suite for vehicle links; it arms and flies the vehicle, which must be a simulated one."""
+"""Conformance suite for vehicle links, which arms and flies the vehicle; the vehicle must be simulated."""
 
 import functools
 import time
@@ -27,9 +27,9 @@ def check_vehicle(
     """Check a link in calm air, in real time.
 
     Args:
-        make: Builds a link to a vehicle on the ground.
+        make: Function that builds a link to a vehicle on the ground.
         place: Position of the flight, world [m].
-        hover_s: Duration of hovering by thrust and body rates [s].
+        hover_s: Duration of hovering with thrust and body-rate commands [s].
 
     Raises:
         AssertionError: A law is broken.
@@ -62,7 +62,7 @@ def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s
     began, last, ages = time.monotonic(), first, []
 
     def held(seconds: float) -> None:
-        """Hover by thrust and body rates."""
+        """Hover with thrust and body-rate commands."""
         nonlocal last
         until = last.t + seconds
         while last.t < until:

@@ -1,1 +1,1 @@
-"""Serialises parameters to bytes, and provides the bus that carries them."""
+"""Serialise parameters to bytes, and provide the bus that carries these bytes."""

@@ -1,4 +1,4 @@
-"""Carries topics between two buses, so that control processes never access a network."""
+"""Carry topics between two buses, so that control processes never access a network."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -10,7 +10,7 @@ EVERY = 0.05  # shortest time between two messages of a throttled topic [s]
 
 
 class Bridge:
-    """Connects two buses, with one direction for each topic; both keep only the last message of a topic."""
+    """Connects two buses, with one direction for each topic; both buses keep only the last message of a topic."""
 
     def __init__(
         self,
@@ -28,8 +28,8 @@ class Bridge:
         Args:
             here: First bus.
             there: Second bus.
-            out: Topics from here to there.
-            into: Topics from there to here.
+            out: Topics carried from ``here`` to ``there``.
+            into: Topics carried from ``there`` to ``here``.
             slowly: Topics that are published more often than necessary; at most one message per ``EVERY`` seconds is
                 carried.
             known: Version of each topic up to which messages are not carried; None to carry every message.

@@ -1,4 +1,4 @@
-"""The bus between the processes of a live flight, which holds the last message of each topic."""
+"""Define the bus between the processes of a live flight; the bus holds the last message of each topic."""
 
 import abc
 from typing import NamedTuple
@@ -13,7 +13,7 @@ class Message(NamedTuple):
 
 
 class Bus(abc.ABC):
-    """Topics with one writer each and any number of readers, which never wait for each other."""
+    """Topics with one writer each and any number of readers; writers and readers never wait for each other."""
 
     @property
     def refused(self) -> int:

@@ -1,4 +1,4 @@
-"""A bus within one process, for tests and for threads."""
+"""Provide a bus within one process, for tests and for threads."""
 
 import threading
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from .bus import Bus, Message
 
 
 class InProcessBus(Bus):
-    """A dictionary behind a lock."""
+    """A bus that keeps its messages in a dictionary with a lock."""
 
     def __init__(self, capacities: Mapping[str, int]) -> None:
         """Build a bus; ``capacities`` holds the maximum message length of each topic [bytes]."""

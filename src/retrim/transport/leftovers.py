@@ -1,7 +1,7 @@
-"""Removes buses in shared memory that are left over because all of their processes were killed.
+"""Remove buses in shared memory that are left over because all of their processes were killed.
 
-Each process that has joined a bus holds a lock on a file in the folder of the topics. The operating system releases it
-when the process ends for any reason. A bus without a held lock is left over.
+Each process that has joined a bus holds a lock on a file in the folder of the topics. The operating system releases the
+lock when the process ends for any reason. If no process holds the lock of a bus, the bus is left over.
 """
 
 import contextlib
@@ -45,7 +45,8 @@ def clear(base: Path, prefix: str) -> list[Path]:
 
     Args:
         base: Parent folder of the buses.
-        prefix: Prefix of their names. A folder without a lock has a different owner, or is just being created.
+        prefix: Prefix of the folder names. A folder without a lock is not removed: it has a different owner, or is just
+            being created.
     """
     cleared = []
     for folder in base.glob(f"{prefix}*"):

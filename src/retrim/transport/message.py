@@ -1,7 +1,8 @@
-"""Named arrays as bytes: one format for files and messages. Its content is never executed.
+"""Encode named arrays as bytes, in one format for files and messages.
 
-A message is a safetensors file. Its header holds the format, the kind, and a checksum of the tensors. Reading
-validates names, shapes, types and finiteness against the expected arrays before any object is built.
+The content of a message is never executed. A message is a safetensors file. Its header holds the format, the kind, and
+a checksum of the tensors. Reading validates names, shapes, types and finiteness against the expected arrays before any
+object is built.
 """
 
 import hashlib
@@ -83,7 +84,7 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
         The arrays, in the order of ``expected``.
 
     Raises:
-        MessageError: The message is truncated, damaged, of a different kind or shape, or has non-finite values.
+        MessageError: The message is truncated, damaged, or of a different kind or shape; or a value is not finite.
     """
     header = describe(data, kind=kind, source=source)
     try:

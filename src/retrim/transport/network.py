@@ -1,8 +1,8 @@
-"""Common parts of the buses between machines: every listener keeps the last message of each topic.
+"""Implement the common parts of the buses between machines; every listener keeps the last message of each topic.
 
 A message carries its version and the number of its writer. A restarted writer does not have its predecessor's last
-version. Readers recognise it by its new number, and versions continue to increase for every reader. A message from
-the same writer that is not newer is dropped. Ends that share a key sign their messages
+version. Readers recognise the restart by the new number, and versions continue to increase for every reader. A message
+from the same writer that is not newer is dropped. Ends that share a key sign their messages
 (:mod:`retrim.transport.session`) and reject all others.
 """
 
@@ -21,7 +21,7 @@ HEAD = struct.Struct("<QQ")
 """Writer and version, before each message."""
 OTHER = 0
 """Writer number of messages that a session has accepted; no real writer has it."""
-DISTRUST = 5.0  # time within which an end with the key must be received, after a message from one without it [s]
+DISTRUST = 5.0  # time in which an end with the key must be received after a message from an end without it [s]
 FAREWELL = 0.3  # time for a message to leave the machine before a bus is closed [s]
 
 
@@ -105,7 +105,7 @@ class NetworkBus(Bus):
             self._send(topic, self._talk.seal(topic, message.version, message.data))
 
     def _begin(self) -> None:
-        """Start a thread that answers the other end's greetings, as the receiving thread must not wait for a send."""
+        """Start a thread that answers the other end's greetings, since the receiving thread must not wait to send."""
         if self._talk is not None:
             self._answering = threading.Thread(target=self._answer, daemon=True)
             self._answering.start()

@@ -1,4 +1,4 @@
-"""Opens buses between machines by address: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
+"""Open buses between machines by address: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ class Address:
     key: str = ""
     """Key that selects one vehicle among several at the same address."""
     shared: SharedKey | None = field(default=None, repr=False, compare=False)
-    """Shared key of all ends that may publish there; None if any end may."""
+    """Shared key of all ends that may publish there; None if any end may publish."""
 
     def __str__(self) -> str:
         """Return the text that :meth:`of` reads."""
@@ -52,11 +52,11 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether the address is on this machine only."""
+        """Whether the address can be reached only from this machine."""
         return self.host in LOOPBACK
 
     def check_shared(self) -> None:
-        """Raise :class:`ConfigError` if the address is on another machine and there is no shared key."""
+        """Raise :class:`ConfigError` if other machines can reach the address and there is no shared key."""
         if self.shared is None and not self.loopback:
             raise ConfigError(
                 f"{self}: learners beyond this machine need a shared key: --key FILE or the variable {VARIABLE}, the "
@@ -68,9 +68,9 @@ class Address:
 
         Args:
             capacities: Maximum length of a message, by topic [bytes].
-            listen: Wait there for other ends; for ROS 1, the master does so.
-            writes: Topics that this end writes. Readers are connected to them immediately. Otherwise, they would be
-                connected only by the first message, which may also be the last one.
+            listen: Whether to wait at the address for other ends; for ROS 1, the master does so.
+            writes: Topics that this end writes. Readers are connected to these topics immediately. Readers of
+                other topics are connected only by the first message, which may also be the last one.
 
         Raises:
             ConfigError: The bus cannot be joined.

@@ -1,4 +1,4 @@
-"""A bus over ROS 1, the paper's transport: latched topics of bytes, and a rosmaster that connects the ends."""
+"""Provide a bus over ROS 1, the paper's transport, with latched topics of bytes and a rosmaster."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -11,7 +11,7 @@ PREFIX = "/retrim"
 
 
 class RosBus(NetworkBus):
-    """One end of the bus. Ends in one process share its node, which lives as long as the process."""
+    """One end of the bus. Ends in one process share one node, which lives as long as the process."""
 
     def __init__(
         self,
@@ -28,7 +28,7 @@ class RosBus(NetworkBus):
             capacities: Maximum length of a message, by topic [bytes].
             master: URI of the rosmaster, for example ``http://127.0.0.1:11311``.
             key: Key that selects one vehicle among several.
-            writes: Topics that are written here; others are declared with their first message.
+            writes: Topics that this end writes; others are declared with their first message.
             session: Signs messages; None if messages are not signed.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Authenticates the messages between two ends that share a key.
+"""Authenticate the messages between two ends that share a key.
 
 Each end draws a random number when it starts. A message contains the number of its sender, the number of its receiver,
 and a count. HMAC-SHA256 covers these, the topic, the vehicle and the payload. An end accepts a message only if the
@@ -46,7 +46,7 @@ class Session:
         Args:
             key: Key that is shared with the other end.
             vehicle: Name of the vehicle, if several share an address.
-            greeting: Topic in which this end greets the other one.
+            greeting: Topic on which this end greets the other one.
         """
         self.greeting = greeting
         self.fault = ""
@@ -84,7 +84,7 @@ class Session:
             if sender in self._former:
                 self._refuse("")
                 return None
-            if receiver != self._me:  # it may be an old message: its sender has to prove that it is running
+            if receiver != self._me:  # it may be an old message, so its sender must prove that it is running
                 if self._greeted != sender:
                     self._greet = sender
                     self.pending.set()

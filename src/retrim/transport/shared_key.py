@@ -1,4 +1,4 @@
-"""A key that is shared by two machines and authenticates their messages."""
+"""Read the key that two machines share, and sign their messages with it."""
 
 import hashlib
 import hmac
@@ -31,7 +31,7 @@ class SharedKey:
 def read_key(file: Path | None) -> SharedKey | None:
     """Return the key from a file or from the variable ``RETRIM_KEY``; None if there is neither.
 
-    The variable is removed from the environment, so that processes that are started later do not inherit it.
+    The variable is removed from the environment, so that processes that are started later do not inherit the key.
 
     Raises:
         ConfigError: The file cannot be read, or the key is too short or too long.

@@ -1,9 +1,9 @@
-"""A bus in shared memory for the processes of one machine, without a broker and without blocking.
+"""Provide a bus in shared memory for the processes of one machine, without a broker and without blocking.
 
 Each topic is a file that is mapped into memory, with two slots. A writer fills the slot that does not hold the last
-message, and then publishes its version. If the writer is killed before publishing, the last message remains intact. A
-reader copies a message and compares its version and its checksum. If the writer has published twice in that time, the
-reader tries again.
+message, and then publishes the version. If the writer is killed before publishing, the last message remains intact. A
+reader copies a message and compares its version and its checksum. If the writer has published twice in the meantime,
+the reader tries again.
 """
 
 import json
@@ -84,7 +84,7 @@ class SharedMemoryBus(Bus):
             os.close(lock)
 
     def take_in(self, file: Path) -> Path:
-        """Copy a file to the folder of the topics, where it exists as long as they do, and return the copy.
+        """Copy a file to the folder of the topics, where the copy exists as long as the bus, and return its path.
 
         Raises:
             OSError: The file cannot be read, or there is not enough space; the bus is then removed.

@@ -1,4 +1,4 @@
-"""Pytrees of arrays as messages (:mod:`retrim.transport.message`)."""
+"""Pack pytrees of arrays into messages (:mod:`retrim.transport.message`), and unpack them."""
 
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -43,7 +43,7 @@ def unpack(data: bytes, like: T, *, kind: str, source: str) -> T:
         The pytree.
 
     Raises:
-        MessageError: The message is truncated, damaged, of a different kind or shape, or has non-finite values.
+        MessageError: The message is truncated, damaged, or of a different kind or shape; or a value is not finite.
     """
     arrays = unpack_arrays(data, names(like), kind=kind, source=source)
     tree: T = jax.tree.unflatten(jax.tree.structure(like), jax.device_put(list(arrays.values())))

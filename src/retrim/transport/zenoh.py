@@ -1,6 +1,7 @@
-"""A bus between machines over zenoh: peers without a broker or discovery; one end listens, the others connect.
+"""Provide a bus between machines over zenoh.
 
-Needs the extra ``zenoh``.
+The peers use neither a broker nor discovery: one end listens, and the others connect. The module needs the extra
+``zenoh``.
 """
 
 import json
@@ -32,14 +33,15 @@ class ZenohBus(NetworkBus):
 
         Args:
             capacities: Maximum length of a message, by topic [bytes].
-            endpoint: For example ``tcp/192.168.1.5:7447``.
-            listen: Wait there for other ends; otherwise, try to connect to a listening end without a time limit.
+            endpoint: Endpoint, for example ``tcp/192.168.1.5:7447``.
+            listen: Whether to wait at the endpoint for other ends; otherwise, the bus tries to connect to a listening
+                end without a time limit.
             key: Key that selects one vehicle among several.
             writes: Topics that are written here; others are declared with their first message.
             session: Signs messages; None if messages are not signed.
 
         Raises:
-            ConfigError: zenoh is not installed, or it is not possible to listen there.
+            ConfigError: zenoh is not installed, or the bus cannot listen at the endpoint.
         """
         try:
             import zenoh
@@ -68,7 +70,7 @@ class ZenohBus(NetworkBus):
             raise ConfigError(f"zenoh: cannot join at {endpoint!r} ({reason})") from error
         cache = ext.CacheConfig(BUFFER)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=BUFFER)
-        # Messages are not dropped if the network is slow, because some topics have a single message.
+        # Messages are not dropped if the network is slow, because some topics carry only a single message.
         block, remote = zenoh.CongestionControl.BLOCK, zenoh.Locality.REMOTE
         prefix = f"{PREFIX}/{key}" if key else PREFIX
         self._declare: Any = lambda topic: ext.declare_advanced_publisher(

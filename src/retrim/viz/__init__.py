@@ -1,1 +1,1 @@
-"""Draws pictures; only the command line imports this package."""
+"""Draw pictures; only the command line imports this package."""

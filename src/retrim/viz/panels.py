@@ -1,4 +1,4 @@
-"""Draws plain panels of curves, for pictures of a model."""
+"""Draw panels of curves, heat maps and bars."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ COLORS = (ADAPTED, BASE, UPDATE, PUSH, "#CC79A7", "#56B4E9")
 
 @dataclass(frozen=True)
 class Curve:
-    """One line, or only points if ``marks`` is true."""
+    """A line, or only points if ``marks`` is true."""
 
     x: np.ndarray
     y: np.ndarray
@@ -26,12 +26,12 @@ class Curve:
     dashed: bool = False
     marks: bool = False
     color: int | None = None
-    """Index of the colour; by default the next one."""
+    """Index of the colour; by default, the next one."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes."""
+    """A pair of axes with curves."""
 
     title: str
     x: str
@@ -73,13 +73,15 @@ def panel_figure(title: str, panels: Sequence[Panel], *, across: int = 3) -> "ma
 def heat_map(
     titles: Sequence[str], rows: Sequence[str], columns: Sequence[str], values: np.ndarray
 ) -> "matplotlib.figure.Figure":
-    """Draw tables of numbers as colours, side by side; darker is larger, on a logarithmic scale for each table.
+    """Draw tables of numbers side by side, with darker cells for larger numbers.
+
+    Each table has its own logarithmic colour scale.
 
     Args:
         titles: Title of each table.
         rows: Labels of the rows.
         columns: Labels of the columns.
-        values: Tables x rows x columns, not negative; infinity is written as such, and NaN is left white.
+        values: Tables x rows x columns, not negative; infinity is written as a symbol, and NaN cells stay white.
     """
     size = (2.6 + len(titles) * (0.6 + 0.75 * len(columns)), 1.2 + 0.3 * len(rows))
     with sheet(size, 9.0, boxed=True) as figure:
@@ -101,7 +103,7 @@ def heat_map(
 
 
 def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> "matplotlib.figure.Figure":
-    """Draw one group of bars per label and one bar per method: the mean, and a dot for each flight.
+    """Draw a group of bars for each label, with a bar for the mean of each method and a dot for each flight.
 
     An infinite value means a crashed flight; the number of crashes is written at the bar's position.
     """

@@ -1,4 +1,4 @@
-"""Draws pictures of flights."""
+"""Draw pictures of flights."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Okabe and Ito's colours, distinguishable with any colour vision.
+# Okabe and Ito's colours, which people with any colour vision can distinguish.
 BASE, ADAPTED, UPDATE, PUSH, INK = "#D55E00", "#0072B2", "#009E73", "#E69F00", "#333333"
 GROUPS = (BASE, ADAPTED, "#CC79A7", "#56B4E9")
-LAPS_S = 10.0  # duration at the end of a flight for which its path is drawn from above [s]
+LAPS_S = 10.0  # [s]: duration at the end of a flight for which the path is drawn from above
 MOST_WORDS = 8  # maximum number of marks with text
 ASPECT = 720 / 1280  # aspect ratio of a camera's image, whose axes both run from -1 to 1
 
@@ -30,14 +30,14 @@ class Track:
     t: np.ndarray
     """Times [s]."""
     p: np.ndarray
-    """Positions, world [m], ticks x 3."""
+    """Positions in the world frame [m], ticks x 3."""
     error: np.ndarray
     """Error [m]."""
     swaps: tuple[float, ...] = ()
     """Times of policy swaps [s]."""
     crashed: bool = False
     last_s: float = 2.0
-    """Duration at the end of the flight over which it is scored [s]."""
+    """Duration at the end of the flight over which the error is averaged [s]."""
     marks: tuple[tuple[float, str], ...] = ()
     """Time [s] and text of each user action."""
 
@@ -54,7 +54,7 @@ class Group(Generic[T]):
 
 @dataclass(frozen=True)
 class ImageTrack:
-    """Image points in the camera during one flight."""
+    """Image points of the camera during one flight."""
 
     pixel: np.ndarray
     """Image coordinates, ticks x 7 x 2; the image is [-1, 1] x [-1, 1]."""
@@ -71,7 +71,7 @@ class Span:
     end: float
     label: str
     strong: bool
-    """Whether it is drawn darker, which distinguishes a push from its reverse."""
+    """Whether the span is drawn darker, to distinguish a push from its reverse."""
 
 
 def flight_figure(
@@ -91,12 +91,12 @@ def flight_figure(
 
 
 def save(figure: "matplotlib.figure.Figure", folder: Path, name: str) -> list[Path]:
-    """Write a PNG and an SVG file; return their paths."""
+    """Write the figure as a PNG and an SVG file; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.{kind}" for kind in ("png", "svg")]
     for path in paths:
         figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else None)
-        figure.set_layout_engine("none")  # keeps the layout of the first file
+        figure.set_layout_engine("none")  # keep the layout of the first file
     return paths
 
 
@@ -118,7 +118,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
         )  # fmt: skip
     swaps = sorted({round(t, 2) for track in every for t in track.swaps})
-    few = len(swaps) <= 12  # many lines would hide the flights, so that only ticks on the time axis are drawn
+    few = len(swaps) <= 12  # many lines would hide the flights, so only ticks on the time axis are drawn
     for i, t in enumerate(swaps):
         axes.axvline(
             t, ymax=1.0 if few else 0.03, color=UPDATE, linestyle="--" if few else "-", linewidth=1.2,
@@ -147,7 +147,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
 
 
 def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top: float) -> None:
-    """Draw the user's actions: a line for each, with text if there are few."""
+    """Draw a line for each user action, with text if there are few actions."""
     for i, (t, words) in enumerate(marks):
         axes.axvline(t, color=INK, linestyle=":", linewidth=1.2, label=None if i else "somebody acts")
         if len(marks) <= MOST_WORDS:
@@ -178,7 +178,7 @@ def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tu
 
 
 def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
-    """Draw the paths of the last ten seconds, seen from above, on top of the lap (points x 3)."""
+    """Draw the paths of the last ten seconds over the lap (points x 3), seen from above."""
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
     for tracks, color, name in _coloured(groups):
         for i, track in enumerate(track for track in tracks if not track.crashed):

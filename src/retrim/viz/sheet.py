@@ -1,6 +1,6 @@
-"""A blank figure, without the global state of pyplot.
+"""Create blank figures without the global state of pyplot.
 
-matplotlib is imported only when the first figure is drawn, so that commands start faster.
+matplotlib is imported only when the first figure is drawn, so commands start faster.
 """
 
 from collections.abc import Iterator
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 @contextmanager
 def sheet(size: tuple[float, float], font_size: float, *, boxed: bool = False) -> Iterator["matplotlib.figure.Figure"]:
-    """Yield a white figure; its style applies while it is drawn.
+    """Yield a white figure; its style applies inside the context.
 
     Args:
         size: Width and height [inch].
-        font_size: Size of the font [pt].
+        font_size: Font size [pt].
         boxed: Whether axes have lines on all four sides; otherwise only below and on the left.
     """
     import matplotlib

@@ -1,4 +1,4 @@
-"""Draws maps of vehicles: lag on the x axis, delay on the y axis, and the error of each vehicle in colour."""
+"""Draw maps of vehicles, with lag on the x axis, delay on the y axis, and each vehicle's error as a colour."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from .sheet import sheet
 if TYPE_CHECKING:
     import matplotlib.figure
 
-SMALLEST, LARGEST = 1e-3, 1.0  # [m], ends of the colour scale
+SMALLEST, LARGEST = 1e-3, 1.0  # [m]: ends of the colour scale
 ACROSS = 4  # panels per row
 LOST = "#D55E00"
 

@@ -1,4 +1,4 @@
-"""PPO samples and their generalised advantage estimates."""
+"""Computes generalised advantage estimates for PPO samples."""
 
 from typing import Any, NamedTuple
 

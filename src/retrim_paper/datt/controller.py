@@ -1,4 +1,4 @@
-"""DATT (Huang et al. 2023): a policy that looks ahead along its reference and receives the disturbance.
+"""Implements DATT (Huang et al. 2023), a policy that looks ahead along its reference and receives the disturbance.
 
 The implementation follows the description in the paper, with three changes that improve the results here. Positions are
 relative to the reference. Vectors are in the body frame. The observation contains the state in which the command begins
@@ -56,7 +56,7 @@ class DattNet(eqx.Module):
         )
 
     def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, "4"], Float[Array, ""]]:
-        """Return the mean action and the value of an observation of :func:`datt_observation`."""
+        """Return the mean action and the value for an observation from :func:`datt_observation`."""
         ahead = jax.nn.relu(_along(o[OWN:].reshape(AHEAD, 3), self.first, self.first_bias))
         seen = jnp.concatenate([o[:OWN], _along(ahead, self.second, self.second_bias).reshape(-1)])
         return self.actor(seen), self.critic(seen)

@@ -1,9 +1,9 @@
-"""Proximal policy optimisation (Schulman et al. 2017): learning from rewards alone, for problems without gradients.
+"""Learns from rewards alone, by proximal policy optimisation (Schulman et al. 2017), for problems without gradients.
 
 Many environments are stepped at once. Advantages are estimated as in Schulman et al. 2016. A few passes over the
 samples, in minibatches, maximise the clipped objective. If an episode is cut off by the time limit and not by the
 vehicle's behaviour, the estimate continues with the value of the state at the cut. Values are sums of rewards scaled
-by 1 - gamma, so that they have the magnitude of a reward for every discount.
+by 1 - gamma, so they have the magnitude of a reward for every discount.
 """
 
 import functools
@@ -31,7 +31,7 @@ class ActorCritic(Protocol):
     """Logarithm of the actions' standard deviation."""
 
     def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, " a"], Float[Array, ""]]:
-        """Return the mean action and the value of an observation."""
+        """Return the mean action and the value for an observation."""
         ...
 
 
@@ -112,7 +112,7 @@ def ppo(
 def _optimiser(settings: PpoSettings, updates: int) -> optax.GradientTransformation:
     """Return gradient clipping followed by Adam with a cosine schedule.
 
-    The same arguments return the same object, so that compiled programs are shared.
+    The same arguments return the same object, so compiled programs are shared.
     """
     rate = optax.cosine_decay_schedule(settings.learning_rate, updates * settings.epochs * settings.minibatches)
     return optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(rate, eps=1e-5))

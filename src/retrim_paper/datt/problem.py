@@ -66,7 +66,7 @@ class DattProblem(eqx.Module):
         return datt_observation(x, s.acting, s.d, self.bank[s.reference, at])
 
     def step(self, s: DattEnv, action: Float[Array, "4"], key: Key[Array, ""]) -> tuple[DattEnv, Outcome]:
-        """Fly one tick; as in DATT, the reward is minus the distance, half the heading and a tenth of the speed."""
+        """Fly one tick; as in DATT, the reward is -(distance + half the heading + a tenth of the speed)."""
         mean, acting = lagged(s.acting, datt_command(action, self.low, self.high), self.dt, self.tau)
         x = PointMass(self.dt).step(s.x, mean, s.d)
         walk = WALK * (self.dt / TICK) ** 0.5

@@ -1,4 +1,4 @@
-"""Baselines that need training before a flight: DATT, which is trained by reinforcement learning."""
+"""Trains the baseline that needs training before a flight: DATT, which uses reinforcement learning."""
 
 import time
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ DATT_STEPS = 20_000_000  # as in the paper
 DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
 DATT_TAG = 2**30 + 5  # folded into a seed, so that DATT does not share keys with the policies
 PARTLY = ".partly"
-"""File name suffix of the state of an interrupted training."""
+"""File name suffix for the saved state of an interrupted training."""
 KEEP_EVERY = 30.0
 """Time between two saved states during training [s]."""
 
@@ -35,7 +35,7 @@ def check_steps(steps: int) -> None:
     """Check the number of training steps.
 
     Raises:
-        ConfigError: It is below one or above 10,000,000,000.
+        ConfigError: The number is below one or above 10,000,000,000.
     """
     if not 1 <= steps <= 10**10:
         raise ConfigError(f"--datt-steps {steps} must be between 1 and 10,000,000,000")
@@ -69,8 +69,8 @@ def train_datt(
     Args:
         preset: Vehicle, control period and declared lag.
         seeds: Seeds for networks, references and episodes.
-        run: Its ``trained`` stores the networks, and the state from which an interrupted training resumes. After an
-            interruption, the incomplete seeds are missing from the result.
+        run: Run whose ``trained`` folder stores the networks, and the state from which an interrupted training resumes.
+            After an interruption, the incomplete seeds are missing from the result.
         reporter: Receives progress.
         steps: Number of training steps.
     """

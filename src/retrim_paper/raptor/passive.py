@@ -1,4 +1,4 @@
-"""The outer controller for a vehicle with its own controller on board."""
+"""Provides the outer controller for a vehicle with its own controller on board."""
 
 from jaxtyping import Array, Float
 
@@ -19,5 +19,5 @@ class HoverController(AbstractController[tuple[()]]):
         return Command.hover(x.p.dtype), memory
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "HoverController":
-        """Return itself, since hover is the same in every frame."""
+        """Return this controller, since hover is the same in every frame."""
         return self

@@ -1,4 +1,4 @@
-"""A vehicle without a rate controller, whose motors are commanded by RAPTOR.
+"""Models a vehicle without a rate controller, whose motors are commanded by RAPTOR.
 
 RAPTOR is a foundation policy with 2,084 weights. It was distilled from a thousand teachers, each for a different
 vehicle, and adapts through its hidden state (Eschmann, Albani and Loianno 2025). It runs on board at 100 Hz and

@@ -1,4 +1,4 @@
-"""The paper's tables and figures, one file each; each table is a function of a run and a reporter."""
+"""Makes the paper's tables and figures, one file each; a table is a function that takes a run and a reporter."""
 
 from .ablation import ablation as ablation
 from .buses import buses as buses

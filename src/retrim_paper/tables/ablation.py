@@ -113,7 +113,7 @@ def _flown(
 
 
 def _follows(preset: Preset, reference: str | None) -> Preset:
-    """Return the preset to fly ``reference``; a policy without preview is trained on this reference alone."""
+    """Return the preset for flying ``reference``; a policy without preview is trained on this reference alone."""
     if reference is None or preset.track is None or preset.track.looks_ahead:
         return preset
     return changed(preset, track={"reference": reference})

@@ -1,4 +1,4 @@
-"""Message latency on each bus."""
+"""Measures the message latency on each bus."""
 
 from collections.abc import Sequence
 from contextlib import closing

@@ -1,4 +1,4 @@
-"""Cost of each method: the paper's compute and sample figures, compared with ours."""
+"""Compares the cost of each method: the paper's compute and sample figures with ours."""
 
 import tempfile
 from pathlib import Path

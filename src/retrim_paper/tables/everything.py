@@ -1,4 +1,4 @@
-"""All tables of the paper, one after another."""
+"""Makes all tables of the paper, one after another."""
 
 import json
 from collections.abc import Callable, Sequence

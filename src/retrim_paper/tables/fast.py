@@ -1,4 +1,4 @@
-"""Fast flight: references at a vehicle's limits, in wind."""
+"""Makes the table of fast flights: references at a vehicle's limits, in wind."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Supplement to a table of errors: intervals, recovery, worst error, phase and effort."""
+"""Supplements a table of errors with further figures: intervals, recovery, worst error, phase and effort."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

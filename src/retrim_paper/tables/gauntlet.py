@@ -1,4 +1,4 @@
-"""The gauntlet: one policy under many changes in the world."""
+"""Flies the gauntlet: one policy under many changes in the world."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal

@@ -1,4 +1,4 @@
-"""The gauntlet of hidden vehicles: one policy for many unknown vehicles."""
+"""Flies the gauntlet of hidden vehicles: one policy for many unknown vehicles."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

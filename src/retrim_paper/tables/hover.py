@@ -1,4 +1,4 @@
-"""Table I of the paper: hover."""
+"""Makes Table I of the paper: hover."""
 
 from retrim.config.scenario import Scenario
 from retrim.evaluation.study import table_presets

@@ -1,4 +1,4 @@
-"""Table sections in the paper's layout: a row per method, and a column per disturbance level."""
+"""Lays out table sections as in the paper: a row per method, and a column per disturbance level."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,4 @@
-"""The blade-element plant: its curves and figures compared with published ones."""
+"""Compares the blade-element plant's curves and figures with published ones."""
 
 import equinox as eqx
 import jax.numpy as jnp

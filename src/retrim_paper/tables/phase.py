@@ -1,4 +1,4 @@
-"""The paper's tracking formulation with several readings of its observation, from blind to state and error."""
+"""Flies the paper's tracking formulation with several readings of its observation, from blind to state and error."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

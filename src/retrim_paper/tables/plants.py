@@ -1,4 +1,4 @@
-"""One hover policy in many scenarios, on every plant."""
+"""Flies one hover policy in many scenarios, on every plant."""
 
 from dataclasses import replace
 

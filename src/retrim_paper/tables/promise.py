@@ -1,4 +1,4 @@
-"""Check of the monitor's promise, flight by flight: adapting is never worse than not adapting."""
+"""Checks the monitor's promise, flight by flight: adapting is never worse than not adapting."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

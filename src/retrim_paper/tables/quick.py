@@ -1,4 +1,4 @@
-"""Quick versions of the tables: one training seed, two starts, short flights."""
+"""Defines quick versions of the tables: one training seed, two starts, short flights."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence

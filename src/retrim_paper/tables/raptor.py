@@ -1,4 +1,4 @@
-"""RAPTOR, the foundation policy, compared with our policies: hover and a figure-8, undisturbed and disturbed."""
+"""Compares RAPTOR, the foundation policy, with our policies: hover and a figure-8, undisturbed and disturbed."""
 
 from retrim.config.loading import with_vehicle
 from retrim.config.scenario import Scenario

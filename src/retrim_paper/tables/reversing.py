@@ -1,4 +1,4 @@
-"""Hover under a push that reverses every 15 s (Sec. IV-B.3 of the paper)."""
+"""Makes the table of hover under a push that reverses every 15 s (Sec. IV-B.3 of the paper)."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Growth in time and memory with the number of flights."""
+"""Measures how time and memory grow with the number of flights."""
 
 import pickle
 import resource

@@ -1,4 +1,4 @@
-"""Table II of the paper: the circle, figure-8 and star."""
+"""Makes Table II of the paper: the circle, figure-8 and star."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The paper's real flights in simulation (Sec. IV-D): a load, a fan, and a policy on an unknown vehicle."""
+"""Repeats the paper's real flights in simulation (Sec. IV-D): a load, a fan, and a policy on an unknown vehicle."""
 
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError

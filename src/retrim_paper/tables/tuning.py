@@ -1,4 +1,4 @@
-"""Settings of the classical baselines, found by random search on conditions that are not part of any table."""
+"""Finds settings of the classical baselines by random search, on conditions that are not part of any table."""
 
 import contextlib
 from collections.abc import Sequence

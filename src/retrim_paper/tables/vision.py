@@ -1,4 +1,4 @@
-"""Table III of the paper: hover from keypoints."""
+"""Makes Table III of the paper: hover from keypoints."""
 
 from collections.abc import Sequence
 

@@ -1,1 +1,1 @@
-"""Runtime of compiled programs: JAX operations in NumPy."""
+"""Run compiled programs with JAX operations implemented in NumPy."""

@@ -1,4 +1,4 @@
-"""Controller operations for which NumPy has no function, with the semantics of :mod:`jax.lax`."""
+"""Implement controller operations for which NumPy has no function, with the semantics of :mod:`jax.lax`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -58,7 +58,7 @@ def dynamic_slice(x: Any, starts: Sequence[Any], sizes: Index) -> Any:
 
 
 def dynamic_update_slice(x: Any, block: Any, starts: Sequence[Any]) -> Any:
-    """Return a copy of ``x`` with ``block`` at a start that is clamped so that the block lies inside."""
+    """Return a copy of ``x`` with ``block`` written at a start that is clamped so that the block lies inside."""
     block, out = np.asarray(block), np.array(x)
     at = _clamped(out.shape, starts, block.shape)
     out[tuple(slice(i, i + n) for i, n in zip(at, block.shape, strict=True))] = block
@@ -85,7 +85,7 @@ def gather(
         collapsed: Axes of a slice that are dropped.
         start_map: Axis of ``x`` for each entry of an index vector.
         sizes: Size of a slice.
-        fill: Whether a slice that exceeds the array is filled with ``value``; otherwise it is moved inside.
+        fill: Whether a slice that exceeds the array is filled with ``value``; otherwise the slice is moved inside.
         value: Fill value; by default NaN, the smallest signed or largest unsigned integer, or true.
     """
     x, indices = np.asarray(x), np.asarray(indices)

@@ -1,7 +1,7 @@
-"""JAX's random numbers in NumPy: Threefry-2x32 with 20 rounds (Salmon et al. 2011), with JAX's counter layout.
+"""Draw JAX's random numbers in NumPy: Threefry-2x32 with 20 rounds (Salmon et al. 2011), with JAX's counter layout.
 
 A key consists of two 32-bit words, on the last axis. Controllers that draw random numbers, for example to simulate a
-camera, draw the same numbers in a live flight.
+camera, draw the same numbers in a live flight as in JAX.
 """
 
 from typing import Any
@@ -43,7 +43,7 @@ def split(key: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def bits(key: Any, shape: tuple[int, ...], width: int) -> Any:
-    """Return random integers of 8 to 64 bits."""
+    """Return random integers with a width of 8 to 64 bits."""
     a, b = threefry(key, *_counters(shape))
     drawn = (a ^ b).astype(f"uint{width}")
     return drawn if width < 64 else a.astype(np.uint64) << np.uint64(32) | b.astype(np.uint64)

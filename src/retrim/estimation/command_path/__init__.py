@@ -1,4 +1,4 @@
-"""A vehicle's command path, identified in flight: delay, lags, damping and gains, with their uncertainty."""
+"""Identify a vehicle's command path in flight: delay, lags, damping and gains, with their uncertainty."""
 
 from .estimate import Estimate as Estimate
 from .estimate import PathEstimate as PathEstimate

@@ -1,9 +1,9 @@
-"""Recursive sums of one channel of the command path: roll and pitch rates, yaw rate, or thrust.
+"""Compute recursive sums for one channel of the command path: roll and pitch rates, yaw rate, or thrust.
 
 A measurement is z = g h(theta) . f + D n + noise, with the features f of the commands, the response h from delay, lag
 and damping (theta), the gain g, and further features n. Sums of products of whitened features and measurements are
-sufficient for every theta at once, so that a grid does not need to be stored. Measurements enter as differences from
-the present prediction, because single precision cannot represent the small difference of large sums.
+sufficient for every theta at once, so a grid does not need to be stored. Measurements enter as differences from
+the present prediction, because single precision cannot represent the small difference between large sums.
 """
 
 import dataclasses
@@ -30,9 +30,9 @@ class Sample(eqx.Module):
     kinds: Float[Array, "kinds 2"]
     """Possible kinds of noise."""
     age: Float[Array, ""]
-    """Time since the end of the mean [s]."""
+    """Time since the end of the averaging interval [s]."""
     width: Float[Array, ""]
-    """Length of the mean [s]; zero for an instantaneous value."""
+    """Length of the averaging interval [s]; zero for an instantaneous value."""
 
 
 class Region(eqx.Module):
@@ -61,7 +61,7 @@ class PathPosterior(NamedTuple):
 
 
 class Channel(eqx.Module):
-    """Sums, and the prediction of the next measurement."""
+    """Sums of a channel, and the prediction of the next measurement."""
 
     whitening: Whitening
     products: Float[Array, "kinds axes columns columns"]

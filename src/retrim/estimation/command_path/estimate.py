@@ -1,4 +1,4 @@
-"""Estimates of the command path with their uncertainty."""
+"""Represent estimates of the command path with their uncertainty."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ class Estimate(eqx.Module):
     high: Float[Array, ""]
     """Upper end of the 90 % interval."""
     excited: Bool[Array, ""]
-    """Whether the flight has provided information: the deviation is below 60 % of that of the prior."""
+    """Whether the flight was informative for the parameter: the deviation is below 60 % of that of the prior."""
 
 
 class PathEstimate(eqx.Module):
@@ -34,18 +34,18 @@ class PathEstimate(eqx.Module):
     delay: Estimate
     """Delay of all commands [s]."""
     rate_lag: Estimate
-    """Lag of the roll and pitch rates, 2 zeta / omega_n, which is the delay of a ramp [s]."""
+    """Lag of the roll and pitch rates, 2 zeta / omega_n, which is the delay in following a ramp [s]."""
     rate_damping: Estimate
     """Damping ratio zeta of the roll and pitch rates [-]; a large value means first order."""
     rate_gain: Estimate
-    """Body rate per commanded body rate, roll and pitch [-]."""
+    """Ratio of body rate to commanded body rate, for roll and pitch [-]."""
     yaw_lag: Estimate
     """Lag of the yaw rate, defined in the same way [s]."""
     yaw_gain: Estimate
     thrust_lag: Estimate
     """First-order lag of the thrust [s]."""
     thrust_gain: Estimate
-    """Thrust per commanded thrust [-]."""
+    """Ratio of thrust to commanded thrust [-]."""
 
     def first_order(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the delay and lag [s] of the first-order path with the most similar turning response."""
@@ -72,7 +72,7 @@ def delay_estimate(posterior: PathPosterior) -> Estimate:
 
 
 def lag_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimate:
-    """Return the estimate of the lag [s], with a log-normal posterior; ``before`` is its prior deviation."""
+    """Return the estimate of the lag [s] (log-normal posterior); ``before`` is the prior deviation of its logarithm."""
     mean, deviation = _moments(posterior.cells[:, 1], posterior.weight)
     value, reach = jnp.exp(mean + 0.5 * deviation**2), NINETY * deviation
     off = value * jnp.sqrt(jnp.expm1(deviation**2))

@@ -1,4 +1,4 @@
-"""Online estimator of the command path: delay, lags, damping and gains between commands and the vehicle's motion.
+"""Estimate the command path online: delay, lags, damping and gains between commands and the vehicle's motion.
 
 Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimator.issued` with the new command, and
 :meth:`PathEstimator.accepted` if the plant accepted a different one. For a batch of ticks, call
@@ -24,8 +24,8 @@ from .noise import DIFFERENCE, DIRECT
 from .posterior import channel_before, path_posterior
 from .prior import Prior, delay_belief, full_belief
 
-SETTLING = 0.1  # [s], start of a flight, during which the thrust depends on earlier commands
-FADING = (0.03, 0.08)  # [s], time constants with which their remaining effect fades afterwards
+SETTLING = 0.1  # [s], beginning of a flight, during which the thrust depends on earlier commands
+FADING = (0.03, 0.08)  # [s], time constants with which the remaining effect of these commands fades
 
 
 class Channels(NamedTuple):
@@ -50,7 +50,7 @@ class Reading(NamedTuple):
     age: Float[Array, ""]
     """Age of the reading [s]."""
     width: float
-    """Length of the mean [s]."""
+    """Length of the averaging interval [s]."""
 
     def sample(self, axes: slice, other: Float[Array, "axes n"]) -> Sample:
         """Return the sample for some axes, with their further features."""
@@ -111,7 +111,7 @@ class PathEstimator(eqx.Module):
         return cls(rates, yaw, thrust, memory * one, dt)
 
     def init(self, x: State) -> PathState:
-        """Return the memory of a vehicle that has hovered until now, measured at ``x``."""
+        """Return the memory of a vehicle that has hovered until now and is measured at ``x``."""
         channels = Channels(
             channel_before(2, self.rates, self.dt),
             channel_before(1, self.yaw, self.dt),

@@ -1,4 +1,4 @@
-"""Grids over the delay, the logarithm of the lag, and the ringing."""
+"""Build grids over the delay, the logarithm of the lag, and the ringing."""
 
 import math
 
@@ -48,7 +48,7 @@ def moments(
 def cholesky(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Return the lower Cholesky factor of a covariance.
 
-    It is written out, since LAPACK takes longer and has no NumPy form.
+    The factorisation is written out, since a LAPACK call takes longer and has no NumPy form.
     """
     zero = jnp.zeros_like(a[0, 0])
     l00 = jnp.sqrt(a[0, 0] + TINY)

@@ -1,8 +1,8 @@
-"""Commands of the last second as features that are linear in a step response.
+"""Represent the commands of the last second as features that are linear in a step response.
 
-A command that is held over each tick is a sum of steps. Its response is therefore the sum of the steps, each times the
-step response at its age. Ages of more than half a second are joined by linear interpolation, since the response is
-smooth.
+A command that is held over each tick is a sum of steps. Its response is therefore the sum of these steps, each times
+the step response at the age of that step. Ages of more than half a second are joined by linear interpolation, since the
+response is smooth.
 """
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-SPAN = 1.2  # [s], time span of the stored commands; the response to older ones is complete
+SPAN = 1.2  # [s], time span of the stored commands; the response to older commands is complete
 SINGLE = 12  # the spacing of ages is 1/SINGLE of the age, and at least one tick
 
 
@@ -40,7 +40,7 @@ class CommandHistory(eqx.Module):
         return CommandHistory(self.commands[source])
 
     def features(self, dt: float) -> Float[Array, "4 m"]:
-        """Return, for each of the four commands, the steps at each of the :func:`ages` and the command before them."""
+        """Return, for each command entry, the steps at each of the :func:`ages` and the command before these steps."""
         newest_first = self.commands[::-1]
         steps = newest_first[:-1] - newest_first[1:]
         joined = jnp.asarray(_joining(dt), dtype=steps.dtype) @ steps
@@ -48,7 +48,7 @@ class CommandHistory(eqx.Module):
 
 
 def ages(dt: float) -> np.ndarray:
-    """Return the ages of commands for which the step response is evaluated [ticks]."""
+    """Return the ages of commands at which the step response is evaluated [ticks]."""
     last, result = round(SPAN / dt), [1]
     while result[-1] < last:
         result.append(min(result[-1] + max(1, result[-1] // SINGLE), last))

@@ -1,9 +1,9 @@
-"""Noise of a measured rate or thrust: a wandering disturbance, plus white noise or the difference of white noise.
+"""Model the noise of a rate or thrust: a wandering disturbance, plus white noise or the difference of white noise.
 
 The residual of a channel is r_k = b_k + e_k - mu e_(k-1), where the disturbance b is a random walk. A gyroscope has
 mu = 0; the difference of two noisy attitudes has mu = 1. The Kalman filter of (b, e) turns residuals into innovations,
-which are independent. It is linear, so it is applied to both commands and measurements before they are compared.
-See Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), sections 3.2 and 4.2.
+which are independent. The filter is linear, so it is applied to both commands and measurements before they are
+compared. See Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), sections 3.2 and 4.2.
 """
 
 import equinox as eqx
@@ -19,7 +19,7 @@ KINDS = len(DIRECT)
 
 
 class Whitening(eqx.Module):
-    """Memory of the Kalman filters for all kinds of noise; columns share the covariance."""
+    """Memory of the Kalman filters for all kinds of noise; all columns share the covariance."""
 
     disturbance: Float[Array, "kinds axes columns"]
     error: Float[Array, "kinds axes columns"]
@@ -60,7 +60,7 @@ class Whitening(eqx.Module):
             innovation: Result of :meth:`innovation`.
             kinds: :data:`DIRECT` or :data:`DIFFERENCE`.
             counts: Whether the row counts; otherwise only the time advances.
-            jumped: Whether the disturbance has jumped, so that nothing is known about it.
+            jumped: Whether the disturbance has jumped, and is therefore unknown.
         """
         mu, wander = kinds.T
         b, cross, error = self.spread.T

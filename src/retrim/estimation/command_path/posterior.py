@@ -1,9 +1,10 @@
-"""Posterior of one channel over delay, lag and damping, on grids that adapt to its region.
+"""Compute the posterior of one channel over delay, lag and damping, on grids that adapt to its region.
 
-Given these three, gain and noise have a conjugate posterior (normal, inverse gamma), so they are integrated in closed
-form. The grid covers the ellipsoid of the posterior of the last tick, and moves and shrinks with it. A coarse
-grid over the prior finds other regions of the posterior, for example after a change of the vehicle; it tempers the
-likelihood, since its cells are wider than the ridge. All shapes are fixed, so that nothing is recompiled.
+Given delay, lag and damping, the gain and the noise have a conjugate posterior (normal, inverse gamma), so both are
+integrated in closed form. The grid covers the ellipsoid of the last tick's posterior, and moves and shrinks with the
+posterior. A coarse grid over the prior finds other regions of the posterior, for example after a change to the vehicle.
+The coarse grid tempers the likelihood, since its cells are wider than the ridge of the likelihood. All shapes are
+fixed, so nothing is recompiled.
 """
 
 from typing import NamedTuple
@@ -21,9 +22,9 @@ from .response import mean_step_response
 TEMPER = 0.03  # share of the information that a coarse grid uses
 ELSEWHERE = 2.0  # excess of the log posterior outside the grid at which the grid moves there
 WIDER = 1.2  # factor on the covariance for the next grid, since a posterior may also widen
-COARSE = 0.35  # smallest deviation of the next grid, as a share of the spacing of this one
+COARSE = 0.35  # smallest deviation of the next grid, as a share of the spacing of the present one
 GAINS = (0.2, 5.0)  # range in which a gain is linearised
-FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the variance of the noise
+FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the noise variance
 
 
 class _Sums(NamedTuple):
@@ -129,8 +130,8 @@ def responses(
 
     Args:
         cells: Delay [s], logarithm of the lag [s], ringing.
-        age: Time since the end of the measured mean [s].
-        width: Length of the mean [s].
+        age: Time since the end of the averaging interval [s].
+        width: Length of the averaging interval [s].
         hover: Hover command; the features are differences from it.
         dt: Control tick [s].
     """

@@ -1,4 +1,4 @@
-"""Prior of a channel before a flight, and information from one channel for another."""
+"""Define the prior of a channel before a flight, and pass information from one channel to another."""
 
 from typing import NamedTuple
 
@@ -46,7 +46,7 @@ class Belief(NamedTuple):
     gain: Float[Array, ""]
     """Mean of the gain at ``mean``."""
     slope: Float[Array, "2"]
-    """Change of the mean of the gain with delay and logarithm of the lag."""
+    """Derivative of the mean of the gain with respect to the delay and the logarithm of the lag."""
     gain_spread: Float[Array, ""]
     """Standard deviation of the gain, given the other two."""
 
@@ -59,7 +59,7 @@ class GainPrior(NamedTuple):
 
 
 def delay_belief(posterior: PathPosterior, prior: Prior) -> Belief:
-    """Return the belief from a channel of another quantity: the delay, which all channels share."""
+    """Return the belief about the delay, which all channels share, from a channel of a different quantity."""
     delay = posterior.cells[:, 0]
     mean = posterior.weight @ delay
     variance = posterior.weight @ (delay - mean) ** 2

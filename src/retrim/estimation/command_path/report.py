@@ -1,4 +1,4 @@
-"""Describes the identified command path in one line."""
+"""Describe the identified command path in one line."""
 
 from jaxtyping import Array, Float
 
@@ -10,7 +10,7 @@ def describe_path(estimate: PathEstimate, declared: tuple[float, float] | None =
 
     Args:
         estimate: Identified command path.
-        declared: Command delay and rate lag of the vehicle file [s]; None if the file does not state them.
+        declared: Command delay and rate lag from the vehicle file [s]; None if the file does not state them.
     """
     thrust = "thrust gain " + _text(estimate.thrust_gain)
     if not (bool(estimate.delay.excited) and bool(estimate.rate_lag.excited)):

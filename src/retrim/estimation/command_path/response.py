@@ -1,7 +1,7 @@
-"""Response of a second-order lag to a step of its command, as a function of time.
+"""Compute the response of a second-order lag to a step of its command, as a function of time.
 
-The transfer function is 1 / (1 + tau s + kappa tau^2 s^2): tau = 2 zeta / omega_n is the delay of a ramp, and
-kappa = 1 / (4 zeta^2). A first-order lag has kappa = 0. The coordinate ``ringing`` = kappa / (kappa + 1/2) =
+The transfer function is 1 / (1 + tau s + kappa tau^2 s^2): tau = 2 zeta / omega_n is the delay in following a
+ramp, and kappa = 1 / (4 zeta^2). A first-order lag has kappa = 0. The coordinate ``ringing`` = kappa / (kappa + 1/2) =
 1 / (1 + 2 zeta^2) covers all shapes in [0, 1): 0 is first order, 1/3 is critical damping.
 """
 
@@ -35,8 +35,8 @@ def mean_step_response(
     """Return the mean of the step response over the ``width`` seconds that end at ``t``.
 
     Args:
-        t: Time since the step [s]; the response before it is zero.
-        width: Length of the mean [s]; zero for the value at ``t``.
+        t: Time since the step [s]; the response before the step is zero.
+        width: Length of the averaging interval [s]; zero for the value at ``t``.
         lag: Time constant tau [s].
         ringing: Shape of the response; see the module docstring.
     """
@@ -69,8 +69,8 @@ def _step_and_ramp(
 def first_order_equivalent(delay: Any, lag: Any, damping: Any) -> tuple[Any, Any]:
     """Return the delay and lag [s] of the first-order path with the step response nearest to a second-order path's.
 
-    Both have the same sum of delay and lag. The share of the lag is a fit to the least squared difference of the step
-    responses for damping ratios from 0.3 to infinity.
+    Both paths have the same sum of delay and lag. The share of the lag is fitted to minimise the squared difference
+    between the step responses, for damping ratios from 0.3 to infinity.
     """
     ringing = ringing_of(damping)
     share = jnp.interp(ringing, *(jnp.asarray(x, ringing.dtype) for x in (SHARE_AT, SHARE)))

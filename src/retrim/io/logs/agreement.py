@@ -1,7 +1,8 @@
 """Measures how well the quantities in a log agree with each other.
 
-The velocity is the derivative of the position. The acceleration lies along the thrust axis and follows the thrust. The
-rotation follows the commanded rates and equals the measured ones. Wind, drag and lags leave a remainder in every log.
+The velocity should be the derivative of the position. The acceleration should lie along the thrust axis and follow the
+thrust. The rotation should follow the commanded rates and equal the measured rates. Wind, drag and lags leave a
+remainder in every log.
 """
 
 import math
@@ -31,7 +32,7 @@ CLAIMS: Mapping[str, str] = {
 
 
 def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, float]:
-    """Return the agreement figures, where 1 is complete agreement; a figure is absent without enough motion."""
+    """Return the agreement figures, where 1 is complete agreement; a figure is absent if there is too little motion."""
     k = max(1, round(SMOOTH / ticks.dt))
     both = np.convolve(valid, np.ones(k + 1), mode="valid") > k
     if both.sum() < 2 * k:
@@ -88,7 +89,7 @@ def _lift(felt: np.ndarray, axis: np.ndarray) -> float:
 def _with_signs(
     score: float, x: np.ndarray, by: np.ndarray, least: float, agree: Callable[[np.ndarray, np.ndarray], float]
 ) -> float:
-    """Return the agreement of all axes, or that of a wrong-signed axis whose motion exceeds ``least``."""
+    """Return the agreement of all axes, or the agreement of a wrong-signed axis whose motion exceeds ``least``."""
     axes = [(p, q) for p, q in zip(x.T, by.T, strict=True) if min(_size(p), _size(q)) > least]
     return min([score, *(result for p, q in axes if (result := agree(p, q)) < AGAINST)])
 

@@ -18,18 +18,18 @@ from .thrust_map import mass_normalised
 
 @dataclass(frozen=True)
 class FlightLog:
-    """A flight on one clock; world ENU, body forward-left-up."""
+    """A flight on one clock, with world axes east-north-up and body axes forward-left-up."""
 
     t: np.ndarray
     """Times from the beginning [s], (n,), one tick apart."""
     p: np.ndarray
-    """Position, world [m], (n, 3)."""
+    """Position in the world frame [m], (n, 3)."""
     R: np.ndarray
     """Attitude, body to world, (n, 3, 3)."""
     v: np.ndarray
-    """Velocity, world [m/s], (n, 3)."""
+    """Velocity in the world frame [m/s], (n, 3)."""
     a: np.ndarray
-    """Acceleration, the derivative of v, world [m/s^2], (n, 3)."""
+    """Acceleration in the world frame, the derivative of v [m/s^2], (n, 3)."""
     c: np.ndarray
     """Commanded collective thrust, mass-normalised [m/s^2], (n,)."""
     rates: np.ndarray
@@ -37,15 +37,15 @@ class FlightLog:
     command: np.ndarray | None
     """Commanded body rates [rad/s], (n, 3); None if the log does not contain them."""
     valid: np.ndarray
-    """Ticks at which the vehicle flies and all of these quantities are known, (n,)."""
+    """Ticks at which the vehicle flies and all quantities are known, (n,)."""
     dt: float
     """Tick [s]."""
     full_thrust: float | None
-    """Acceleration at full thrust [m/s^2], if the commanded thrust is a share of it."""
+    """Acceleration at full thrust [m/s^2], if the commanded thrust is a share of full thrust."""
     notes: tuple[str, ...]
     """Notes on findings and excluded parts; doubtful findings come first."""
     agreement: Mapping[str, float] = field(default_factory=dict)
-    """Agreement of the log's quantities, where 1 is complete; see :data:`retrim.io.logs.agreement.CLAIMS`."""
+    """Agreement of the log's quantities, where 1 is complete agreement; see :data:`retrim.io.logs.agreement.CLAIMS`."""
     warnings: tuple[str, ...] = ()
     """Warnings about agreement that is too low for reliable results."""
 

@@ -1,4 +1,4 @@
-"""Detects a vehicle on the ground: it does not move although its thrust is below hover thrust."""
+"""Detects when a vehicle is on the ground: its thrust is below hover thrust, but it does not move."""
 
 import numpy as np
 

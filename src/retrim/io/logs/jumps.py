@@ -27,7 +27,7 @@ def jumps_of(ticks: Ticks, name: str) -> np.ndarray:
 
 
 def stands_out(steps: np.ndarray, known: np.ndarray, least: float) -> np.ndarray:
-    """Return the steps that differ from those before and after by more than the noise.
+    """Return the steps that differ from the steps before and after them by more than the noise.
 
     Args:
         steps: Steps per unit of time, (n, columns).

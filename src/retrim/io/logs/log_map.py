@@ -1,4 +1,4 @@
-"""Maps a log's fields to quantities, units and frames, in a small TOML file.
+"""Maps a log's fields to quantities, units and frames, using a small TOML file.
 
 A field may have a sign, for example ``-pitch``. It may have alternatives, for example
 ``stabilizer.thrust|controller.cmd_thrust``; the first one in the log is used.
@@ -15,7 +15,7 @@ STRICT = ConfigDict(extra="forbid")
 
 
 def check_flag(name: str) -> str:
-    """Return a flag if it is valid: the name of a field that is not zero when set, or ``field==number``."""
+    """Return a flag if it is valid: the name of a field that is non-zero when set, or ``field==number``."""
     _, sign, number = name.partition("==")
     if sign:
         try:
@@ -58,7 +58,7 @@ class Position:
     fields: Fields
     unit: Literal["m", "cm", "mm"] = "m"
     valid: Flags = ()
-    """Fields that are not zero while the samples are valid, if the log contains them."""
+    """Fields that are non-zero while the samples are valid, if the log contains them."""
     resets: Flags = ()
     """Counters that change when the estimator resets, if the log contains them."""
 
@@ -80,7 +80,7 @@ class Attitude:
 
     fields: Fields
     form: Literal["xyzw", "wxyz", "matrix", "roll pitch yaw", "rotation vector"]
-    """Quaternion order; rotation matrix, row by row; angles about the x, y and z axes; or an axis times an angle."""
+    """Quaternion order, a rotation matrix (row by row), angles about the x, y and z axes, or an axis times an angle."""
     unit: Literal["rad", "deg"] = "rad"
     """Unit of angles."""
     turns: Literal["body to world", "world to body"] = "body to world"
@@ -99,18 +99,18 @@ class Thrust:
 
     fields: Fields
     unit: Literal["m/s^2", "g", "N", "share"]
-    """Mass-normalised (m/s^2 or g); in newtons; or a share on the autopilot's own scale."""
+    """m/s^2 or g for a mass-normalised thrust, N for newtons, or a share on the autopilot's own scale."""
     positive: Literal["up", "down"] = "up"
     mass: Positive | None = None
     """Mass [kg], for the unit N."""
     hover: Positive | Name | None = None
     """For a share: the value at hover, or the field that contains it; by default it is estimated from the flight."""
     full: Positive = 1.0
-    """For a share: the number for full thrust, for example 65535."""
+    """For a share: the number that means full thrust, for example 65535."""
 
     @property
     def scale(self) -> float | None:
-        """Mass-normalised thrust of one unit [m/s^2]; None for a share, which the flight or ``hover`` scales."""
+        """Mass-normalised thrust of one unit [m/s^2]; None for a share, scaled by the flight or ``hover``."""
         return {"m/s^2": 1.0, "g": ACCELERATIONS["g"], "N": 1.0 / (self.mass or 1.0)}.get(self.unit)
 
     @property
@@ -152,14 +152,14 @@ class Acceleration:
 
 @dataclass(frozen=True, config=STRICT)
 class Landed:
-    """Fields that are not zero while the vehicle is on the ground, if the log contains them."""
+    """Fields that are non-zero while the vehicle is on the ground, if the log contains them."""
 
     fields: Flags
 
 
 @dataclass(frozen=True, config=STRICT)
 class Frames:
-    """The log's axes; three letters for the directions of x, y and z."""
+    """The log's world and body axes; three letters give the directions of x, y and z."""
 
     world: World = "ENU"
     """ENU (east, north, up), NED, NWU, or for example EUS if y points up; the direction of north is arbitrary."""
@@ -175,7 +175,7 @@ class Frames:
 
 @dataclass(frozen=True, config=STRICT)
 class Part:
-    """The part of the log to use, in time from its beginning [s]."""
+    """The part of the log to use; times count from the beginning of the log [s]."""
 
     start: Seconds = 0.0
     end: Seconds | None = None
@@ -188,9 +188,9 @@ class LogMap:
     attitude: Attitude
     thrust: Thrust
     position: Position | None = None
-    """Without it, positions are integrated from the velocities."""
+    """Without this table, positions are integrated from the velocities."""
     velocity: Velocity | None = None
-    """Without it, velocities are the smoothed derivatives of the positions."""
+    """Without this table, velocities are the smoothed derivatives of the positions."""
     rates: BodyRates | None = None
     """Commanded body rates."""
     measured_rates: BodyRates | None = None

@@ -13,7 +13,7 @@ QUANTITIES = ("position", "velocity", "attitude")
 
 @dataclass(frozen=True)
 class Marks:
-    """Marks on the ticks of a grid."""
+    """An autopilot's marks at the ticks of a grid."""
 
     holds: Mapping[str, np.ndarray]
     """Ticks at which a quantity is valid, (n,); quantities without flags are absent."""
@@ -55,6 +55,6 @@ def _around(series: Series, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _true(values: np.ndarray, field: str) -> np.ndarray:
-    """Return where a flag is set: it is not zero, or equals the number in its field, for example ``state==1``."""
+    """Return where a flag is set: it is non-zero, or equals the number in its field, for example ``state==1``."""
     number = field.partition("==")[2]
     return np.asarray(values == float(number) if number else values != 0.0)

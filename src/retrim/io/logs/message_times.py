@@ -1,4 +1,4 @@
-"""Determines the times of the messages in a bag, on one clock; their own stamps are used if they exist."""
+"""Determines the times of the messages in a bag, on one clock; message stamps are used if they exist."""
 
 from collections.abc import Mapping
 from operator import attrgetter
@@ -46,8 +46,8 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
     """Return each topic's times on one clock, and notes.
 
     For a topic whose messages have no stamps, the times of reception are used. Other topics may have stamps from a
-    different clock, for example an autopilot's uptime. They are then shifted to the recorder's clock by their earliest
-    messages.
+    different clock, for example an autopilot's uptime. All stamps are then shifted to the recorder's clock, by
+    the delay of each topic's messages that did not wait.
 
     Args:
         stamps: Stamp (NaN if absent) and time of reception of each message [s], (n, 2), by topic.
@@ -73,7 +73,7 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
 
 
 def evenly(received: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the send times of messages with an even rate, plus the shortest delay, and whether the rate is even.
+    """Return the send times (plus the shortest delay) of messages with an even rate, and whether the rate is even.
 
     A message may be late but never early. The neighbour with the shortest delay therefore determines the send times of
     the messages around it. If the rate is not even, or if messages are lost, the times of reception are returned.

@@ -1,4 +1,4 @@
-"""Named maps for logs from retrim and common autopilots, as TOML files in the folder ``maps``."""
+"""Reads named maps for logs from retrim and common autopilots, from TOML files in the folder ``maps``."""
 
 import tomllib
 from functools import cache

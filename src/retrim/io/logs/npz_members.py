@@ -1,4 +1,4 @@
-"""Arrays in an NPZ file; each is read when it is accessed, after its size is checked."""
+"""Reads arrays from an NPZ file; each array is read when it is accessed, after a check of its size."""
 
 import math
 import zipfile

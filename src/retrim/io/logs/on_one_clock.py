@@ -1,4 +1,4 @@
-"""Applies a map to series: states and commands on one clock, in retrim's frames and units."""
+"""Applies a map to series, and gives states and commands on one clock, in retrim's frames and units."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it change
 
 @dataclass(frozen=True)
 class Ticks:
-    """A log on one clock; world ENU, body forward-left-up."""
+    """A log on one clock, with world axes east-north-up and body axes forward-left-up."""
 
     t: np.ndarray
     p: np.ndarray
@@ -38,11 +38,11 @@ class Ticks:
     """Upward thrust in the map's unit; a share is not converted."""
     command: np.ndarray | None
     known: np.ndarray
-    """Ticks at which all of these quantities are known."""
+    """Ticks at which all quantities are known."""
     hover: np.ndarray | None
     dt: float
     gyroscope: bool
-    """Whether the rates are measured, not derived from the attitudes."""
+    """Whether the rates are measured rather than derived from the attitudes."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Grid:
     t: np.ndarray
     dt: float
     sampled: bool
-    """Whether these are the original times of the states."""
+    """Whether the grid's times are the original times of the states."""
 
 
 def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -> Grid:
@@ -142,7 +142,7 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
 
 
 def _speed(log_map: LogMap) -> float:
-    """Return the m/s per unit of velocity; a velocity that is not in the log uses the position's unit."""
+    """Return the factor from the velocity's unit to m/s; a velocity that is not in the log has the position's unit."""
     if log_map.velocity is not None:
         return maps.SPEEDS[log_map.velocity.unit]
     return 1.0 if log_map.position is None else maps.METRES[log_map.position.unit]

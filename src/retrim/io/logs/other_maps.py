@@ -1,4 +1,4 @@
-"""Generates maps that differ from a given one in one statement, with a text: candidates for the intended map."""
+"""Generates candidates for the intended map: maps that differ from a given map in one statement, each with a text."""
 
 import dataclasses
 import math

@@ -1,8 +1,8 @@
 """Checks a log's consistency, and finds mistakes in its map's units, frames and signs.
 
 If figures from :mod:`retrim.io.logs.agreement` are low, every map that differs in one statement is tried. If the log
-agrees far better with one of them, the error names that map. A log that is inconsistent with every map is refused. A
-log with low agreement is read, but with a warning.
+agrees far better with one of these maps, the error names this map. A log that is inconsistent with every map is
+refused. A log with low agreement is read, but with a warning.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def check_plausible(
         valid: Mask of the ticks that are used.
 
     Returns:
-        The agreement figures, where 1 is complete agreement, and a warning for each low one.
+        The agreement figures, where 1 is complete agreement, and a warning for each low figure.
 
     Raises:
         LogError: The quantities do not agree; the message names the wrong statement in the map, if there is one.
@@ -61,7 +61,7 @@ def check_plausible(
 
 
 def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.ndarray) -> str:
-    """Return the error and the map statement that corrects it best; an empty string if no statement does."""
+    """Return the error and the map statement that corrects it best; an empty string if no statement corrects it."""
     part = _part(valid)
     ticks = read(Other("", chosen, {}), part)
     scores = agreement(chosen, ticks, valid[part])
@@ -84,7 +84,7 @@ def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.nda
 
 
 def _part(valid: np.ndarray) -> slice:
-    """Return the part of a long log with the most flight data; it is sufficient to check a map."""
+    """Return the part of a long log that contains the most flight data; this part is sufficient to check a map."""
     if len(valid) <= PART:
         return slice(0, len(valid))
     flight = np.concatenate([[0], np.cumsum(valid)])

@@ -1,4 +1,4 @@
-"""Reads the quantities in a map from a file: series in order of time, and the map that was used."""
+"""Reads a map's quantities from a file, as series in order of time."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +42,7 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
     """Return a log's series, the map that was used to read it, and notes.
 
     In addition to the quantities, the series include ``<quantity> valid <k>``, ``<quantity> resets <k>`` and
-    ``landed <k>``, and a derived velocity if the log has none.
+    ``landed <k>``, and a derived velocity if the log contains none.
 
     Raises:
         LogError: The file cannot be read, or a field is missing.
@@ -130,7 +130,7 @@ def _clock(chosen: LogMap) -> Clock | None:
 
 
 def _valid(series: dict[str, Series], name: str) -> Series:
-    """Return the samples of a quantity without those that its flags mark as invalid at the same time."""
+    """Return a quantity's samples, except those at times that its flags mark as invalid."""
     result = series[name]
     keep = np.ones(len(result.t), dtype=bool)
     for other, flag in series.items():

@@ -20,7 +20,7 @@ FRAME = "world"
 
 @dataclass(frozen=True)
 class Recording:
-    """Ticks and events of a flight; a state consists of p [m], R row by row, and v [m/s], world."""
+    """Ticks and events of a flight; a state consists of p [m], R (row by row) and v [m/s], in the world frame."""
 
     t: np.ndarray
     """Times from the start [s], (n,)."""
@@ -35,7 +35,7 @@ class Recording:
     error: np.ndarray
     """The task's error [m], (n,)."""
     target: np.ndarray | None = None
-    """The vehicle's target position, world [m], (n, 3)."""
+    """The vehicle's target position in the world frame [m], (n, 3)."""
     flown_by: Sequence[str] | None = None
     """Name of the controller that commanded the vehicle, (n,)."""
     policy_age: np.ndarray | None = None
@@ -58,7 +58,7 @@ def write_mcap(path: Path, flight: Recording) -> None:
     """Write ROS 2 messages; the file appears once it is complete.
 
     Times are those of the flight. If the first states were measured before the flight began, all times are shifted
-    later. Stamps are then neither negative nor zero; ROS readers treat zero as a missing stamp.
+    later, so that stamps are neither negative nor zero; ROS readers treat a zero stamp as missing.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -107,7 +107,7 @@ def quaternions(x: np.ndarray) -> np.ndarray:
 
 
 class _Messages:
-    """Builds ROS 2 messages; a command has the thrust in linear.z [m/s^2] and the body rates in angular [rad/s]."""
+    """Builds ROS 2 messages; the thrust command is in linear.z [m/s^2] and the body rates are in angular [rad/s]."""
 
     def __init__(self, types: Any) -> None:
         self._types = types

@@ -1,6 +1,6 @@
-"""Writes a flight as a file for the rerun viewer: the vehicle in 3-D, and plots of errors, commands and events.
+"""Writes a flight for the rerun viewer, which shows the vehicle in 3-D and plots errors, commands and events.
 
-It needs the extra ``rerun``. All data are on one timeline, ``flight``, in seconds from the start of the flight.
+Writing needs the extra ``rerun``. All data are on one timeline, ``flight``, in seconds from the start of the flight.
 """
 
 import tempfile

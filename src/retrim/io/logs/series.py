@@ -1,4 +1,4 @@
-"""Columns from a log with their recorded times."""
+"""Defines a log's columns with their recorded times, and the interface for readers."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,12 +41,12 @@ class LogReader(Protocol):
         Args:
             path: The file, or a bag's folder.
             wanted: Field names for each quantity, in the format's notation. A field may contain several numbers. A
-                minus sign may precede its name, and alternatives may follow it; see :func:`first_of`.
+                minus sign may precede a name, and alternatives may follow the name; see :func:`first_of`.
             time: Time field; None for the format's own times.
             optional: Quantities that are left out if the log does not contain them.
 
         Returns:
-            Each quantity, and notes on excluded data.
+            Each quantity's series, and notes on excluded data.
 
         Raises:
             LogError: The file cannot be read, or a field is missing.

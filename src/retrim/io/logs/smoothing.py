@@ -12,13 +12,13 @@ from .series import Series
 
 FEWEST, WIDEST = 2, 0.15  # half-width of a window: smallest number of samples, and longest time [s]
 QUIET = 0.3  # noise in the second derivative at which a window is wide enough [m/s^2]
-PROBES, CHUNK = 2000, 4096  # number of samples to choose the window with, and number that are fitted at a time
+PROBES, CHUNK = 2000, 4096  # number of samples used to choose the window, and number fitted at a time
 
 
 def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     """Return the derivative of positions, and a note on its window and noise.
 
-    A cubic is fitted to the samples around each sample. The window is centred, so that the derivative has no lag. It is
+    A cubic is fitted to the samples around each sample. The window is centred, so the derivative has no lag. It is
     the shortest window for which the noise in the second derivative is at most ``QUIET``, but it extends by at most
     ``WIDEST`` to each side.
 

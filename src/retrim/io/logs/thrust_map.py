@@ -1,4 +1,4 @@
-"""Converts a log's thrust to the model's: mass-normalised, with the acceleration at full thrust."""
+"""Converts a log's thrust to mass-normalised thrust, and determines the acceleration at full thrust."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ LEAST = 1e-9  # thrust share below which a number is not a command
 def mass_normalised(
     path: Path, spec: Thrust, ticks: Ticks, valid: np.ndarray
 ) -> tuple[np.ndarray, float | None, list[str]]:
-    """Return the thrust [m/s^2], the acceleration at full thrust if the thrust was a share, and notes.
+    """Return the thrust [m/s^2], the acceleration at full thrust if the log's thrust is a share, and notes.
 
     Raises:
         LogError: The thrust is zero throughout, acts against the acceleration, or is not positive at hover.

@@ -21,8 +21,8 @@ def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
     """Return a series with increasing times and finite values, and notes on excluded samples.
 
     Messages are logged when they arrive. A state is logged again until a newer one arrives, and errors in reading the
-    clock can give it an older time. One thread may overtake another, and a stamp may never be set. Samples with such
-    faults are left out.
+    clock can give the copy an older time. One thread may overtake another, and a stamp may never be set. Samples with
+    such faults are left out.
 
     Raises:
         LogError: Times decrease or are constant, or no sample remains.

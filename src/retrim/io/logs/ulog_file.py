@@ -25,8 +25,8 @@ def read_ulog(
 ) -> tuple[dict[str, Series], list[str]]:
     """Read topics from a ULog; see :class:`~retrim.io.logs.series.LogReader`.
 
-    Times come from the map's time field if the topic has it. Otherwise they are the topic's sample times, if available,
-    or its message times.
+    Times come from the map's time field if the topic contains this field. Otherwise, the topic's sample times are used
+    if available, and its message times if not.
     """
     if find_spec("pyulog") is None:
         raise LogError(f"{path}: a ULog needs pyulog: pip install 'retrim[logs]'")

@@ -1,4 +1,4 @@
-"""Recordings for external viewers, by file suffix."""
+"""Writes recordings for external viewers, in the format that the file suffix gives."""
 
 import os
 from collections.abc import Callable, Mapping

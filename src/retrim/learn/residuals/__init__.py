@@ -1,4 +1,4 @@
-"""Models of the residual acceleration, one per file, which follow the protocol in :mod:`.model`."""
+"""Models of the residual acceleration, one per file; each follows the protocol in :mod:`.model`."""
 
 from .ensemble import EnsembleModel as EnsembleModel
 from .ensemble import EnsembleResidual as EnsembleResidual

@@ -15,7 +15,7 @@ from .targets import Targets
 
 
 class EnsembleResidual(eqx.Module):
-    """Mean of ``members`` ReLU networks 19-128-128-3 on x and u, in the world frame [m/s^2].
+    """Mean prediction of ReLU networks (19-128-128-3) with the inputs x and u, in the world frame [m/s^2].
 
     ``offset`` and ``scale`` bring the 19 inputs to order one. Positions are relative to the task's origin, and thrust
     is mass-normalised. Offset and scale are the same in fitting, simulation and flight, and are never trained.
@@ -36,7 +36,7 @@ class EnsembleResidual(eqx.Module):
         members: int = 3,
         hidden: tuple[int, ...] = (128, 128),
     ) -> "EnsembleResidual":
-        """Return fresh networks that differ in their seeds; the last layer is zero, so that they predict zero."""
+        """Return fresh networks that differ in their seeds; their last layers are zero, so they predict zero."""
         sizes = (19, *hidden, 3)
 
         def member(key: Key[Array, ""]) -> tuple[eqx.nn.Linear, ...]:
@@ -92,10 +92,10 @@ class EnsembleState(eqx.Module):
 
 
 class EnsembleModel(eqx.Module):
-    """The ensemble as a :class:`retrim.learn.ResidualModel`, fitted by Adam with moments carried from fit to fit."""
+    """The ensemble as a :class:`retrim.learn.ResidualModel`, fitted by Adam; its moments carry over to the next fit."""
 
     origin: Float[Array, "3"]
-    """Task origin, world [m]; positions are taken relative to it."""
+    """Task origin in the world frame [m]; positions are taken relative to it."""
     omega_max: Float[Array, "3"]
     """Largest body rates [rad/s]; rates are divided by them."""
     learning_rate: Float[Array, ""]

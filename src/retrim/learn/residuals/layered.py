@@ -1,4 +1,4 @@
-"""An ensemble on the remainder of the closed form, weighted by the share of its prediction that flight confirms."""
+"""Fit an ensemble to the remainder of the closed form, weighted by the share of its prediction that flight confirms."""
 
 from typing import Any
 
@@ -36,12 +36,12 @@ class LayeredState(eqx.Module):
 
 
 class LayeredModel(eqx.Module):
-    """A closed form and an ensemble, as a :class:`retrim.learn.ResidualModel`.
+    """A closed form with an ensemble on top, as a :class:`retrim.learn.ResidualModel`.
 
     The ensemble is fitted to the remainder of the closed form, and only to rows since the last change. Before each fit,
     its prediction for the newest rows, which were not in its training data, is compared with their remainder. The
     remainder is regressed on the prediction; the coefficient, between 0 and 1, is the share of the prediction that is
-    used. An ensemble that was fitted across a change, or without useful data, therefore does not make the layer below
+    used. An ensemble that was fitted across a change, or without useful data, therefore does not make the closed form
     worse. Noise could pass this test, since velocity noise enters both the input and the target. But noise jumps from
     tick to tick, and the share decreases with the part of the remainder that jumps. Where members disagree, the mean is
     shrunk, per axis, by the factor mean^2 / (mean^2 + spread^2).
@@ -56,7 +56,7 @@ class LayeredModel(eqx.Module):
         return LayeredState(self.first.init(key), self.second.init(key), nothing, nothing, nothing)
 
     def fit(self, state: LayeredState, rows: Targets) -> tuple[LayeredState, Float[Array, ""]]:
-        """Fit the closed form, weight the ensemble by its last prediction, and fit it to the remainder.
+        """Fit the closed form, weight the ensemble by its last prediction, and fit the ensemble to the remainder.
 
         Returns:
             The new state, and the weighted error of the joint prediction [m/s^2].

@@ -9,7 +9,7 @@ from ...physics.state import STANDARD_GRAVITY, Command, State, where
 from .targets import Targets
 
 SIZE = 19
-"""Number of features: one (1), velocity (3), attitude (9), thrust beyond hover along its axis (3), body rates (3)."""
+"""Number of features: constant (1), velocity (3), attitude (9), thrust vector beyond hover (3), body rates (3)."""
 STEEP = 3.0 / STANDARD_GRAVITY  # [s^2/m], scales thrust beyond hover to the size of the other features
 
 
@@ -32,7 +32,7 @@ class LinearModel(eqx.Module):
 
     The weights of attitude-dependent wind, drag and thrust-map errors can only be distinguished by flight in many
     attitudes, which takes longer than a window. The information from each window is therefore added to that from
-    earlier ones. The model predicts seconds ahead. For a recent change, use the closed form of
+    earlier windows. The model predicts seconds ahead. For a recent change, use the closed form of
     :class:`~retrim.learn.residuals.regression.RegressionModel`, which has a short memory.
     """
 
@@ -41,7 +41,7 @@ class LinearModel(eqx.Module):
     noise: Float[Array, ""]
     """Standard deviation of one row of targets [m/s^2]."""
     memory: Float[Array, ""]
-    """Age at which a row's weight is 1/e of that of the newest row [s]."""
+    """Age at which a row's weight is 1/e of the newest row's weight [s]."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
     every: float = eqx.field(static=True)
@@ -49,7 +49,7 @@ class LinearModel(eqx.Module):
 
     @classmethod
     def of(cls, dt: float, *, every: float, memory: float = 20.0, noise: float = 0.5) -> "LinearModel":
-        """Return the model.
+        """Return the model with default priors.
 
         Args:
             dt: Control tick [s].
@@ -95,7 +95,7 @@ class LinearModel(eqx.Module):
         return LinearState(precision, moment, weights, covariance, fits)
 
     def predict(self, state: LinearState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the mean prediction, world frame [m/s^2]."""
+        """Return the mean prediction in the world frame [m/s^2]."""
         return features_of(x, u) @ state.weights
 
     def spread(self, state: LinearState, x: State, u: Command) -> Float[Array, "3"]:
@@ -105,6 +105,6 @@ class LinearModel(eqx.Module):
 
 
 def features_of(x: State, u: Command) -> Float[Array, "19"]:
-    """Return the features, which are all of about order one in flight."""
+    """Return the features, which are all of order one in flight."""
     thrust = STEEP * (u.c - STANDARD_GRAVITY) * x.R[:, 2]
     return jnp.concatenate([jnp.ones(1, dtype=x.p.dtype), x.v, x.R.reshape(9), thrust, u.omega])

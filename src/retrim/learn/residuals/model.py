@@ -22,7 +22,7 @@ class ResidualModel(Protocol):
     """
 
     def init(self, key: Key[Array, ""]) -> Any:
-        """Return the state before the first fit; it must predict zero. The key is consumed."""
+        """Return the state before the first fit; this state must predict zero. The key is consumed."""
         ...
 
     def fit(self, state: Any, rows: Targets) -> tuple[Any, Float[Array, ""]]:
@@ -34,7 +34,7 @@ class ResidualModel(Protocol):
         ...
 
     def predict(self, state: Any, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the predicted residual acceleration, world frame [m/s^2]."""
+        """Return the predicted residual acceleration in the world frame [m/s^2]."""
         ...
 
 
@@ -51,5 +51,5 @@ class FittedResidual(eqx.Module):
         return None if turning is None else turning(self.state)
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the predicted residual acceleration, world frame [m/s^2]."""
+        """Return the predicted residual acceleration in the world frame [m/s^2]."""
         return self.model.predict(self.state, x, u)

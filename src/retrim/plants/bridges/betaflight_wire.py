@@ -7,20 +7,20 @@ import numpy as np
 from ...errors import MessageError
 
 MOTORS, STATE, STICKS, CLI = 9002, 9003, 9004, 5761  # ports: the board sends motors, and listens on the others
-CENTRE, SPAN, LOW, HIGH = 1500, 500, 1000, 2000  # [us] of a stick
+CENTRE, SPAN, LOW, HIGH = 1500, 500, 1000, 2000  # [us], stick positions
 THROTTLE_FROM, THROTTLE_SPAN = 1050.0, 950.0  # [us]: start and length of the throttle range
-IDLE = 0.055  # smallest share of a motor's range while it is armed
+IDLE = 0.055  # smallest share of a motor's range while the board is armed
 CHANNELS, ARM = 16, 4  # number of receiver channels, and index of the one that arms
 GYRO = np.array([1.0, -1.0, -1.0])  # from forward-left-up body rates
 RATE_STICKS = np.array([1.0, 1.0, -1.0])  # roll, pitch and yaw up, from forward-left-up body rates
-OUR_ROTORS = [0, 1, 3, 2]  # its motors are front-right, back-left, front-left, back-right; our last two are swapped
+OUR_ROTORS = [0, 1, 3, 2]  # the board's are front-right, back-left, front-left, back-right; our last two are swapped
 _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct.Struct("<4f")
 
 
 def state_packet(omega: np.ndarray) -> bytes:
     """Return a packet with body rates; a board in rate mode ignores all other values.
 
-    The time stamp is constant, so that the board uses its own clock, which the jitter of varying stamps would disturb.
+    The time stamp is constant, so the board uses its own clock, which the jitter of varying stamps would disturb.
 
     Args:
         omega: Body rates, forward-left-up [rad/s].
@@ -36,7 +36,7 @@ def sticks_packet(throttle: float, omega: np.ndarray, fastest: float, *, armed: 
         throttle: Throttle, 0 to 1; at 0 the stick is at its lower end, which arming requires.
         omega: Body rates, forward-left-up [rad/s].
         fastest: Body rate at full stick [rad/s].
-        armed: Whether the switch is on.
+        armed: Whether the arming switch is on.
     """
     roll, pitch, yaw = np.clip(CENTRE + SPAN * RATE_STICKS * omega / fastest, LOW, HIGH).round().astype(int)
     up = round(float(np.clip(THROTTLE_FROM + THROTTLE_SPAN * throttle, LOW, HIGH))) if throttle > 0.0 else LOW
@@ -60,7 +60,7 @@ def motors_of(packet: bytes) -> np.ndarray:
 
 
 def throttle_of(motor: float) -> float:
-    """Return the throttle, 0 to 1, at which all motors are at ``motor``."""
+    """Return the throttle, 0 to 1, at which every motor command is ``motor``."""
     return float(np.clip((motor - IDLE) / (1.0 - IDLE), 0.0, 1.0))
 
 

@@ -24,11 +24,11 @@ from .vehicle_state import VehicleState
 GROUND = 0.0  # [m]
 HOST = "127.0.0.1"
 STICKS_EVERY = 5  # [ms] between receiver packets
-BEHIND = 0.02  # [s], largest delay that the world still catches up
+BEHIND = 0.02  # [s], largest delay that the world still makes up for
 
 
 class MotorListener:
-    """Receives motor commands, but only from the first sender of valid ones."""
+    """Receives motor commands, but only from the first sender of valid commands."""
 
     def __init__(self, port: int = MOTORS) -> None:
         """Open the port.
@@ -72,18 +72,18 @@ class MotorListener:
 
 
 class World:
-    """A vehicle on a stand or in free flight, simulated by a thread; other threads may call its methods."""
+    """A vehicle on a stand or in free flight, simulated in a thread; other threads may call the methods."""
 
     def __init__(self, model: BemQuadrotor, disturbance: Disturbance, fastest: float) -> None:
         """Build a world with the vehicle on the stand, and open the sockets.
 
         Args:
-            model: The vehicle; its rate controller is not used.
+            model: The vehicle; the model's rate controller is not used.
             disturbance: External effects, as a function of the time since the release [s] and the state.
             fastest: Body rate at full stick [rad/s].
 
         Raises:
-            PlantError: The port of the motors is in use.
+            PlantError: The port for motor commands is in use.
         """
         self._model, self._fastest = model, fastest
         self._ears = MotorListener()
@@ -160,7 +160,7 @@ class World:
 
 
 def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
-    """Return a vehicle at rest with spinning rotors; its leaves have the types that a step returns."""
+    """Return a vehicle at rest with spinning rotors; the leaves have the types that a step returns."""
     s: BemState = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), model.init(x))
     return s
 

@@ -1,4 +1,4 @@
-"""Mapping from a remote machine's clock to this machine's clock."""
+"""Map a remote machine's clock to this machine's clock."""
 
 from collections import deque
 
@@ -6,7 +6,7 @@ import numpy as np
 
 KEPT = 10  # exchanges
 ENOUGH = 3  # smallest number of exchanges for an estimate of the rate
-APART = 0.03  # [s], smallest standard deviation of their times for an estimate of the rate
+APART = 0.03  # [s], smallest standard deviation of the exchange times for an estimate of the rate
 SLIP = 3e-3  # [s], largest deviation in excess of the error bound by the round trip
 JITTER = 1e-4  # [s], of the quickest exchange
 WINDOW_S = 2.0  # [s] in which at least one message is assumed to arrive without a delay
@@ -17,7 +17,7 @@ class RemoteClock:
 
     The rate is estimated because simulated clocks do not run in real time.
 
-    The weight of an exchange is the inverse square of its round-trip time, which bounds its error.
+    Each exchange is weighted by the inverse square of its round-trip time, which bounds the error of the exchange.
     """
 
     def __init__(self) -> None:
@@ -56,9 +56,9 @@ class RemoteClock:
 
 
 class ArrivalClock:
-    """Estimates a remote clock's offset from the arrival times of its messages; the quickest recent message counts.
+    """Estimates a remote clock's offset from the arrival times of messages, using the quickest recent message.
 
-    The transmission time of these messages remains unknown.
+    The estimate includes the unknown transmission time of that message.
     """
 
     def __init__(self) -> None:

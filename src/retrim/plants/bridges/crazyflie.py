@@ -17,7 +17,7 @@ from .vehicle_state import VehicleState
 ADDRESS = "udp:127.0.0.1:19850"  # of a simulated Crazyflie, or a bridge to the radio, on this machine
 ANSWERS_S, READY_S, STILL_S, ARM_S, GO_S, LANDING_S = 5.0, 20.0, 2.0, 5.0, 20.0, 15.0  # [s]
 AGAIN_S = 1.0  # [s] after which an order without effect is sent again
-LOST_S = 2.0  # [s] of silence; by then it has stopped its motors
+LOST_S = 2.0  # [s] of silence; by then the Crazyflie has stopped its motors
 WANDERS = 0.1  # [m], largest change in the estimated position while it stands still
 SPEED, RISE_S = 0.5, 2.0  # [m/s] during the flight to the start; [s] of a take-off
 THRUST_S = 2.0  # [s] over which the thrust at hover is identified
@@ -26,17 +26,17 @@ WRONG = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crt
 
 
 class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
-    """A Crazyflie that receives thrust and body rates as manual setpoints by CRTP over UDP, and logs its state.
+    """A Crazyflie that receives thrust and body rates as manual setpoints via CRTP over UDP, and logs its state.
 
-    The world and body frames are the Crazyflie's own, which are also ours. Thrust per mass is the thrust command times
-    g, divided by the thrust command at hover. Adaptation compensates for the battery and the thrust map.
+    The Crazyflie's world and body frames are the same as ours. Thrust per mass is the thrust command times
+    g, divided by the thrust command at hover. Adaptation compensates for errors from the battery and the thrust map.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray) -> None:
         """Build a plant; it does not send packets until it connects.
 
         Args:
-            address: ``udp:HOST:PORT`` that it listens on.
+            address: ``udp:HOST:PORT`` that the Crazyflie listens on.
             dt: Control period [s].
             low: Smallest command [c, omega].
             high: Largest command [c, omega].
@@ -51,7 +51,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self._flies, self._floor = False, 0.0
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
-        """Connect, and wait until it has a position estimate and can be armed."""
+        """Connect, and wait until the Crazyflie has a position estimate and can be armed."""
         if self._link is None:
             _, host, port = address_of(self.address)
             try:
@@ -73,7 +73,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             self._stands_still(keep_on)
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Let its own commander fly it to a position, and identify its thrust command at hover."""
+        """Fly to a position using the Crazyflie's own commander, and identify the thrust command at hover."""
         link, x = self.link, self.reading()
         if not self._is(crtp.FLYING):
             self._floor = float(x.p[2])
@@ -104,11 +104,11 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
-        """Let its commander hold the take-off position."""
+        """Hold the take-off position using the Crazyflie's commander."""
         self.link.pump(until)
 
     def read(self) -> VehicleState:
-        """Return the newest state in its log."""
+        """Return the newest logged state."""
         link = self.link
         link.pump(0.0)
         now = time.monotonic()
@@ -132,7 +132,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.link.pump(until)
 
     def land(self) -> None:
-        """Let its commander land it, and disarm it; a vehicle that no longer answers is ignored."""
+        """Land the Crazyflie using its own commander, and disarm it; ignore a vehicle that no longer answers."""
         link, self._link = self._link, None
         if link is None:
             return
@@ -165,12 +165,12 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             link.pump(time.monotonic() + 0.1)
 
     def _is(self, bits: int) -> bool:
-        """Return whether its supervisor reports any of these bits."""
+        """Return whether the Crazyflie's supervisor reports any of these bits."""
         status = self.link.status
         return status is not None and bool(status.info & bits)
 
     def _stands_still(self, keep_on: KeepOn) -> None:
-        """Check that its position estimate does not drift, as it does without a positioning system."""
+        """Check that the position estimate does not drift, as happens without a positioning system."""
         first = self.reading().p
         wanders = 0.0
 
@@ -188,10 +188,10 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
 
 
 def check_address(address: str) -> str:
-    """Return a Crazyflie's address, or the default for an empty address.
+    """Check a Crazyflie's address and return it, or return the default for an empty address.
 
     Raises:
-        ConfigError: The text is not an address, or its kind is not UDP.
+        ConfigError: The text is not a UDP address.
     """
     if address_of(address or ADDRESS)[0] != "udp":
         raise ConfigError(f"address {address!r}: a Crazyflie is reached by udp:HOST:PORT, as {ADDRESS}")

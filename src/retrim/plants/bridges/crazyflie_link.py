@@ -1,4 +1,4 @@
-"""One end of a connection to a Crazyflie: it receives logs and sends packets.
+"""Connect to a Crazyflie, receive its logs and send packets.
 
 This module does not decide when to arm or which controller flies; :mod:`.crazyflie` does.
 """
@@ -20,17 +20,17 @@ STATES, STATUSES = 1, 2  # numbers of our log blocks
 STATE_S, STATUS_S = 0.01, 0.05  # [s] between two states and between two statuses
 ECHO_S = 0.1  # [s] between two measurements of the round-trip time
 AGAIN_S = 0.2  # [s] after which an unanswered request is repeated
-WRAP_MS = 1 << 24  # [ms], period after which its time wraps around
-LATE_S, EARLY_S = 0.5, 1.0  # [s] by which its time may go back, and run ahead of ours, between two messages
+WRAP_MS = 1 << 24  # [ms], period after which the Crazyflie's time wraps around
+LATE_S, EARLY_S = 0.5, 1.0  # [s] by which this time may go back, and run ahead of ours, between two messages
 # [m], largest plausible jump between two states; [s] for which the last state is used for this check; [m/s]
 LEAP, LEAPS_S, FASTEST = 1.0, 0.5, 20.0
 
 
 class CrazyflieLink:
-    """Receives messages, stores the newest of each kind, and keeps the connection alive."""
+    """Receives messages, stores the newest message of each kind, and keeps the connection alive."""
 
     def __init__(self, endpoint: Endpoint, to: tuple[str, int]) -> None:
-        """Build one end.
+        """Build one end of a connection.
 
         Args:
             endpoint: Endpoint for received and sent packets.
@@ -43,20 +43,20 @@ class CrazyflieLink:
         self._awaited: Packet | None = None
         self._answer: bytes | None = None
         self.version = 0
-        """Version of its protocol; 0 until it is requested."""
+        """Version of the Crazyflie's protocol; 0 until it is requested."""
         self.reading: Reading | None = None
         self.status: crtp.Status | None = None
         self.thrusts: deque[float] = deque(maxlen=100)
-        """Thrust commands from its controller, 0 to 65535."""
+        """Thrust commands from the Crazyflie's controller, 0 to 65535."""
         self.console = ""
-        """End of its console output."""
+        """End of the Crazyflie's console output."""
         self.heard = -math.inf
-        """Time of its last valid packet, monotonic clock [s]."""
+        """Time of the last valid packet, on the monotonic clock [s]."""
         self.ignored = 0
         """Number of packets that were damaged, implausible or from other senders."""
 
     def pump(self, until: float) -> None:
-        """Read received packets and send periodic ones until an instant of the monotonic clock [s]."""
+        """Read received packets and send periodic ones until an instant on the monotonic clock [s]."""
         pump(self._endpoint, until, self._chores, self._take)
 
     def send(self, packet: Packet) -> None:
@@ -105,7 +105,7 @@ class CrazyflieLink:
                     raise PlantError(f"the Crazyflie refuses a block of its log: error {refused}")
 
     def stop_logs(self) -> None:
-        """Request the end of the log messages."""
+        """Ask the Crazyflie to stop sending log messages."""
         self.send(Packet(crtp.LOG, crtp.CONTROL, bytes([crtp.RESET])))
 
     def close(self) -> None:
@@ -113,7 +113,7 @@ class CrazyflieLink:
         self._endpoint.close()
 
     def _numbers(self, wanted: set[str], patience: float, keep_on: KeepOn) -> dict[str, int]:
-        """Return the numbers of the wanted variables from its table of contents."""
+        """Return the numbers of the wanted variables from the Crazyflie's table of contents."""
         about = self.ask(Packet(crtp.LOG, crtp.TOC, bytes([crtp.INFO])), 1, patience, keep_on)
         length, result = int.from_bytes(about[:2], "little"), dict[str, int]()
         for number in range(length):
@@ -178,7 +178,7 @@ class CrazyflieLink:
             raise MessageError("a block of a log that nobody asked for")
 
     def _take_state(self, x: crtp.StateRow, ms: int, now: float) -> None:
-        """Process a state; one that is implausibly far from a recent state is refused."""
+        """Process a state, or refuse it if it is implausibly far from a recent state."""
         last, since = self.reading, now - self._logged_at
         if last is not None and since < LEAPS_S and abs(x.p - last.p).max() > LEAP + FASTEST * since:
             raise MessageError("a state that is far from the last one")
@@ -191,6 +191,6 @@ class CrazyflieLink:
             self.reading = Reading(stamp, *x)
 
     def said(self) -> str:
-        """Return its console output, as a suffix for an error message."""
+        """Return the Crazyflie's console output as a suffix for an error message."""
         words = " ".join(self.console.split())
         return f"; it said: {words}" if words else ""

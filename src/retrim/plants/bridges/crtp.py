@@ -1,7 +1,7 @@
 """CRTP, the Crazyflie protocol: little-endian packets with a port, a channel and up to 30 bytes.
 
-The Crazyflie's world frame (x, y and z up) and its body frame (forward, left, up) equal ours. Its positive pitch is
-nose up, which is a negative rotation about our y axis.
+The Crazyflie's world frame (x, y and z up) and its body frame (forward, left, up) equal ours. Positive pitch is
+nose up on the Crazyflie, which is a negative rotation about our y axis.
 """
 
 import math
@@ -23,13 +23,13 @@ MANUAL, RELAX = 11, 0  # of SETPOINT's channels 0 and 1
 HL_STOP, GO_TO, TAKE_OFF, LAND, GO_TO_LINEAR = 3, 4, 7, 8, 12  # commands of HIGH_LEVEL
 NEW_GO_TO, OWN_SUPERVISOR = 8, 12  # first protocol versions with GO_TO_LINEAR, and with the port SUPERVISOR
 CAN_ARM, ARMED, _, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
-THRUST = (1.0, 65_535.0)  # at 0 the motors stop and its controllers are reset
+THRUST = (1.0, 65_535.0)  # at 0 the motors stop and the controllers are reset
 STATE_LOG = {
     **{f"stateEstimateZ.{name}": "h" for name in ("x", "y", "z", "vx", "vy", "vz")},
     "stateEstimateZ.quat": "I",
     **{f"stateEstimateZ.{name}": "h" for name in ("rateRoll", "ratePitch", "rateYaw")},
 }
-"""Variables in a block of states and their types [mm, mm/s, packed quaternion, mrad/s]."""
+"""Variables in a block of states, with their types [mm, mm/s, packed quaternion, mrad/s]."""
 STATUS_LOG = {"stabilizer.thrust": "f", "supervisor.info": "H", "pm.vbat": "f"}
 LOG_TYPES = {"B": 1, "H": 2, "I": 3, "b": 4, "h": 5, "i": 6, "f": 7}
 _STATE, _STATUS = (struct.Struct("<" + "".join(block.values())) for block in (STATE_LOG, STATUS_LOG))
@@ -61,7 +61,7 @@ def unpacked(data: bytes) -> Packet:
 
 
 def rates_setpoint(thrust: int, omega: np.ndarray) -> Packet:
-    """Return a setpoint of thrust and body rates.
+    """Return a setpoint for thrust and body rates.
 
     Args:
         thrust: 0 to 65535.
@@ -88,12 +88,12 @@ def land(height: float, duration: float) -> Packet:
 
 
 def stop_planning() -> Packet:
-    """Return the order that ends the motions of take_off, go_to and land; the motors stop."""
+    """Return the order that ends the motions started by take_off, go_to and land; the motors then stop."""
     return Packet(HIGH_LEVEL, 0, bytes([HL_STOP, 0]))
 
 
 def relax() -> Packet:
-    """Return the notice that setpoints end, so that orders take effect again; without it the motors stop."""
+    """Return the notice that setpoints end, so orders take effect again; without this notice, the motors stop."""
     return Packet(SETPOINT, 1, struct.pack("<BI", RELAX, 0))
 
 
@@ -111,7 +111,7 @@ def new_block(number: int, variables: list[tuple[str, int]]) -> list[Packet]:
 
 
 def start_block(number: int, period: float) -> Packet:
-    """Return the order to send a block at a period [s]."""
+    """Return the order to send a block once per period [s]."""
     return Packet(LOG, CONTROL, bytes([START, number, max(1, round(1e3 * period / LOG_MS))]))
 
 
@@ -119,11 +119,11 @@ class StateRow(NamedTuple):
     """A state in a log."""
 
     p: np.ndarray
-    """Position, world [m]."""
+    """Position in the world frame [m]."""
     R: np.ndarray
     """Attitude, body to world."""
     v: np.ndarray
-    """Velocity, world [m/s]."""
+    """Velocity in the world frame [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
 
@@ -178,7 +178,7 @@ def status_values(status: Status) -> bytes:
 
 
 def attitude_of(packed: int) -> np.ndarray:
-    """Return an attitude, body to world, from 32 bits: the largest element's index, and the others' signs and sizes.
+    """Return an attitude, body to world, from 32 bits: the largest element's index, and the other signs and magnitudes.
 
     Raises:
         MessageError: The other elements are too large for a unit quaternion.
@@ -198,7 +198,7 @@ def attitude_of(packed: int) -> np.ndarray:
 
 
 def quaternion_of(R: np.ndarray) -> int:
-    """Return an attitude in 32 bits; the inverse of :func:`attitude_of` to 2 mrad."""
+    """Encode an attitude in 32 bits; the inverse of :func:`attitude_of` to within 2 mrad."""
     from scipy.spatial.transform import Rotation  # local for the same reason
 
     q = Rotation.from_matrix(R).as_quat()

@@ -16,7 +16,7 @@ NAP_S = 0.02  # [s], longest time between two calls of the periodic work
 
 @runtime_checkable
 class Endpoint(Protocol):
-    """One end of a link, whose methods do not block."""
+    """One end of a link; the methods do not block."""
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when data has arrived."""
@@ -57,7 +57,7 @@ class UdpEndpoint:
         return self._socket.fileno()
 
     def receive(self) -> tuple[bytes, Any] | None:
-        """Return a datagram and its sender."""
+        """Return a datagram and its sender; None if there is no new datagram."""
         try:
             return self._socket.recvfrom(LONGEST)
         except OSError:  # no data, or the receiver of an earlier datagram no longer exists
@@ -141,7 +141,7 @@ def address_towards(host: str, port: int) -> str:
     """Return this machine's address on the route to a host, without sending data.
 
     A socket bound only to this address cannot be reached from other networks. For a vehicle on this machine, it is the
-    loopback address; for a vehicle on a radio, it is the radio's address.
+    loopback address; for a vehicle reached through a radio, it is the radio's address.
 
     Raises:
         PlantError: There is no route to the host.
@@ -155,7 +155,7 @@ def address_towards(host: str, port: int) -> str:
 
 
 def open_endpoint(address: str) -> Endpoint:
-    """Open the endpoint of an address.
+    """Open the endpoint for an address.
 
     Raises:
         ConfigError: The text is not an address.
@@ -166,13 +166,13 @@ def open_endpoint(address: str) -> Endpoint:
 
 
 def pump(endpoint: Endpoint, until: float, chores: Callable[[float], None], take: Callable[[bytes, Any], None]) -> None:
-    """Read received data and do periodic work until an instant of the monotonic clock [s].
+    """Read received data and do periodic work until an instant on the monotonic clock [s].
 
     Args:
         endpoint: Source of the data.
         until: End time; data that has already arrived is read even if this time has passed.
         chores: Periodic work; called with the current time.
-        take: Called with the data of one read, and its sender.
+        take: Called with the data from one read, and the sender.
     """
     while True:
         chores(time.monotonic())

@@ -1,4 +1,4 @@
-"""Conversions between the frames of autopilots and ours.
+"""Conversions between autopilot frames and our frames.
 
 An autopilot's world frame is north, east, down (NED), and its body frame is forward, right, down (FRD). Our frames are
 east, north, up (ENU) and forward, left, up (FLU), as in ROS. Each conversion is its own inverse.
@@ -7,9 +7,9 @@ east, north, up (ENU) and forward, left, up (FLU), as in ROS. Each conversion is
 import numpy as np
 
 WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""NED to ENU, and ENU to NED."""
+"""Matrix that converts NED to ENU, and ENU to NED."""
 BODY = np.array([1.0, -1.0, -1.0])
-"""FRD to FLU, and FLU to FRD, by axis."""
+"""Sign of each axis in the conversion from FRD to FLU, and from FLU to FRD."""
 
 
 def turned_world(vector: np.ndarray) -> np.ndarray:

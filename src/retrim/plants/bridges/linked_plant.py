@@ -1,4 +1,4 @@
-"""A vehicle at the other end of a link, which reports its state and accepts thrust and body rates."""
+"""Plants for a vehicle that is reached over a link, reports its state, and accepts thrust and body rates."""
 
 from collections.abc import Collection
 from typing import Generic, Protocol, TypeVar, runtime_checkable
@@ -18,7 +18,7 @@ class VehicleLink(Protocol):
     reading: Reading | None
     """Newest state; None until the first one arrives."""
     heard: float
-    """Time of the last received message, monotonic clock [s]."""
+    """Time of the last received message, on the monotonic clock [s]."""
 
 
 L = TypeVar("L", bound=VehicleLink)
@@ -31,7 +31,7 @@ class LinkedPlant(VehiclePlant, Generic[L]):
         """Build a plant.
 
         Args:
-            address: Address of the vehicle, which error messages contain.
+            address: Address of the vehicle, for error messages.
             dt: Control period [s].
             low: Smallest command [c, omega] that is sent to the vehicle.
             high: Largest command [c, omega] that is sent to the vehicle.
@@ -55,7 +55,7 @@ class LinkedPlant(VehiclePlant, Generic[L]):
         """Return the newest received state.
 
         Raises:
-            PlantError: A state has not been received yet.
+            PlantError: The vehicle has not sent a state yet.
         """
         if self.link.reading is None:
             raise PlantError(f"{self.address}: the vehicle has sent no state")
@@ -63,7 +63,7 @@ class LinkedPlant(VehiclePlant, Generic[L]):
 
 
 class ThrustScale:
-    """Linear scale between thrust per mass and an autopilot's thrust command; identified while the vehicle hovers."""
+    """Linear scale between thrust per mass and an autopilot's thrust command, identified while the vehicle hovers."""
 
     def __init__(self, smallest: float, largest: float) -> None:
         """Build a scale that is not identified yet.
@@ -93,7 +93,7 @@ class ThrustScale:
         self.hover = float(np.mean(np.array(commands)))
 
     def command(self, c: float) -> float:
-        """Return the command for a thrust per mass [m/s^2], within the range.
+        """Return the command for a thrust per mass [m/s^2], clipped to the range.
 
         Raises:
             PlantError: The vehicle has not hovered yet.
@@ -101,7 +101,7 @@ class ThrustScale:
         return float(np.clip(c / self._step, *self._range))
 
     def per_mass(self, command: float) -> float:
-        """Return the thrust per mass of a command [m/s^2].
+        """Return the thrust per mass for a command [m/s^2].
 
         Raises:
             PlantError: The vehicle has not hovered yet.
@@ -110,7 +110,7 @@ class ThrustScale:
 
     @property
     def _step(self) -> float:
-        """Thrust per mass of a command of one [m/s^2]."""
+        """Thrust per mass for a command of one [m/s^2]."""
         if self.hover is None:
             raise PlantError("the vehicle has not taken off; call take_off or reset first")
         return STANDARD_GRAVITY / self.hover

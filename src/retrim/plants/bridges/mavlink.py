@@ -55,7 +55,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
             raise ConfigError(f"dt = {dt} s: PX4 is commanded at 10 to 250 Hz")
         address_of(self.address)
         self.thrust = ThrustScale(0.0, 1.0)
-        """Scale of thrust commands; its range is the full thrust of the motors."""
+        """Scale of thrust commands; its range is the motors' full thrust."""
         self._engaged = False
         self._place, self._heading, self._told = np.zeros(3), 0.0, -math.inf
 
@@ -86,7 +86,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
             raise PlantError(f"{self.address}: no position in {READY_S:g} s{self._said()}")
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Let PX4 fly to a position, and identify its thrust command at hover."""
+        """Let PX4 fly to a position, and identify PX4's thrust command at hover."""
         x, link = self.reading(), self.link
         up = np.array([0.0, 0.0, 0.0 if link.armed else 1.0])
         self._place = x.p + up if p is None else np.asarray(p, dtype=float)
@@ -105,7 +105,7 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         self.thrust.learn(link.thrusts)
 
     def hold(self, until: float) -> None:
-        """Let PX4 hold the take-off position until an instant of the monotonic clock [s]."""
+        """Let PX4 hold the take-off position until an instant on the monotonic clock [s]."""
         while time.monotonic() < until:
             self._tell()
             self.link.pump(min(until, time.monotonic() + TELL_EVERY_S))

@@ -1,4 +1,4 @@
-"""One end of a MAVLink connection: it receives the autopilot's state and sends commands.
+"""Connect to an autopilot by MAVLink, receive its state and send commands.
 
 This module does not decide when to arm or which controller flies; :mod:`.mavlink` does.
 """
@@ -33,10 +33,10 @@ SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are used ins
 
 
 class MavlinkLink:
-    """Receives messages, stores the newest of each kind, and keeps the connection alive."""
+    """Receives messages, stores the newest message of each kind, and keeps the connection alive."""
 
     def __init__(self, endpoint: Endpoint, *, datagrams: bool = True) -> None:
-        """Build one end.
+        """Build one end of a connection.
 
         Args:
             endpoint: Endpoint for received and sent bytes. The link communicates with the first autopilot from which it
@@ -60,13 +60,13 @@ class MavlinkLink:
         self.autopilot, self.mode, self.armed, self.ready = -1, (0, 0), False, False
         self.reading: Reading | None = None
         self.truth: Reading | None = None
-        """True state from the autopilot's own simulator, if it is reported; its origin is the first position."""
+        """True state from the autopilot's own simulator, if it is reported; the origin is the first position."""
         self.thrusts: deque[float] = deque(maxlen=50)
-        """The autopilot's thrust commands to its motors, as shares of their thrust."""
+        """The autopilot's thrust commands to its motors, as shares of the full thrust."""
         self.texts: deque[str] = deque(maxlen=20)
         """Text messages from the autopilot."""
         self.heard = -math.inf
-        """Time of its last message, monotonic clock [s]."""
+        """Time of the autopilot's last message, on the monotonic clock [s]."""
         self.ignored = 0
         """Number of messages that were damaged, implausible or from other senders."""
         self.notes: list[str] = []
@@ -80,11 +80,11 @@ class MavlinkLink:
         }  # fmt: skip
 
     def pump(self, until: float) -> None:
-        """Read received messages and send periodic ones until an instant of the monotonic clock [s]."""
+        """Read received messages and send periodic ones until an instant on the monotonic clock [s]."""
         pump(self._endpoint, until, self._chores, self._take)
 
     def command(self, number: int, *parameters: float) -> None:
-        """Send COMMAND_LONG; its first answer only confirms its arrival, and the autopilot's state shows its effect."""
+        """Send COMMAND_LONG; the first answer only confirms arrival, and the autopilot's state shows the effect."""
         padded = (*parameters, *([0.0] * (7 - len(parameters))))
         if self.system is not None:
             self._send(self._sender.command_long_encode(*self.system, number, 0, *padded))
@@ -111,8 +111,8 @@ class MavlinkLink:
         """Send SET_POSITION_TARGET_LOCAL_NED.
 
         Args:
-            p: Target position, our world [m].
-            yaw: Target heading, our convention [rad].
+            p: Target position in our world frame [m].
+            yaw: Target heading in our convention [rad].
         """
         if self.system is not None:
             place = [float(x) for x in frames.turned_world(p)]
@@ -124,7 +124,7 @@ class MavlinkLink:
         """Send ODOMETRY: a state measured by motion capture, for the autopilot's estimator.
 
         Args:
-            x: The state; its stamp is not sent, since the message is sent immediately.
+            x: The state; the time stamp is not sent, since the message is sent immediately.
         """
         place = [float(each) for each in frames.turned_world(x.p)]
         velocity = [float(each) for each in frames.turned_body(x.R.T @ x.v)]
@@ -136,7 +136,7 @@ class MavlinkLink:
         ))  # fmt: skip
 
     def set_parameter(self, name: str, value: float | int) -> None:
-        """Send PARAM_SET; an integer is sent as its bit pattern, which is the convention of PX4."""
+        """Send PARAM_SET; an integer is sent as its bit pattern, following the PX4 convention."""
         if self.system is not None:
             real = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
             kind = INT32 if isinstance(value, int) else REAL32
@@ -265,7 +265,7 @@ class MavlinkLink:
         self.texts.append(str(message.text))
 
     def _hil_state(self, message: Any, now: float) -> None:
-        """Read the true state from PX4's own simulator, on a plane that touches the earth at its first position."""
+        """Read the true state from PX4's own simulator, on a plane that touches the earth at the first position."""
         q = np.array(message.attitude_quaternion)
         if not np.isfinite(q).all() or not 0.5 < q @ q < 2.0:
             self.ignored += 1

@@ -1,4 +1,4 @@
-"""Waiting until a vehicle satisfies a condition, with a time limit."""
+"""Wait until a vehicle satisfies a condition, with a time limit."""
 
 import math
 import time
@@ -12,13 +12,13 @@ NAP_S = 0.01  # [s] between two checks
 
 
 def wait_until(done: KeepOn, patience: float, keep_on: KeepOn, wait: Callable[[float], object]) -> bool:
-    """Wait until a condition holds; return whether it holds.
+    """Wait until a condition holds or the time is up; return whether the condition holds.
 
     Args:
         done: Returns whether the condition holds.
         patience: Longest time to wait [s].
         keep_on: Called repeatedly; the wait is given up when it returns False.
-        wait: Keeps the link alive until an instant of the monotonic clock [s].
+        wait: Keeps the link alive until an instant on the monotonic clock [s].
 
     Raises:
         PlantError: ``keep_on`` returned False, so the flight was given up.
@@ -34,7 +34,7 @@ def wait_until(done: KeepOn, patience: float, keep_on: KeepOn, wait: Callable[[f
 
 
 def insisting(order: Callable[[], object], done: KeepOn, every: float) -> KeepOn:
-    """Return a condition that repeats an order, which may be lost, until another condition holds.
+    """Return a condition that repeats an order until another condition holds, since an order may be lost.
 
     Args:
         order: Sends the order.

@@ -1,4 +1,4 @@
-"""A vehicle behind ROS 1 as a plant: another pilot takes off, hands over control, and takes it back."""
+"""A vehicle behind ROS 1 as a plant: another pilot takes off, hands over control, and takes control back."""
 
 import math
 import re
@@ -23,10 +23,10 @@ HEADING = math.radians(20.0)
 class RosPlant(LinkedPlant[RosLink]):
     """A vehicle whose states and targets are ROS 1 topics.
 
-    The world and body frames are those of ROS, which are also ours. The other pilot (mavros, or a flight stack's pilot)
-    takes off, flies the vehicle to the start, and follows our targets while they are published. It takes back control
-    when they stop. Thrust per mass is converted to a share of the motors' thrust with the vehicle's mass and largest
-    thrust; adaptation compensates for errors in these.
+    The world and body frames are the ROS frames, as are ours. The other pilot (mavros, or a flight stack's pilot)
+    takes off, flies the vehicle to the start, and follows our targets while they are published. The other pilot
+    takes back control when the targets stop. Thrust per mass is converted to a share of the motors' thrust using the
+    vehicle's mass and largest thrust; adaptation compensates for errors in these values.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
@@ -37,7 +37,7 @@ class RosPlant(LinkedPlant[RosLink]):
             dt: Control period [s].
             low: Smallest command [c, omega].
             high: Largest command [c, omega].
-            strongest: Thrust per mass of all motors at full throttle [m/s^2].
+            strongest: Total thrust per mass with all motors at full throttle [m/s^2].
 
         Raises:
             ConfigError: The address is invalid.
@@ -60,7 +60,7 @@ class RosPlant(LinkedPlant[RosLink]):
             )
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Wait until another pilot has flown the vehicle to the start and it stays there."""
+        """Wait until another pilot has flown the vehicle to the start and the vehicle stays there."""
         x = self.reading()
         place = x.p if p is None else np.asarray(p, dtype=float)
         stays = self.staying(place)
@@ -78,7 +78,7 @@ class RosPlant(LinkedPlant[RosLink]):
             )
 
     def hold(self, until: float) -> None:
-        """Let the other pilot hold the vehicle."""
+        """Let the other pilot hold the vehicle's position."""
         self.wait(until)
 
     def read(self) -> VehicleState:
@@ -99,7 +99,7 @@ class RosPlant(LinkedPlant[RosLink]):
         time.sleep(max(0.0, until - time.monotonic()))
 
     def land(self) -> None:
-        """Stop publishing, so that the other pilot takes back control."""
+        """Stop publishing, so the other pilot takes back control."""
         link, self._link = self._link, None
         if link is not None:
             link.close()

@@ -78,7 +78,7 @@ class RosLink:
         self._one_at_a_time = threading.Lock()
         self.reading: Reading | None = None
         self.heard = -math.inf
-        """Time of the last valid state, monotonic clock [s]."""
+        """Time of the last valid state, on the monotonic clock [s]."""
         self.ignored = 0
         """Number of invalid states."""
         odometry, pose = system_module("nav_msgs.msg").Odometry, system_module("geometry_msgs.msg").PoseStamped
@@ -94,7 +94,7 @@ class RosLink:
 
         Args:
             thrust: Share of the motors' thrust, 0 to 1.
-            omega: Body rates in our frame, which is that of ROS: forward, left, up [rad/s].
+            omega: Body rates in our frame, which is the ROS frame: forward, left, up [rad/s].
         """
         target = self._target()
         target.header.stamp = self._rospy.Time.from_sec(time.time())
@@ -103,7 +103,7 @@ class RosLink:
         self._publisher.publish(target)
 
     def close(self) -> None:
-        """Unregister from the topics; the node stays until the process ends."""
+        """Unregister from the topics; the node exists until the process ends."""
         for end in self._ends:
             end.unregister()
 
@@ -130,7 +130,7 @@ class RosLink:
         self._take(message.header.stamp.to_sec(), p, R, v if in_world else R @ v, R.T @ omega if in_world else omega)
 
     def _pose(self, message: Any) -> None:
-        """Process geometry_msgs/PoseStamped without recent odometry; velocities are smoothed differences of poses."""
+        """Process geometry_msgs/PoseStamped unless odometry is recent; velocities are smoothed differences of poses."""
         from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
         result, last = _pose(message.pose), self.reading

@@ -1,4 +1,4 @@
-"""A vehicle as a plant: it runs in real time, and its state cannot be set."""
+"""Base class of plants that are vehicles: they run in real time, and their state cannot be set."""
 
 import abc
 import math
@@ -21,7 +21,7 @@ THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s]: limits for a vehicle t
 class VehiclePlant(Plant, abc.ABC):
     """A link to one vehicle.
 
-    A live flight uses the link tick by tick; :meth:`step` makes it a plant like the others.
+    A live flight uses the link tick by tick; :meth:`step` makes the vehicle a plant like the others.
 
     Missed ticks are not repeated; the measurement times show them.
     """
@@ -37,7 +37,7 @@ class VehiclePlant(Plant, abc.ABC):
         self.dt = dt
         self.low, self.high = low, high
         self.lost: float | None = None
-        """Time that a simulated vehicle on this machine lost because of a busy machine [s]; None for other vehicles."""
+        """Time that a simulated vehicle lost because this machine was busy [s]; None for other vehicles."""
         self._tick: int | None = None
         self._began = 0.0
         self._thrust = STANDARD_GRAVITY
@@ -49,7 +49,7 @@ class VehiclePlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
-        """Connect, and wait until the vehicle can be armed; return immediately if it already can.
+        """Connect, and wait until the vehicle can be armed; return immediately if this is already possible.
 
         Args:
             keep_on: Called repeatedly; the wait is given up when it returns False.
@@ -81,7 +81,7 @@ class VehiclePlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def hold(self, until: float) -> None:
-        """Let the autopilot hold the take-off position until an instant of the monotonic clock [s]."""
+        """Let the autopilot hold the take-off position until an instant on the monotonic clock [s]."""
 
     @abc.abstractmethod
     def transmit(self, u: np.ndarray) -> np.ndarray:
@@ -103,10 +103,10 @@ class VehiclePlant(Plant, abc.ABC):
 
     @abc.abstractmethod
     def wait(self, until: float) -> None:
-        """Keep the link alive until an instant of the monotonic clock [s]."""
+        """Keep the link alive until an instant on the monotonic clock [s]."""
 
     def until(self, done: KeepOn, patience: float, keep_on: KeepOn) -> bool:
-        """Keep the link alive until a condition holds, for at most ``patience`` [s]; return whether it holds.
+        """Keep the link alive for at most ``patience`` [s] until a condition holds; return whether this happened.
 
         Raises:
             PlantError: ``keep_on`` returned False, so the flight was given up.
@@ -114,7 +114,7 @@ class VehiclePlant(Plant, abc.ABC):
         return wait_until(done, patience, keep_on, self.wait)
 
     def staying(self, place: np.ndarray, meanwhile: Callable[[], object] = lambda: None) -> KeepOn:
-        """Return a function that checks whether the vehicle has stayed at a position [m] for a while.
+        """Return a function that checks whether the vehicle has stayed at a position for a while.
 
         Args:
             place: Position, world [m].

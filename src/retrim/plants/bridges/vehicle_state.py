@@ -10,14 +10,14 @@ LONGEST_S = 0.05  # [s], limit of a state's extrapolation; an older state is not
 
 
 class VehicleState(NamedTuple):
-    """A state in NumPy, and its age."""
+    """A state in NumPy arrays, with its age."""
 
     p: np.ndarray
-    """Position, world [m]."""
+    """Position in the world frame [m]."""
     R: np.ndarray
     """Attitude, body to world."""
     v: np.ndarray
-    """Velocity, world [m/s]."""
+    """Velocity in the world frame [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
     age: float
@@ -33,9 +33,11 @@ class VehicleState(NamedTuple):
         return self.age + self.carried
 
     def carried_on(self, c: float) -> "VehicleState":
-        """Return the state extrapolated to now with constant thrust, gravity and body rates; its age is the remainder.
+        """Return the state extrapolated to the current time with constant thrust, gravity and body rates.
 
-        The autopilot chooses when it sends states, and they are 5 to 20 ms old when they arrive. If they were used as
+        The extrapolation is limited to 50 ms; the new age is the time beyond this limit.
+
+        The autopilot chooses when to send states, and they are 5 to 20 ms old when they arrive. If they were used as
         current states, they would add a delay that is not part of any model, and the intervals between them would not
         be ticks. A controller compensates for the reported age, so this age must not include the time that is already
         compensated for here.
@@ -61,14 +63,14 @@ class Reading(NamedTuple):
     stamp: float
     """Time at which the state was valid, on this machine's monotonic clock [s]."""
     p: np.ndarray
-    """Position, world [m]."""
+    """Position in the world frame [m]."""
     R: np.ndarray
     """Attitude, body to world."""
     v: np.ndarray
-    """Velocity, world [m/s]."""
+    """Velocity in the world frame [m/s]."""
     omega: np.ndarray
     """Body rates [rad/s]."""
 
     def at(self, now: float) -> VehicleState:
-        """Return the reading as a state, with its age at an instant of the same clock [s]."""
+        """Return the reading as a state, with its age at an instant on the same clock [s]."""
         return VehicleState(self.p, self.R, self.v, self.omega, max(0.0, now - self.stamp))
