@@ -1,7 +1,8 @@
-"""The whole loop: a policy is pretrained, flown where the world pushes, and re-trained in flight.
+"""Pretrain a hover policy, fly it under a push, and re-train it in flight.
 
-You learn which objects there are: a preset holds every number, a set-up builds the objects, a scenario makes a plant, a
-pilot flies it. Printed are the loss of pretraining, the hover error of each method, and what adaptation did when.
+The example introduces the main objects: a preset contains all numbers, a set-up builds the objects, a scenario makes a
+plant, and a pilot flies the plant. It prints the pretraining loss, the hover error of each method, and the events of
+the adaptation.
 """
 
 import jax
@@ -20,7 +21,7 @@ def main(*, quick: bool = False) -> None:
     preset = changed(load("hover/fast"), **(QUICK if quick else {}))
     setup, ticks = Setup.from_preset(preset), 100 if quick else 1500
 
-    # The model of training is one equation; it knows nothing of what follows.
+    # The training model is one equation, without the disturbances of the flights below.
     *_, (policy, losses) = setup.pretraining()
     print(f"pretraining ended at a loss of {float(losses[-1]):.3f}")
 

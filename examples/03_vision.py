@@ -1,9 +1,9 @@
-"""A policy flies from pixels: it sees seven points on the ground through a camera, and never its own state.
+"""Fly from pixels: the policy observes seven points on the ground through a camera, and not the state.
 
-You learn that such a policy first learns to see and then to fly, and that what it sees in flight may differ from what
-it saw in training: here points out of sight are not observed, pixels are noisy, and some points are missed. A filter
-estimates the pose from the others, and the push that is felt. Printed are the loss of training, and the hover error in
-wind of the policy as it is, in the frame of felt gravity (no learning), and adapting in it.
+Training begins with an encoder and continues with the policy. In flight, the observation may differ from that of
+training: here, points outside the image are not observed, pixels are noisy, and some points are missed. A filter
+estimates the pose and the disturbance from the remaining points. The example prints the training loss and the hover
+error in wind: of the policy alone, of the policy in the frame of effective gravity, and with adaptation.
 """
 
 import jax
@@ -22,11 +22,11 @@ def main(*, quick: bool = False) -> None:
     """Learn to see, learn to fly, and fly in wind."""
     preset = changed(load("vision/retrim"), **(QUICK if quick else {}))
     setup, ticks = Setup.from_preset(preset), 100 if quick else 1500
-    # The encoder learns first, to tell position, attitude and velocity from the pixels of random motions.
+    # First, the encoder learns to predict position, attitude and velocity from the pixels of random motions.
     *_, (policy, losses) = setup.pretraining()
     print(f"pretraining ended at a loss of {float(losses[-1]):.3f}")
 
-    # In flight only what the camera sees is observed; the policy is shown the picture of the estimated pose.
+    # In flight, only points in the image are observed; the policy receives the image of the estimated pose.
     plant, x0 = Scenario("wind=3").make(), setup.flight_starts(1)[0]
     for method in ("base", "base-do", "full"):
         log = fly(plant, setup.pilot(policy, method, jax.random.key(1)), x0, ticks=ticks)

@@ -136,6 +136,10 @@ def test_names_that_do_not_fit():
         setup_of(learner="bttp")
     with pytest.raises(ConfigError, match="no optimiser 'frish'; did you mean 'fresh'"):
         setup_of(optimiser="frish")
+    with pytest.raises(ConfigError, match="learner 'math:pi' is a float, not a function that takes a LearnerRequest"):
+        setup_of(learner="math:pi")
+    with pytest.raises(ConfigError, match="optimiser 'math:pi' is a float, not an AbstractPolicyOptimiser"):
+        setup_of(optimiser="math:pi")
     with pytest.raises(ConfigError, match=r"learner 'nothing' gives a int, expected a retrim\.OnlineLearner"):
         setup_of(learner="nothing")
 

@@ -1,16 +1,21 @@
 """Help texts: names come from the registries, and an option without a default shows none."""
 
+import importlib
+
 import pytest
 
 from commands import retrim
+from retrim import ConfigError
 from retrim.config.disturbances import DISTURBANCES
 from retrim.config.faults import FAULTS
-from retrim.config.methods import METHODS
+from retrim.config.methods import METHODS, find_method
 from retrim.config.plants import PLANTS
 from retrim.config.references import REFERENCES
 from retrim.config.residuals import RESIDUALS
 from retrim.config.sensors import SENSORS
 from retrim.config.vehicles import VEHICLES
+
+main = importlib.import_module("retrim.cli.main")  # the package has a function of that name
 
 
 @pytest.mark.parametrize("command", ["fly", "live"])
@@ -27,3 +32,23 @@ def test_an_option_without_a_default_shows_none(command, tmp_path):
     out = retrim(command, "--help", cwd=tmp_path)
     assert "{None}" not in out
     assert "default: None" not in out
+
+
+def test_methods_of_installed_packages_are_listed_and_suggested(tmp_path):
+    assert {"datt", "raptor"} <= set(METHODS.plugins())
+    shown = "".join(retrim("fly", "--help", cwd=tmp_path).replace("│", " ").split())
+    assert "datt,raptorofinstalledpackages" in shown
+    with pytest.raises(ConfigError, match="no method 'rapto'; did you mean 'raptor'"):
+        find_method("rapto")
+
+
+def test_commands_of_a_broken_package_do_not_stop_the_others(monkeypatch, capsys):
+    class Broken:
+        value = "broken:COMMANDS"
+
+        def load(self):
+            raise ImportError("no module named broken")
+
+    monkeypatch.setattr(main, "entry_points", lambda group: [Broken()])
+    assert set(main.commands()) == set(main.COMMANDS)
+    assert "the commands of broken:COMMANDS cannot be loaded: no module named broken" in capsys.readouterr().err

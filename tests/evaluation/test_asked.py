@@ -9,7 +9,7 @@ from helpers import brief_preset
 from retrim import ConfigError, Setup, changed, load
 from retrim.cli.arguments import (
     FlightArguments,
-    loaded,
+    load_inputs,
     reference_of_flight,
     same_policy,
     training_preset,
@@ -111,15 +111,15 @@ def test_where_a_flight_takes_place_is_its_scenario():
 def test_weights_are_of_a_policy_or_of_an_earlier_flight(tmp_path, key):
     preset = brief_preset()
     save_policy(tmp_path / "policy.safetensors", Setup.from_preset(preset).new_policy(key), preset)
-    weights, found, state = loaded(tmp_path, None)
+    weights, found, state = load_inputs(tmp_path, None)
     assert (found, state) == (preset, None)
     assert weights.layers[0].weight.shape == load_policy(tmp_path)[0].layers[0].weight.shape
     with pytest.raises(ConfigError, match="give either --policy FILE or --resume FILE"):
-        loaded(None, None)
+        load_inputs(None, None)
     with pytest.raises(ConfigError, match="give either --policy FILE or --resume FILE"):
-        loaded(tmp_path, tmp_path)
+        load_inputs(tmp_path, tmp_path)
     with pytest.raises(ConfigError, match="--resume holds its own"):
-        loaded(None, tmp_path, tmp_path)
+        load_inputs(None, tmp_path, tmp_path)
 
 
 def test_a_mistake_in_a_module_of_ones_own_is_told_in_a_line(tmp_path, monkeypatch):

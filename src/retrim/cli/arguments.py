@@ -22,10 +22,10 @@ from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
 from ..io.trained import load_learner_state, load_policy
-from .options import listed, option
+from .options import join_names, option
 
 
-def loaded(
+def load_inputs(
     policy: Path | None, resume: Path | None, delta: Path | None = None, *, trust: Collection[str] = ()
 ) -> tuple[AbstractPolicy, Preset, LearnerState | None]:
     """Return the weights, the preset, and the learner state of an earlier flight (or None).
@@ -53,36 +53,37 @@ def loaded(
 
 
 DISTURBANCE = (
-    f"Disturbance of the flight: {listed(DISTURBANCES)}; by default large, and none on a vehicle. A size may follow, "
-    "as in wind=6 [m/s] or payload=0.2 [kg]. A sum combines several, as in wind+payload=0.1. Or module:name."
+    f"Disturbance of the flight: {join_names(DISTURBANCES)}; by default large, and none on a vehicle. A size may "
+    "follow, as in wind=6 [m/s] or payload=0.2 [kg]. A sum combines several, as in wind+payload=0.1. Or module:name."
 )
 PLANT = (
-    f"Plant: {listed(PLANTS)}, or module:name; docs/plant.md describes them. A vehicle has an address: "
+    f"Plant: {join_names(PLANTS)}, or module:name; docs/plant.md describes them. A vehicle has an address: "
     "mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD, crazyflie:udp:HOST:PORT, ros:HOST:PORT."
 )
 REFERENCE = (
-    f"Reference of a tracking policy: {listed(REFERENCES)}, module:name, or a CSV file of t, x, y, z[, yaw]; by "
+    f"Reference of a tracking policy: {join_names(REFERENCES)}, module:name, or a CSV file of t, x, y, z[, yaw]; by "
     "default the reference of its training. A closed file repeats as laps, any other is flown once; my.csv:laps and "
     "my.csv:once override this. Only a policy that observes its reference can follow another one than in training."
 )
 VEHICLE = (
-    f"Vehicle that the plant simulates: {listed(VEHICLES)}, a vehicle file or module:name; by default the vehicle of "
-    "training. rotorpy and crazyflow fly their own."
+    f"Vehicle that the plant simulates: {join_names(VEHICLES)}, a vehicle file or module:name; by default the vehicle "
+    "of training. rotorpy and crazyflow fly their own."
 )
 SENSOR = (
-    f"Sensors that measure the state for the policy: {listed(SENSORS)}, or module:name; docs/how-to/sensors.md lists "
-    "their noise."
+    f"Sensors that measure the state for the policy: {join_names(SENSORS)}, or module:name; docs/how-to/sensors.md "
+    "lists their noise."
 )
 THRUST = "Relative thrust error; 0.1 means 10 % more thrust than commanded (bem, simple, second-order)."
 LATE = "Command delay of the plant [s], unknown to the policy (bem, simple, second-order)."
 FAULT = (
-    f"Fault of the measurements, unknown to the policy (bem, simple, second-order): {listed(FAULTS)}. A size may "
+    f"Fault of the measurements, unknown to the policy (bem, simple, second-order): {join_names(FAULTS)}. A size may "
     "follow, as in late=3. Or module:name."
 )
 METHOD = (
-    f"Method of the flight: none, {listed(f'{name} ({METHODS[name].label})' for name in METHODS)}, or module:name."
+    f"Method of the flight: none, {join_names(f'{name} ({METHODS[name].label})' for name in METHODS)}; "
+    f"{join_names(METHODS.plugins())} of installed packages; or module:name."
 ).replace("**", "")
-RESIDUAL = f"Residual model: {listed(RESIDUALS)}, or module:name; by default that of the policy."
+RESIDUAL = f"Residual model: {join_names(RESIDUALS)}, or module:name; by default that of the policy."
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ..runkit.flights import Flight
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
 from ..runkit.run import INTERRUPTED, Run
-from .arguments import METHOD, RESIDUAL, FlightArguments, loaded, same_policy, with_residual
+from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, same_policy, with_residual
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 from .options import option
@@ -74,7 +74,7 @@ def fly(
                 policy, resume, flight=flight, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed,
                 save_vehicle=save_vehicle, trust=trust, out=out,
             )(stop)  # fmt: skip
-        weights, preset, state = loaded(policy, resume, delta, trust=trust)
+        weights, preset, state = load_inputs(policy, resume, delta, trust=trust)
         if config is not None:
             preset = same_policy(preset, overlaid(preset, config, trust=trust), config)
         preset = with_residual(preset, residual, state)

@@ -29,7 +29,7 @@ from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import train
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
-from .arguments import METHOD, RESIDUAL, FlightArguments, loaded, with_residual
+from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, with_residual
 from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 from .options import option
@@ -98,7 +98,7 @@ def live(
         check_limits(fence, seconds, policy_age)
         state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
         if policy is not None or resume is not None:
-            weights, chosen, state = loaded(policy, resume, trust=trust)
+            weights, chosen, state = load_inputs(policy, resume, trust=trust)
         chosen = with_residual(chosen, residual, state)
         scenario = flight.scenario(chosen)
         wanted = page or (seconds is None and not no_page)

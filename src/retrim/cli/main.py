@@ -14,14 +14,14 @@ from ..signals import stopped_by
 PACKAGE = __name__.rpartition(".")[0]
 COMMANDS = {
     "pretrain": "Train a policy from scratch in the nominal model and save it.",
-    "fly": "Fly a policy on a plant, as it is and adapting as it flies.",
-    "sweep": "Presets x scenarios x seeds from a TOML file, to one table and one picture.",
-    "live": "Fly against the clock and learn at the same time, in processes of their own.",
+    "fly": "Fly a policy on a plant, without and with adaptation in flight.",
+    "sweep": "Fly presets x scenarios x seeds from a TOML file; one table and one picture.",
+    "live": "Fly in real time and learn at the same time, in separate processes.",
     "learn": "Learn for a live flight on another machine.",
-    "replay": "Read a flight log: what the model missed, how well it is foretold; identify, adapt.",
+    "replay": "Read a flight log: errors of the model and of their predictions; identify, adapt.",
     "export": "Write a policy as NPZ, ONNX or C, for a computer without JAX.",
-    "bench": "How long each piece of work takes on this machine.",
-    "doctor": "Versions, device and cache, and known faults of dependencies.",
+    "bench": "Measure the duration of each piece of work on this machine.",
+    "doctor": "Show versions, device and cache, and check for known faults of dependencies.",
 }
 TRACEBACK = "--traceback"
 GROUP = "retrim.commands"
@@ -30,10 +30,18 @@ GROUP = "retrim.commands"
 
 def commands() -> dict[str, tuple[str, str]]:
     """Return the help text and module of every command, by name."""
-    result = {name: (about, f"{PACKAGE}.{name}") for name, about in COMMANDS.items()}
+    result = own_commands()
     for entry in entry_points(group=GROUP):
-        result |= entry.load()
+        try:
+            result |= entry.load()
+        except Exception as error:  # the other commands still work
+            print(f"retrim: the commands of {entry.value} cannot be loaded: {error}", file=sys.stderr)
     return result
+
+
+def own_commands() -> dict[str, tuple[str, str]]:
+    """Return the help text and module of every command of this package, by name."""
+    return {name: (about, f"{PACKAGE}.{name}") for name, about in COMMANDS.items()}
 
 
 def describe(known: Mapping[str, tuple[str, str]]) -> str:
@@ -52,7 +60,7 @@ def describe(known: Mapping[str, tuple[str, str]]) -> str:
             *(f"  {name:<{width}}{about}" for name, (about, _) in known.items()),
             "",
             "  --version, --help",
-            "  --traceback with any command: show the whole traceback of an error",
+            "  --traceback with any command: show the full traceback of an error",
             "",
             "Ctrl-C, SIGTERM or a closed terminal (SIGHUP) stops a command and keeps what is done.",
         ]
@@ -82,7 +90,7 @@ def _run(words: list[str]) -> int:
 
         print(f"retrim {version('retrim')}")
         return 0
-    known = commands()
+    known = own_commands() if words[0] in COMMANDS else commands()
     if words[0] not in known:
         import difflib
 
@@ -109,25 +117,28 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
 
     from ..runkit.compile_flags import compile_for
     from .console import console, refuse
-    from .options import readable
+    from .options import simplify_help
 
     compile_for(name)
     command = importlib.import_module(module)
-    whole = TRACEBACK in words
+    full_traceback = TRACEBACK in words
     words = [word for word in words if word != TRACEBACK]
     try:
         if hasattr(command, "COMMANDS"):
             call = tyro.extras.subcommand_cli_from_dict(
-                {n: tyro.conf.configure(tyro.conf.AvoidSubcommands)(readable(f)) for n, f in command.COMMANDS.items()},
+                {
+                    n: tyro.conf.configure(tyro.conf.AvoidSubcommands)(simplify_help(f))
+                    for n, f in command.COMMANDS.items()
+                },
                 prog=f"retrim {name}",
                 description=about,
                 args=words,
             )
         else:
-            call = tyro.cli(readable(getattr(command, name)), prog=f"retrim {name}", args=words)
+            call = tyro.cli(simplify_help(getattr(command, name)), prog=f"retrim {name}", args=words)
         code: int = call(stop)
     except Exception as error:
-        if whole:
+        if full_traceback:
             raise
         message = _message_of(error, words)
         if message is None:

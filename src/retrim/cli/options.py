@@ -12,7 +12,7 @@ import tyro
 PLACEHOLDERS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 
 
-def listed(names: Iterable[str]) -> str:
+def join_names(names: Iterable[str]) -> str:
     """Return names separated by commas, for a help text."""
     return ", ".join(names)
 
@@ -28,7 +28,7 @@ def option(text: str, *, optional: bool = False) -> Any:
     return tyro.conf.arg(help=text, **more)
 
 
-def readable(command: Callable[..., Any]) -> Callable[..., Any]:
+def simplify_help(command: Callable[..., Any]) -> Callable[..., Any]:
     """Return a command whose help shows placeholders and no defaults for optional options.
 
     Args:
@@ -44,13 +44,13 @@ def readable(command: Callable[..., Any]) -> Callable[..., Any]:
         parameters.append(parameter.replace(annotation=hint))
 
     @functools.wraps(command)
-    def same(*words: Any, **options: Any) -> Any:
+    def wrapper(*words: Any, **options: Any) -> Any:
         return command(*words, **options)
 
-    same.__annotations__ = {each.name: each.annotation for each in parameters} | {"return": hints.get("return", Any)}
-    vars(same)["__signature__"] = signature.replace(parameters=parameters)
-    del same.__wrapped__  # only the wrapper's own signature is used
-    return same
+    wrapper.__annotations__ = {each.name: each.annotation for each in parameters} | {"return": hints.get("return", Any)}
+    vars(wrapper)["__signature__"] = signature.replace(parameters=parameters)
+    del wrapper.__wrapped__  # only the wrapper's own signature is used
+    return wrapper
 
 
 def _of_hint(hint: Any) -> dict[str, Any]:

@@ -40,6 +40,9 @@ class LearnerRequest:
             ConfigError: The preset names an unknown optimiser, or contains settings that its task does not permit.
         """
         make = OPTIMISERS.find(self.preset.adapt.optimiser)
+        if not callable(make):
+            name = self.preset.adapt.optimiser
+            raise ConfigError(f"optimiser {name!r} is a {type(make).__name__}, not an AbstractPolicyOptimiser")
         result = learner_settings(self.preset, self.env, make)
         return kind(**{"env": self.env, "residual_model": self.model, **result, **settings})
 
@@ -59,7 +62,10 @@ def make_learner(request: LearnerRequest) -> OnlineLearner:
         ConfigError: There is no such learner, or the function does not return an :class:`~retrim.OnlineLearner`.
     """
     name = request.preset.adapt.learner
-    learner = LEARNERS.find(name)(request)
+    make = LEARNERS.find(name)
+    if not callable(make):
+        raise ConfigError(f"learner {name!r} is a {type(make).__name__}, not a function that takes a LearnerRequest")
+    learner = make(request)
     if not isinstance(learner, OnlineLearner):
         raise ConfigError(f"learner {name!r} gives a {type(learner).__name__}, expected a retrim.OnlineLearner")
     return learner

@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from ..errors import ConfigError, excerpt
 from .validation import suggestion
@@ -61,11 +61,19 @@ class Registry(Mapping[str, T], Generic[T]):
             return self._known[name]
         if ":" in name:
             return self._imported(name)
-        for entry in entry_points(group=f"retrim.{self._kind}s"):
+        for entry in self._entries():
             if entry.name == name:
                 result: T = entry.load()
                 return result
-        raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, self)}, or {self._example}")
+        known = (*self, *self.plugins())
+        raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, known)}, or {self._example}")
+
+    def plugins(self) -> tuple[str, ...]:
+        """Return the names that installed packages add through entry points."""
+        return tuple(entry.name for entry in self._entries())
+
+    def _entries(self) -> Iterator[Any]:
+        yield from entry_points(group=f"retrim.{self._kind}s")
 
     def _imported(self, name: str) -> T:
         module, _, attribute = name.partition(":")
