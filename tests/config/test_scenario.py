@@ -142,6 +142,9 @@ BOUNDS = {
     "battery": (0.0, 0.1),
     "weak-rotor": (0.3, 1.0),
     "fan": (None, 20.0),
+    "table-edge": (0.0, 0.5),
+    "ceiling": (0.0, 1.0),
+    "downwash": (0.3, 3.0),
 }
 
 

@@ -15,9 +15,10 @@ from retrim.plants.plant import Measurement, Plant, as_numpy
 
 
 def knobbed(plant="simple", **scenario):
-    made = Scenario(plant=plant, **scenario).make("small")
+    scenario = Scenario(plant=plant, **scenario)
+    made = scenario.make("small")
     made.reset(None)
-    return KnobbedPlant(made, Scenario(plant=plant, **scenario), 0)
+    return KnobbedPlant(made, scenario.make_disturbance("small"))
 
 
 def speeds(plant, ticks):
@@ -108,7 +109,7 @@ def test_a_plant_without_knobs_says_so_and_its_errors_are_its_own():
         def stop(self):
             pass
 
-    plant = KnobbedPlant(Bare(), Scenario(), 0)
+    plant = KnobbedPlant(Bare(), Scenario().make_disturbance())
     plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
     assert plant.refused == "this plant has no knobs"
     assert plant.step(Command.hover(jnp.zeros(0).dtype))[0].t == 0.0

@@ -8,7 +8,9 @@ from jaxtyping import Array, Key
 
 from ..errors import ConfigError
 from ..physics.disturbance import Constant, Disturbance, Kick, RandomWalk, Reversing, Step, SumOfDisturbances
+from ..physics.downwash import Downwash
 from ..physics.faults import BatterySag, Payload, WeakRotor
+from ..physics.proximity import BELOW, Ceiling, TableEdge
 from ..physics.wind import Dryden, Fan, SteadyWind
 from .registry import Registry
 from .sizes import name_and_size
@@ -16,6 +18,7 @@ from .sizes import name_and_size
 DisturbanceFactory = Callable[[Key[Array, ""], float | None], Disturbance]
 """Function that takes a random key and a size (or None for the default size), and returns a disturbance."""
 
+GOAL_HEIGHT = 1.0  # [m], height of the default goal and of the built-in references
 SEED_TAG = 2**30 + 3  # folded into seeds, to keep disturbances from sharing keys with starts, learners or sensors
 
 DISTURBANCES: Registry[DisturbanceFactory] = Registry("disturbance", example="sums as wind+payload=0.1, or module:name")
@@ -74,6 +77,22 @@ def _fan(key: Key[Array, ""], size: float | None) -> Disturbance:
     return Fan.of(outlet, direction, speed=_bounded(size, 6.0, 0.0, 20.0, "m/s"), width=0.3, key=key)
 
 
+def _table_edge(key: Key[Array, ""], size: float | None) -> Disturbance:
+    # The table begins under the centre of the built-in circle, and its top is below the height of the built-in goal.
+    clearance = _bounded(size, 0.02, 0.0, 0.5, "m")
+    return TableEdge.of(GOAL_HEIGHT - BELOW - clearance, 1.0)
+
+
+def _ceiling(key: Key[Array, ""], size: float | None) -> Disturbance:
+    return Ceiling.of(GOAL_HEIGHT + _bounded(size, 0.05, 0.0, 1.0, "m"))
+
+
+def _downwash(key: Key[Array, ""], size: float | None) -> Disturbance:
+    # The second vehicle is above the far end of the built-in circle.
+    above = _bounded(size, 0.75, 0.3, 3.0, "m")
+    return Downwash.of(jnp.array([2.0, 0.0, GOAL_HEIGHT + above]))
+
+
 _BUILT_IN: dict[str, DisturbanceFactory] = {
     "none": _push(0.0),
     "small": _push(0.5),  # the paper's levels [m/s^2] per axis (Sec. IV-B)
@@ -95,6 +114,9 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
     "wind": lambda key, size: SteadyWind(_diagonal(_bounded(size, 4.0, 0.0, 20.0, "m/s"))),
     "gusts": lambda key, size: Dryden.of(_diagonal(_bounded(size, 4.0, 0.5, 20.0, "m/s")), key=key),
     "fan": _fan,
+    "table-edge": _table_edge,  # size: clearance below the vehicle
+    "ceiling": _ceiling,  # size: distance above the rotors
+    "downwash": _downwash,  # size: height of a second vehicle above the goal
     "payload": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg")),  # the paper: 190 g become 260 g
     "pickup": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg"), picked=8.0, dropped=20.0),
     "battery": lambda key, size: BatterySag(  # size: relative loss of thrust per second

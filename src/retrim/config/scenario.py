@@ -5,6 +5,7 @@ from typing import Any
 
 from ..errors import ConfigError, RetrimError
 from ..physics.command_path import LONGEST_DELAY
+from ..physics.disturbance import Disturbance, for_vehicle
 from ..physics.vehicle import Vehicle
 from ..plants.plant import Plant
 from .disturbances import disturbance
@@ -121,6 +122,18 @@ class Scenario:
         """
         return make_vehicle(self.vehicle or trained_for)
 
+    def make_disturbance(self, trained_for: str | VehicleSpec | Vehicle = "small", *, seed: int = 0) -> Disturbance:
+        """Build the disturbance for the vehicle of the flight.
+
+        Args:
+            trained_for: Training vehicle of the policy, used unless the scenario has a vehicle.
+            seed: Seed of the random parts of the disturbance.
+        """
+        return for_vehicle(disturbance(self.disturbance, seed), self._simulated_vehicle(trained_for))
+
+    def _simulated_vehicle(self, trained_for: str | VehicleSpec | Vehicle) -> Vehicle:
+        return make_vehicle(self.vehicle or ("small" if self.entry.own_vehicle else trained_for))
+
     def make(self, trained_for: str | VehicleSpec | Vehicle = "small", *, dt: float = 0.02, seed: int = 0) -> Plant:
         """Build the plant.
 
@@ -135,8 +148,8 @@ class Scenario:
         """
         entry = self.entry
         request = PlantRequest(
-            make_vehicle(self.vehicle or ("small" if entry.own_vehicle else trained_for)),
-            disturbance(self.disturbance, seed),
+            self._simulated_vehicle(trained_for),
+            self.make_disturbance(trained_for, seed=seed),
             SENSORS.find(self.sensors)(),
             self.thrust_error,
             dt,

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from ..config.disturbances import disturbance
-from ..config.scenario import Scenario
 from ..errors import MessageError, PlantError
 from ..onboard.messages import pack_note, unpack_note
 from ..onboard.note_fields import read_fields
-from ..physics.disturbance import HeldEffects, SumOfDisturbances
+from ..physics.disturbance import Disturbance, HeldEffects, SumOfDisturbances
 from ..physics.effects import ExternalEffects
 from ..physics.state import Command
 from ..physics.vehicle import payload_inertia
@@ -78,13 +76,18 @@ class ManualDisturbance:
 class KnobbedPlant:
     """Plant with knobs that may change in flight. The plant rejects unsupported knobs, and the flight continues."""
 
-    def __init__(self, plant: Plant, scenario: Scenario, seed: int) -> None:
-        """Initialise with a plant; a user-defined plant without a ``disturb`` method has no knobs."""
+    def __init__(self, plant: Plant, disturbance: Disturbance) -> None:
+        """Initialise with a plant; a user-defined plant without a ``disturb`` method has no knobs.
+
+        Args:
+            plant: The plant.
+            disturbance: Disturbance of the scenario.
+        """
         self.refused = "" if hasattr(plant, "disturb") else "this plant has no knobs"
         """Reason why the last change of the knobs was rejected; empty if it was accepted."""
         self._plant, self._possible = plant, not self.refused
         self._knobs, self._left = ManualDisturbance(), 0
-        self._scenario = disturbance(scenario.disturbance, seed)
+        self._scenario = disturbance
         self._turn()
 
     def turn(self, knobs: ManualDisturbance) -> None:

@@ -55,7 +55,7 @@ def simulate(plan: PlantPlan) -> None:
     x0 = state_of(plan.x0, jnp.zeros(0).dtype)
     try:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
-            knobbed = KnobbedPlant(plant, plan.scenario, plan.seed)
+            knobbed = KnobbedPlant(plant, plan.scenario.make_disturbance(plan.vehicle, seed=plan.seed))
             for load in (0.0, 0.01):  # compile and run every program
                 plant.reset(x0)
                 knobbed.turn(ManualDisturbance(load=load))

@@ -18,6 +18,7 @@ from .disturbance import Push as Push
 from .disturbance import RandomWalk as RandomWalk
 from .disturbance import Reversing as Reversing
 from .disturbance import SumOfDisturbances as SumOfDisturbances
+from .downwash import Downwash as Downwash
 from .dynamics import AbstractDynamics as AbstractDynamics
 from .dynamics import Hybrid as Hybrid
 from .dynamics import PointMass as PointMass
@@ -31,6 +32,8 @@ from .faults import WeakRotor as WeakRotor
 from .propeller import Propeller as Propeller
 from .propeller import five_inch as five_inch
 from .propeller import three_inch as three_inch
+from .proximity import Ceiling as Ceiling
+from .proximity import TableEdge as TableEdge
 from .rotors import LinearDragQuadrotor as LinearDragQuadrotor
 from .second_order import SecondOrderQuadrotor as SecondOrderQuadrotor
 from .state import STANDARD_GRAVITY as STANDARD_GRAVITY

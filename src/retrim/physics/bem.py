@@ -11,7 +11,7 @@ from .betaflight import Betaflight
 from .effects import ExternalEffects
 from .propeller import AIR_DENSITY, BladeForces, Inflow, hover_coefficient, rotor
 from .state import STANDARD_GRAVITY, Command, State
-from .substep import SUBSTEP, AbstractSubstepDynamics, RotorState, check_tick, rigid_body, signs
+from .substep import SUBSTEP, AbstractSubstepDynamics, RotorState, check_tick, hub_places, rigid_body, signs
 from .vehicle import Vehicle
 
 IN_PLANE_GAIN = 3.0  # identified in flight, since blade elements alone underestimate the drag of the whole vehicle
@@ -139,9 +139,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
 
     def places(self) -> Float[Array, "4 3"]:
         """Return the hub positions in the body frame [m]."""
-        arm = self.vehicle.arm
-        turn = signs(arm.dtype)  # the lever of a rotor at (x, y) is y about the x axis, and -x about the y axis
-        return jnp.stack([-arm[0] * turn[1], arm[1] * turn[0], jnp.zeros(4, dtype=arm.dtype)], axis=1)
+        return hub_places(self.vehicle.arm)
 
     def loads(self, b: RotorState, motors: Float[Array, "4"], blades: BladeForces, effects: ExternalEffects) -> Loads:
         """Return the force and torque from the rotors, body drag, the motors' yaw reaction and gyroscopic effects."""

@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Key
 
 from .effects import ExternalEffects
 from .state import State
+from .vehicle import Vehicle
 
 
 @runtime_checkable
@@ -51,6 +52,21 @@ class SumOfDisturbances(eqx.Module):
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Return the sum of the parts."""
         return sum((part(t, x) for part in self.parts), start=ExternalEffects.calm(x.p.dtype))
+
+    def for_vehicle(self, vehicle: Vehicle) -> "SumOfDisturbances":
+        """Return the sum of the parts for a vehicle."""
+        return SumOfDisturbances(tuple(for_vehicle(part, vehicle) for part in self.parts))
+
+
+def for_vehicle(disturbance: Disturbance, vehicle: Vehicle) -> Disturbance:
+    """Return a disturbance for a vehicle; one whose effects depend on the rotors has a method ``for_vehicle``.
+
+    Args:
+        disturbance: Disturbance by name.
+        vehicle: Vehicle of the flight.
+    """
+    fit: Callable[[Vehicle], Disturbance] | None = getattr(disturbance, "for_vehicle", None)
+    return disturbance if fit is None else fit(vehicle)
 
 
 class HeldEffects(eqx.Module):

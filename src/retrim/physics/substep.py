@@ -59,6 +59,16 @@ def signs(dtype: jnp.dtype) -> Float[Array, "3 4"]:
     return jnp.array(SIGNS, dtype=dtype)
 
 
+def hub_places(arm: Float[Array, "2"]) -> Float[Array, "4 3"]:
+    """Return the hub positions in the body frame [m].
+
+    Args:
+        arm: Distance of the rotors from the centre along body x and y [m].
+    """
+    turn = signs(arm.dtype)  # the lever of a rotor at (x, y) is y about the x axis, and -x about the y axis
+    return jnp.stack([-arm[0] * turn[1], arm[1] * turn[0], jnp.zeros(4, dtype=arm.dtype)], axis=1)
+
+
 class RotorState(eqx.Module):
     """State of a vehicle with rotors and a rate loop."""
 
