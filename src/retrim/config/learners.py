@@ -16,7 +16,7 @@ from ..adapt.trim import RestTrim, Untrimmed
 from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
-from ..control.gravity_frame import GravityFrame, PoseFrame
+from ..control.gravity_frame import GravityFrame, PoseFrame, lead_of
 from ..errors import ConfigError, FrameError
 from ..estimation.command_path import PathEstimator
 from ..estimation.disturbance_observer import DisturbanceObserver
@@ -131,15 +131,17 @@ def effective_gravity_frame(
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
         return PoseFrame(controller, limit)
+    path = declared_path(preset, vehicle)
     observer = DisturbanceObserver(
         PointMass(preset.dt),
         jnp.array(OBSERVER_TAU),
         limit,
         jnp.array(WANDER if preset.family is None else FAMILY_WANDER),
-        declared_path(preset, vehicle),
+        path,
         (vehicle.command_min, vehicle.command_max),
         longest_delay=longest_delay(preset),
     )
     result = None if known is None else known.turning
     bias = jnp.zeros(3) if result is None else result.bias
-    return GravityFrame(controller, observer, known, rate_bias=bias)
+    place = None if known is None else known.place
+    return GravityFrame(controller, observer, known, rate_bias=bias, place=place, lead=lead_of(path, preset.dt))

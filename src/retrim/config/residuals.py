@@ -10,6 +10,7 @@ from ..learn.residuals.ensemble import EnsembleModel
 from ..learn.residuals.layered import LayeredModel
 from ..learn.residuals.linear import LinearModel
 from ..learn.residuals.model import ResidualModel
+from ..learn.residuals.place import PlaceModel
 from ..learn.residuals.regression import BLOCK, RegressionModel
 from ..physics.vehicle import Vehicle
 from .command_paths import lag_of
@@ -75,6 +76,11 @@ def _layered(request: ResidualRequest) -> ResidualModel:
     return LayeredModel(_regression(request), _ensemble(request, SMALL))
 
 
+def _place(request: ResidualRequest) -> PlaceModel:
+    p = request.preset
+    return PlaceModel.of(_regression(request), p.dt, every=p.adapt.fit_every)
+
+
 def _linear(request: ResidualRequest) -> LinearModel:
     return LinearModel.of(request.preset.dt, every=request.preset.adapt.fit_every)
 
@@ -83,3 +89,4 @@ register_residual("ensemble", _ensemble)
 register_residual("regression", _regression)
 register_residual("layered", _layered)
 register_residual("linear", _linear)
+register_residual("place", _place)

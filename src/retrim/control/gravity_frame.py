@@ -6,6 +6,7 @@ inputs or training. A disturbance that changes with state and command is treated
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float
 from ..estimation.disturbance_observer import DisturbanceObserver, ObserverState
 from ..estimation.latency import ahead
 from ..physics.actuator_response import ActuatorState
-from ..physics.command_path import CommandQueue
+from ..physics.command_path import CommandPath, CommandQueue
 from ..physics.dynamics import Hybrid, Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
@@ -56,6 +57,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
     """Share of the learned residual and of the learned rate bias that is used."""
     actuators: ActuatorState | None = None
     """Present thrust and body rates; None if the last command acts."""
+    place: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None
+    """Learned acceleration as a function of position, world [m/s^2]. The frame uses its value at the position at which
+    the command acts, since an estimate of this value would be late; None if the residual does not depend on
+    position."""
+    lead: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
+    """Time from a measurement that is not late until the thrust has followed a command [s]."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Disturbance that turns the frame in addition to the estimated one, in the world frame [m/s^2]."""
 
@@ -70,10 +77,11 @@ class GravityFrame(AbstractController[GravityFrameState]):
         frame must not turn much faster than the vehicle can follow.
         """
         observer = dataclasses.replace(self.observer, path=member.path)
+        lead = lead_of(member.path, observer.nominal.dt).astype(self.lead.dtype)
         if member.lateness is not None:
             tau = jnp.clip(SHARE_OF_LATENESS * member.lateness, FASTEST, SLOWEST)
             observer = dataclasses.replace(observer, tau=tau.astype(self.observer.tau.dtype))
-        return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer)
+        return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer, lead=lead)
 
     def with_actuators(self, actuators: ActuatorState) -> "GravityFrame":
         """Return the same controller for a tick in which thrust and body rates are known."""
@@ -92,9 +100,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
         """Return the command of the inner controller, in the frame of the present effective gravity."""
         observer, felt = self.observer, jnp.zeros_like(x.p)
         if self.known is not None:
-            unsteady = StateDependentResidual(self.known, self.trust_known)
+            unsteady = StateDependentResidual(self.known, self.trust_known, self.place)
             felt = unsteady(x, memory.observer.commands.newest)
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
+            if self.place is not None:
+                there = x.p + (self.lead + self.age).astype(x.p.dtype) * x.v
+                felt = felt + self.trust_known.astype(x.p.dtype) * (self.place(there) - self.place(x.p))
         observed = observer(memory.observer, t, x)
         felt = self.trust_estimate.astype(x.p.dtype) * (observed.d_hat + felt) + self.steady.astype(x.p.dtype)
         frame = EffectiveGravityFrame.of(capped(felt, observer.limit))
@@ -148,16 +159,20 @@ class PoseFrame(AbstractController[tuple[OccludedMemory, Command]]):
 
 
 class StateDependentResidual(eqx.Module):
-    """Part of a residual beyond its value at rest; this part depends on state and command."""
+    """Part of a residual beyond its value at rest, and its part that depends on position."""
 
     residual: Residual
     share: Float[Array, ""]
-    """Share of this part that is used."""
+    """Share of these parts that is used."""
+    place: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None
+    """Part that depends on position; None if there is none."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return this part of the residual acceleration in the world frame [m/s^2]."""
-        rest = self.residual(x, u) - self.residual(State.at(x.p), Command.hover(x.p.dtype))
-        return self.share.astype(x.p.dtype) * rest
+        beyond = self.residual(x, u) - self.residual(State.at(x.p), Command.hover(x.p.dtype))
+        if self.place is not None:
+            beyond = beyond + self.place(x.p)
+        return self.share.astype(x.p.dtype) * beyond
 
 
 class NormLimited(eqx.Module):
@@ -170,6 +185,17 @@ class NormLimited(eqx.Module):
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the residual acceleration in the world frame [m/s^2]."""
         return capped(self.residual(x, u), self.limit)
+
+
+def lead_of(path: CommandPath, dt: float) -> Float[Array, ""]:
+    """Return the mean time from a command's tick until the thrust has followed it [s].
+
+    Args:
+        path: Command path of the vehicle.
+        dt: Control tick [s].
+    """
+    lag = jnp.zeros_like(path.delay) if path.response is None else path.response.thrust_lag
+    return path.delay + lag + 0.5 * dt
 
 
 def capped(d: Float[Array, "3"], limit: Float[Array, ""]) -> Float[Array, "3"]:

@@ -10,6 +10,8 @@ from .linear import LinearModel as LinearModel
 from .linear import LinearState as LinearState
 from .model import FittedResidual as FittedResidual
 from .model import ResidualModel as ResidualModel
+from .place import PlaceModel as PlaceModel
+from .place import PlaceState as PlaceState
 from .rates import RateFit as RateFit
 from .rates import RateModel as RateModel
 from .regression import RegressionModel as RegressionModel

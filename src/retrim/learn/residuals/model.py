@@ -18,7 +18,8 @@ class ResidualModel(Protocol):
     Every method is pure and traceable. The state is a pytree of arrays with fixed shapes. A model that also identifies
     the bias and lag of the body rates has a method ``turning``, which maps its state to a
     :class:`~retrim.learn.residuals.rates.RateFit`. A model that quantifies its uncertainty has a method ``spread``,
-    which takes the arguments of ``predict`` and returns one standard deviation per axis [m/s^2].
+    which takes the arguments of ``predict`` and returns one standard deviation per axis [m/s^2]. A model with a part
+    that depends on position has a method ``at_place``, which maps its state and a position [m] to this part [m/s^2].
     """
 
     def init(self, key: Key[Array, ""]) -> Any:
@@ -50,6 +51,23 @@ class FittedResidual(eqx.Module):
         turning: Callable[[Any], RateFit] | None = getattr(self.model, "turning", None)
         return None if turning is None else turning(self.state)
 
+    @property
+    def place(self) -> "PlaceResidual | None":
+        """Part of the residual that depends on position; None for a model without such a part."""
+        return PlaceResidual(self.model, self.state) if hasattr(self.model, "at_place") else None
+
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the predicted residual acceleration in the world frame [m/s^2]."""
         return self.model.predict(self.state, x, u)
+
+
+class PlaceResidual(eqx.Module):
+    """The part of a fitted residual that depends on position, as a function of the position."""
+
+    model: Any
+    state: Any
+
+    def __call__(self, p: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Return the acceleration at a position, world [m/s^2]; ``p`` is in the world frame [m]."""
+        a: Array = self.model.at_place(self.state, p)
+        return a
