@@ -380,6 +380,17 @@ def test_every_section_is_written_when_it_is_added(tmp_path):
     assert document.run.pages == [tmp_path / "table.md"]
 
 
+def test_a_page_begins_with_results_and_ends_with_provenance(tmp_path):
+    document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0, 4], Silent())
+    document.add(TableSection(("a",), (("1",),), "First"))
+    page = (tmp_path / "table.md").read_text()
+    results_only, _, provenance = page.partition("## Provenance\n\n")
+    assert results_only == "# Title\n\nIntro.\n\n## First\n\n| a |\n|---|\n| 1 |\n\n"
+    for fact in ("training seeds 0, 4", "Command: `", "Compiling"):
+        assert fact in provenance
+        assert fact not in results_only
+
+
 def test_errors_are_read_around_reversals_and_updates(tmp_path):
     """A reversal every 15 s; updates start every 5 s and fly a second later."""
     moments, updates = _moments(Adapt(), 60.0)

@@ -1,13 +1,14 @@
 """Renders all tables as sections of text cells, and writes Markdown and JSON whenever a section is added."""
 
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..errors import one_line
-from .provenance import describe_code, describe_hardware
+from .provenance import command_line, describe_code, describe_hardware
 from .reporter import Reporter
 from .run import Run
 
@@ -88,18 +89,27 @@ class Document:
         self.write()
 
     def write(self) -> Path:
-        """Write both files; return the path of the Markdown file."""
-        seeds = ", ".join(map(str, self.seeds))
+        """Write both files; return the path of the Markdown file.
+
+        The page begins with the results. Commit, machine, command and run times are its last section.
+        """
         remark = [self.run.remark, ""] if self.run.remark else []
         head = [f"# {as_text(self.title)}", "", self.intro, "", *remark]
-        trained = f"; training seeds {seeds}" if seeds else ""
-        head += [f"{describe_code()}; {describe_hardware()}{trained}.", ""]
         body = [line for section in self.sections for line in section.markdown()]
-        foot = self.run.watch.sentence() + (" Interrupted: incomplete." if self.run.interrupted else "")
-        if self.run.reused:
-            foot += f" An earlier run had made {self.run.reused} of the parts; its time is not counted."
+        foot = ["## Provenance", "", self._provenance(), ""]
         self.run.write_results(self._rows, seeds=self.seeds, name=self.data or self.name, **self.more)
-        page = self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, foot, ""]))
+        page = self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, *foot]))
         if page not in self.run.pages:
             self.run.pages.append(page)
         return page
+
+    def _provenance(self) -> str:
+        """Return the commit, the machine, the seeds, the command and the run times."""
+        trained = f"; training seeds {', '.join(map(str, self.seeds))}" if self.seeds else ""
+        command = as_text(command_line(sys.argv[1:])).replace("`", "'")
+        text = f"{describe_code()}; {describe_hardware()}{trained}. Command: `{command}`. {self.run.watch.sentence()}"
+        if self.run.interrupted:
+            text += " Interrupted: incomplete."
+        if self.run.reused:
+            text += f" An earlier run had made {self.run.reused} of the parts; its time is not counted."
+        return text
