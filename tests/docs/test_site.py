@@ -1,12 +1,15 @@
-"""The site shows what the command line states."""
+"""The site leads to every page, and shows what the command line and the result pages state."""
 
 import importlib.util
 import re
 from pathlib import Path
 
+import pytest
+
 from retrim.cli.main import commands
 
 DOCS = Path(__file__).parents[2] / "docs"
+LINK = re.compile(r"\]\(([\w./-]+\.md)")
 
 
 def load_hook(name):
@@ -14,6 +17,47 @@ def load_hook(name):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.mark.parametrize(("index", "folder"), [("how-to/index.md", "how-to"), ("reference/index.md", "reference")])
+def test_an_index_leads_to_every_page_of_its_folder(index, folder):
+    pages = {path.name for path in (DOCS / folder).glob("*.md")} - {"index.md", "commands.md"}
+    assert pages <= set(LINK.findall((DOCS / index).read_text()))
+
+
+def test_the_index_of_results_has_one_row_for_each_page_with_its_commit():
+    rows = re.findall(
+        r"^\| \[.*\]\((results/[^)]+)\) \|.*\| (?:code )?`(\w+)` \|$", (DOCS / "results.md").read_text(), re.M
+    )
+    pages = sorted(path.relative_to(DOCS).as_posix() for path in (DOCS / "results").rglob("*.md"))
+    assert sorted(page for page, _ in rows) == pages
+    for page, commit in rows:
+        text, mark, provenance = (DOCS / page).read_text().partition("\n## Provenance\n")
+        assert mark, page
+        assert commit in provenance, page
+        assert commit not in text, page
+
+
+def test_the_navigation_is_short():
+    nav = (DOCS.parent / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    assert len(re.findall(r"^ *- ", nav, re.M)) <= 45
+
+
+def test_a_result_page_begins_with_the_answer_of_the_index():
+    hook = load_hook("result_answers")
+    rows = hook.read_index(DOCS)
+    assert len(rows) == len(list((DOCS / "results").rglob("*.md")))
+    row = rows["results/hover.md"]
+
+    class Page:
+        class file:
+            src_uri = row.page
+
+    class Config:
+        docs_dir = str(DOCS)
+
+    page = hook.on_page_markdown((DOCS / row.page).read_text(), page=Page, config=Config)
+    assert page.index(row.question) < page.index(row.answer) < page.index("Made by")
 
 
 def test_the_page_of_commands_has_every_option():
