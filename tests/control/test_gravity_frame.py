@@ -12,7 +12,7 @@ from jax import lax, random
 from helpers import GOAL, first_order, hover_env, hover_task, random_command, random_state, replaced
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
-from retrim.control.controller import PolicyController
+from retrim.control.controller import AbstractController, PolicyController
 from retrim.control.gravity_frame import GravityFrame, PoseFrame, StateDependentResidual
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, FittedResidual, rollout
@@ -384,3 +384,57 @@ def test_a_corrected_model_turns_as_the_vehicle_was_seen_to_turn(key):
     for seen, expected in ((world, RateBiased(true, known.rates.bias)), (framed, true)):
         x, u = random_state(key), random_command(key)
         close(seen.step(seen.init(x), u, jnp.zeros(3)), expected.step(expected.init(x), u, jnp.zeros(3)))
+
+
+class Standstill(AbstractController[None]):
+    """Commands hover in every frame."""
+
+    def in_frame(self, frame):
+        return self
+
+    def init(self, x):
+        return None
+
+    def __call__(self, memory, t, x):
+        return Command.hover(x.p.dtype), memory
+
+    def accepted(self, memory, u):
+        return memory
+
+
+def everywhere(force, p):
+    """A map with one value."""
+    return force
+
+
+def bump(height, p):
+    """A force near the origin of the plane."""
+    return height * jnp.exp(-0.5 * jnp.sum(p[:2] ** 2) / 0.2**2)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 2.0])
+def test_a_wrong_map_does_not_change_the_estimate_of_a_steady_disturbance(share):
+    """The observer estimates the remainder of the map, so their sum is the disturbance, whatever the map states."""
+    d = jnp.array([1.0, -0.5, 2.0])
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.02), LIMIT, jnp.array(jnp.inf))
+    nothing = eqx.Partial(always, jnp.zeros(3))
+    frame = GravityFrame(Standstill(), observer, nothing, place=eqx.Partial(everywhere, share * d))
+    x = State.at(jnp.array([0.0, 0.0, 1.0]))
+    memory = frame.init(x)
+    for k in range(60):
+        u, memory = frame(memory, jnp.array(0.02 * k), x)
+        nominal = PointMass(0.02)
+        x = nominal.state(nominal.step(nominal.init(x), u, d))
+    np.testing.assert_allclose(memory.frame.d, d, atol=2e-2)
+
+
+def test_the_map_is_read_where_the_command_acts():
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.02), LIMIT, jnp.array(jnp.inf))
+    force = eqx.Partial(bump, jnp.array([0.0, 0.0, 2.0]))
+    frame = GravityFrame(
+        Standstill(), observer, eqx.Partial(always, jnp.zeros(3)), place=force, lead=jnp.array(0.06)
+    ).with_age(0.02)
+    x = State(jnp.array([-0.2, 0.0, 1.0]), jnp.eye(3), jnp.array([2.0, 0.0, 0.0]))
+    _, memory = frame(frame.init(x), jnp.array(0.0), x)
+    there = x.p + 0.08 * x.v
+    np.testing.assert_allclose(memory.frame.d - memory.observer.d_hat, force(there), atol=1e-6)

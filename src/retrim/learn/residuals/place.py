@@ -131,7 +131,7 @@ class PlaceModel(eqx.Module):
         age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
         new = rows.valid & ((age < round(self.every / self.dt)) | (state.fits == 0))
         remainder = rows.a_res - jax.vmap(lambda x: self._drag(first, x))(rows.x)
-        agreement, prediction = self._evidence(state, forecast, remainder - state.map.weights[-1], new)
+        agreement, prediction = self._evidence(state, forecast, remainder - state.map.weights[-1:], new)
         after = self._learn(state.map, p, remainder, new, state.fits)
         fitted = PlaceState(first, after, agreement, prediction, state.fits + 1)
         error = rows.a_res - jax.vmap(lambda x, u: self.predict(fitted, x, u))(rows.x, rows.u)
