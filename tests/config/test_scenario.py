@@ -139,6 +139,7 @@ BOUNDS = {
     "gusts": (0.5, 20.0),
     "payload": (None, 20.0),
     "pickup": (None, 20.0),
+    "off-centre": (-0.2, 0.2),
     "battery": (0.0, 0.1),
     "weak-rotor": (0.3, 1.0),
     "fan": (None, 20.0),

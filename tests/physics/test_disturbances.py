@@ -11,11 +11,13 @@ from retrim.config.disturbances import DISTURBANCES
 from retrim.physics import (
     BatterySag,
     BemQuadrotor,
+    Command,
     Constant,
     Disturbance,
     Dryden,
     ExternalEffects,
     Fan,
+    LinearDragQuadrotor,
     Payload,
     Push,
     RandomWalk,
@@ -28,10 +30,11 @@ from retrim.physics import (
     small,
 )
 from retrim.physics.propeller import Inflow
+from retrim.physics.substep import hub_places
 from retrim.physics.vehicle import payload_inertia
 from retrim.physics.wind import FEET
 
-SHAPES = {"push": (3,), "wind": (3,), "gain": (4,), "mass": (), "inertia": (3,)}
+SHAPES = {"push": (3,), "wind": (3,), "gain": (4,), "mass": (), "inertia": (3,), "moment": (3,)}
 
 
 def at(*p):
@@ -56,7 +59,7 @@ def test_all(name, double):
         disturbance = DISTURBANCES[name](random.key(1), None)
         assert isinstance(disturbance, Disturbance)
         times = [*np.arange(0.0, 12.0, 0.05), 100.0, 3600.0]  # a kick lasts a tenth of a second
-        found = over(disturbance, times, at(0.3, -0.2, 1.0))
+        found = over(disturbance, times, at(1.9 if name == "downwash" else 0.3, -0.2, 1.0))
         for field, shape in SHAPES.items():
             value = getattr(found, field)
             assert value.shape == (len(times), *shape)
@@ -248,6 +251,22 @@ def test_payload_is_picked_up_and_dropped():
     for mass, picked, dropped in ((0.0, 0.0, 1.0), (0.1, 2.0, 2.0), (0.1, 3.0, 1.0)):
         with pytest.raises(ValueError, match="Payload: mass = "):
             Payload.of(mass, picked=picked, dropped=dropped)
+
+
+@pytest.mark.parametrize("ahead", [0.05, -0.08])
+def test_the_rotors_balance_a_load_off_the_centre(ahead):
+    """Once the rate loop has trimmed the vehicle, the thrusts have no torque about the common centre of mass."""
+    load = Payload.of(0.07, ahead=ahead)
+    model = LinearDragQuadrotor.of(small(), 0.02, thrust_error=0.0)
+    start = model.init(at(0.0, 0.0, 1.0))
+    effects = load(jnp.array(0.0), at(0.0, 0.0, 1.0))
+    u = Command(jnp.array(9.81), jnp.zeros(3))
+    end = jax.jit(lambda s: lax.fori_loop(0, 4000, lambda _, s: model.substep(s, u, effects), s))(start)
+    thrusts = np.asarray(small().thrust_coefficient * end.motors**2)
+    shift = 0.07 * ahead / (0.07 + float(small().mass))
+    places = np.asarray(hub_places(small().arm))[:, 0]
+    np.testing.assert_allclose(thrusts @ (places - shift), 0.0, atol=2e-4 * thrusts.sum())
+    np.testing.assert_allclose(end.omega, 0.0, atol=5e-3)
 
 
 def test_battery_sags_to_a_floor():

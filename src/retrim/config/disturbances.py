@@ -118,6 +118,7 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
     "ceiling": _ceiling,  # size: distance above the rotors
     "downwash": _downwash,  # size: height of a second vehicle above the goal
     "payload": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg")),  # the paper: 190 g become 260 g
+    "off-centre": lambda key, size: Payload.of(0.07, ahead=_bounded(size, 0.03, -0.2, 0.2, "m")),  # the same load
     "pickup": lambda key, size: Payload.of(_bounded(size, 0.07, 0.0, 20.0, "kg"), picked=8.0, dropped=20.0),
     "battery": lambda key, size: BatterySag(  # size: relative loss of thrust per second
         jnp.array(_bounded(size, 0.002, 0.0, 0.1, "1/s")), jnp.array(0.8)

@@ -70,7 +70,8 @@ class ManualDisturbance:
         push = np.asarray(self.push) + (np.asarray(self.kick) if kicking else 0.0)
         gain = np.array([self.rotor, 1.0, 1.0, 1.0])
         inertia = payload_inertia(self.load) if self.load > 0 else np.zeros(3)
-        return ExternalEffects(*(jnp.asarray(a) for a in (push, np.asarray(self.wind), gain, self.load, inertia)))
+        parts = (push, np.asarray(self.wind), gain, self.load, inertia, np.zeros(3))
+        return ExternalEffects(*(jnp.asarray(a) for a in parts))
 
 
 class KnobbedPlant:

@@ -110,7 +110,8 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         blades, inflow = self.rotors(b, motors, s.inflow, effects.wind)
         loads = self.loads(b, motors, blades, effects)
         mass, inertia = vehicle.mass + effects.mass, vehicle.inertia + effects.inertia
-        moved = rigid_body(b, motors, integral, loads.force, loads.torque, mass, inertia, effects.push, wanted_slow)
+        torque = loads.torque - jnp.cross(effects.moment / mass, loads.force)
+        moved = rigid_body(b, motors, integral, loads.force, torque, mass, inertia, effects.push, wanted_slow)
         return BemState(moved, inflow)
 
     def rotors(

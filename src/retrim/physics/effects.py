@@ -18,12 +18,15 @@ class ExternalEffects(eqx.Module):
     """Mass of a load, in addition to that of the vehicle [kg]."""
     inertia: Float[Array, "3"]
     """Diagonal of the load's inertia, in addition to that of the vehicle, body frame [kg m^2]."""
+    moment: Float[Array, "3"]
+    """First moment of the load, its mass times its position in the body frame [kg m]. It shifts the centre of mass, so
+    that the thrust causes a torque; models without torques ignore it."""
 
     @classmethod
     def calm(cls, dtype: jnp.dtype) -> "ExternalEffects":
         """Return the effects of an undisturbed vehicle."""
         zero = jnp.zeros(3, dtype=dtype)
-        return cls(zero, zero, jnp.ones(4, dtype=dtype), zero[0], zero)
+        return cls(zero, zero, jnp.ones(4, dtype=dtype), zero[0], zero, zero)
 
     @classmethod
     def of(
@@ -35,6 +38,7 @@ class ExternalEffects(eqx.Module):
         gain: Float[Array, "4"] | None = None,
         mass: Float[Array, ""] | None = None,
         inertia: Float[Array, "3"] | None = None,
+        moment: Float[Array, "3"] | None = None,
     ) -> "ExternalEffects":
         """Return the given effects; all others are those of an undisturbed vehicle."""
         calm = cls.calm(dtype)
@@ -44,6 +48,7 @@ class ExternalEffects(eqx.Module):
             calm.gain if gain is None else gain.astype(dtype),
             calm.mass if mass is None else mass.astype(dtype),
             calm.inertia if inertia is None else inertia.astype(dtype),
+            calm.moment if moment is None else moment.astype(dtype),
         )
 
     def __add__(self, other: "ExternalEffects") -> "ExternalEffects":
@@ -54,4 +59,5 @@ class ExternalEffects(eqx.Module):
             self.gain * other.gain,
             self.mass + other.mass,
             self.inertia + other.inertia,
+            self.moment + other.moment,
         )

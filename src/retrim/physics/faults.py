@@ -21,6 +21,8 @@ class Payload(eqx.Module):
     """Time at which the load is picked up [s]."""
     dropped: Float[Array, ""]
     """Time at which the load is dropped [s]; infinity if it is kept."""
+    ahead: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
+    """Distance of the load from the centre of the vehicle along body x [m]; it shifts the centre of mass."""
 
     def __check_init__(self) -> None:
         """Raise ``ValueError`` if the mass is not positive, or the load is dropped before it is picked up."""
@@ -30,14 +32,23 @@ class Payload(eqx.Module):
             raise ValueError(f"Payload: mass = {self.mass} kg, picked = {self.picked} s, dropped = {self.dropped} s")
 
     @classmethod
-    def of(cls, mass: float, *, picked: float = 0.0, dropped: float = float("inf")) -> "Payload":
-        """Return a load in the form of a small cube under the vehicle; see :func:`payload_inertia`."""
-        return cls(jnp.array(mass), payload_inertia(mass), jnp.array(picked), jnp.array(dropped))
+    def of(cls, mass: float, *, picked: float = 0.0, dropped: float = float("inf"), ahead: float = 0.0) -> "Payload":
+        """Return a load in the form of a small cube under the vehicle; see :func:`payload_inertia`.
+
+        Args:
+            mass: Mass of the load [kg].
+            picked: Time at which the load is picked up [s].
+            dropped: Time at which the load is dropped [s].
+            ahead: Distance of the load from the centre along body x [m].
+        """
+        inertia = payload_inertia(mass, ahead=ahead)
+        return cls(jnp.array(mass), inertia, jnp.array(picked), jnp.array(dropped), jnp.array(ahead))
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
-        """Return the payload's mass and inertia while it is attached."""
+        """Return the payload's mass, inertia and first moment while it is attached."""
         carried = jnp.where((t >= self.picked) & (t < self.dropped), 1.0, 0.0).astype(self.mass.dtype)
-        return ExternalEffects.of(x.p.dtype, mass=carried * self.mass, inertia=carried * self.inertia)
+        moment = carried * self.mass * self.ahead * jnp.array([1.0, 0.0, 0.0], dtype=self.mass.dtype)
+        return ExternalEffects.of(x.p.dtype, mass=carried * self.mass, inertia=carried * self.inertia, moment=moment)
 
 
 class BatterySag(eqx.Module):

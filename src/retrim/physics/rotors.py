@@ -101,6 +101,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         thrusts = effects.gain * vehicle.thrust_coefficient * self.thrust_gain * motors**2
         force, torque = self.wrench(s, motors, thrusts, effects.wind)
         mass, inertia = vehicle.mass + effects.mass, vehicle.inertia + effects.inertia
+        torque = torque - jnp.cross(effects.moment / mass, force)
         return rigid_body(s, motors, integral, force, torque, mass, inertia, effects.push)
 
     def rate_loop(self, s: RotorState, u: Command) -> tuple[Float[Array, "4"], Float[Array, "3"]]:

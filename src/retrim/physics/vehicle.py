@@ -191,13 +191,17 @@ def large() -> Vehicle:
     )
 
 
-def payload_inertia(mass: float, *, side: float = 0.05, below: float = 0.03) -> Float[Array, "3"]:
-    """Return the inertia [kg m^2] added by a cube of ``mass`` [kg] and ``side`` [m], ``below`` [m] under the centre.
+def payload_inertia(mass: float, *, side: float = 0.05, below: float = 0.03, ahead: float = 0.0) -> Float[Array, "3"]:
+    """Return the inertia [kg m^2] added by a cube under the vehicle; the shift of the centre of mass is neglected.
 
-    The shift of the centre of mass is neglected.
+    Args:
+        mass: Mass of the cube [kg].
+        side: Length of an edge [m].
+        below: Distance of the cube below the centre [m].
+        ahead: Distance of the cube from the centre along body x [m].
     """
     own = mass * side**2 / 6.0
-    return jnp.array([own + mass * below**2, own + mass * below**2, own])
+    return jnp.array([own + mass * below**2, own + mass * (below**2 + ahead**2), own + mass * ahead**2])
 
 
 def with_payload(vehicle: Vehicle, mass: float) -> Vehicle:

@@ -78,6 +78,8 @@ class ExternalPlant(Plant, abc.ABC):
             raise PlantError(f"{name}: not flying; call reset first")
         times = self._ticks * self.dt + self._instants
         effects = jax.tree.map(np.asarray, effects_at(times, self._x, self._disturbance))
+        if np.any(effects.moment != 0.0):
+            raise PlantError(f"{name}: cannot carry a load off its centre; the plants bem and simple can")
         after = self._advance(self._held, effects)
         dtype = self._x.p.dtype
         acceleration = (after.v - self._v) / self.dt  # in double precision: a difference in single has few digits
