@@ -30,7 +30,7 @@ from retrim.config import changed, load, overlaid, read_vehicle
 from retrim.config.loading import dump, values
 from retrim.config.names import PLAIN
 from retrim.config.references import make_reference
-from retrim.evaluation.sweep import Sweep, _Kept, read_sweep
+from retrim.evaluation.sweep import Sweep, read_sweep
 from retrim.io.checkpoint import architecture, load_delta, lora_header
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.log_map import LogMap
@@ -47,6 +47,7 @@ from retrim.onboard.messages import (
     unpack_note,
 )  # fmt: skip
 from retrim.onboard.topics import INTO, OUT
+from retrim.runkit.codecs import RowsCodec
 from retrim.transport import wire
 from retrim.transport.message import pack_arrays
 
@@ -522,8 +523,8 @@ class Maker:
                 yield Case(f"setpoint {i} {value}", lambda data=data: Setpoint.unpack(data), bool(np.isfinite(value)))
         for name, text in texts_and_numbers(toml=False):
             for line in (text, f'{{"key": {text}}}', f'{{"key": "a", "failed": {text}}}', f"{{{text}: 1}}"):
-                yield Case(f"row {name}", lambda line=line: _Kept(self.file(line, ".jsonl")), True)
-        yield Case("row of bytes", lambda: _Kept(self.file(b"\xff\xfe{}\n", ".jsonl")), True)
+                yield Case(f"row {name}", lambda line=line: RowsCodec().read(self.file(line, ".jsonl")), True)
+        yield Case("row of bytes", lambda: RowsCodec().read(self.file(b"\xff\xfe{}\n", ".jsonl")), True)
 
 
 def callers() -> Iterator[str]:

@@ -12,8 +12,7 @@ from commands import OVERLAY, results, retrim, started
 from helpers import brief_preset
 from made_up import flight
 from retrim import ConfigError, Fleet, Scenario, Setup
-from retrim.evaluation import policy_store as kept_policies
-from retrim.evaluation import sweep
+from retrim.evaluation import policies, sweep
 from retrim.evaluation.executor import Flights
 from retrim.evaluation.metrics import record
 from retrim.evaluation.sweep import Sweep, read_sweep, run_sweep
@@ -36,9 +35,9 @@ COMBINATIONS = [(name, method) for name in ("none", "wind=3") for method in ("ba
 # A power cut right after the first flight was kept.
 KILLED = """
 import os, signal
-from retrim.evaluation.sweep import _Kept
-add = _Kept.add
-_Kept.add = lambda self, rows: add(self, rows) or os.kill(os.getpid(), signal.SIGKILL)
+from retrim.evaluation.sweep import _FlightRows
+add = _FlightRows.add
+_FlightRows.add = lambda self, rows: add(self, rows) or os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
@@ -85,6 +84,7 @@ def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
 
     out = retrim("sweep", "sweep.toml", "--out", "cut", cwd=folder)
     assert "pretraining" not in out
+    assert out.count("flights.jsonl: unusable lines, 1;") == 1
     assert {path: path.stat().st_mtime_ns for path in (folder / "cut" / "policies").iterdir()} == policies
     assert results(folder / "cut", "sweep.json")["rows"] == results(folder / "whole", "sweep.json")["rows"]
     again = flown(folder / "cut")
@@ -118,8 +118,8 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
     trained = []
     monkeypatch.setattr(sweep, "bars", lambda *_: None)
     monkeypatch.setattr(sweep, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / f"{stem}.svg"))
-    made = kept_policies.train
-    monkeypatch.setattr(kept_policies, "train", lambda *a, **k: trained.append(0) or made(*a, **k))
+    made = policies.train
+    monkeypatch.setattr(policies, "train", lambda *a, **k: trained.append(0) or made(*a, **k))
 
     def fly():
         trained.clear()
@@ -131,7 +131,7 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
     monkeypatch.setattr(provenance, "code", lambda: "changed")
     assert fly() == (1, 2)
     assert results(tmp_path / "out", "sweep.json")["rows"][0]["n"] == 1
-    for module in (sweep, kept_policies):
+    for module in (sweep, policies):
         monkeypatch.setattr(module, "file_digests", lambda *names: {"mine.csv": "changed"})
     assert fly() == (1, 3)
 
@@ -206,8 +206,8 @@ def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
     preset, said = brief_preset(), []
     policies = {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}
     fleet = Fleet(preset, policies, [Scenario(plant="simple")], methods=("base",), starts=2, seconds=1.2)
-    kept = sweep._Kept(tmp_path / "flights.jsonl")
     reporter, run = Silent(), Run("test", tmp_path)
+    kept = sweep._FlightRows(run, reporter)
     reporter.say = said.append
     asked = []
 
@@ -229,7 +229,7 @@ def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
     sweep._fly(
         fleet,
         {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs},
-        sweep._Kept(tmp_path / "flights.jsonl"),
+        sweep._FlightRows(run, reporter),
         run,
         reporter,
     )

@@ -22,6 +22,8 @@ from retrim.evaluation import sweep
 from retrim.io.logs import npz_members, read_flight_log, read_map
 from retrim.io.logs.npz_members import NpzMembers
 from retrim.live.page import free_port
+from retrim.runkit import Run
+from retrim.runkit.reporter import Silent
 from retrim.tasks.trajectory_csv import from_csv
 
 LONGEST = 500
@@ -156,7 +158,10 @@ def test_rows_of_a_sweep_that_are_none_are_flown_again(folder):
     wrong = [{**row, "key": "a", "error": "x"}, {**row, "key": "b", "plant": 3}, {"key": "c"}, {**row, "key": 4}, [], 1]
     lines = [json.dumps(each).encode() for each in (*wrong, row)]
     (folder / "flights.jsonl").write_bytes(b"\n".join([b"\xff\xfe", *lines, b'{"key": "torn']))
-    assert list(sweep._Kept(folder / "flights.jsonl").rows) == ["good"]
+    said, reporter = [], Silent()
+    reporter.say = said.append
+    assert list(sweep._FlightRows(Run("test", folder), reporter).by_key) == ["good"]
+    assert said == [f"{folder / 'flights.jsonl'}: unusable lines, 8; their flights are flown again"]
 
 
 def test_a_host_that_cannot_be_is_one_line():

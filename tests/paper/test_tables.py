@@ -21,10 +21,11 @@ from retrim.config.disturbances import DISTURBANCES
 from retrim.config.loading import dump, with_vehicle
 from retrim.config.presets import Adapt
 from retrim.evaluation.batches import LOT
-from retrim.evaluation.section_store import file_digests, named_by, named_in
+from retrim.evaluation.flight_groups import FLIGHTS
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
 from retrim.runkit import Run, provenance
 from retrim.runkit.document import Document, TableSection
+from retrim.runkit.file_digests import file_digests, preset_names, scenario_names
 from retrim.runkit.reporter import Silent
 from retrim_paper.datt import training as rivals
 from retrim_paper.tables.levels import Levels, fly_levels
@@ -125,10 +126,15 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
     flown, whole = table(one, two)
     assert flown == ["bem"]
     assert (whole[0][: len(killed)], whole[1][: len(rows)]) == (killed, rows)
+    unfinished = tmp_path / FLIGHTS / "of_another_section.npz"
+    unfinished.parent.mkdir()
+    unfinished.touch()
     assert table(one, two) == ([], whole)
+    assert unfinished.exists()  # a reused section leaves the flights of an unfinished one
     assert "An earlier run had made 2 of the parts" in (tmp_path / "table.md").read_text()
     flown, other = table(one, two, starts=2)
     assert flown == ["simple", "bem"]
+    assert not unfinished.exists()
     assert other != whole
     (tmp_path / "x1.png").write_bytes(b"what another table of this folder drew")
     assert table(one)[0] == ["simple"]
@@ -139,7 +145,7 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
 def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, monkeypatch):
     base = Levels("title", brief_preset(), Scenario(plant="simple"), "x", ("indi", "datt"))
     asked = []
-    monkeypatch.setattr(levels, "_level_section", lambda *a, **k: asked.append(0) or (TableSection((), ()), []))
+    monkeypatch.setattr(levels, "_fly_section", lambda *a, **k: asked.append(0) or (TableSection((), ()), []))
     monkeypatch.setattr(levels, "figures_table", lambda *_: TableSection((), ()))
 
     def fly(section=base, *, seeds=(0,), starts=1, seconds=1.0, datt_steps=1):
@@ -167,8 +173,10 @@ def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypa
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("my_quad.py").write_text("from retrim.physics.vehicle import small as make\n")
     preset = with_vehicle(load("hover/retrim"), "my_quad:make")
-    assert set(file_digests(*named_in(preset))) == set(file_digests(*named_by(Scenario(vehicle="my_quad:make"))))
-    assert set(file_digests(*named_in(preset))) == {"my_quad:make"}
+    assert set(file_digests(*preset_names(preset))) == set(
+        file_digests(*scenario_names(Scenario(vehicle="my_quad:make")))
+    )
+    assert set(file_digests(*preset_names(preset))) == {"my_quad:make"}
     text = (Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml").read_text()
     Path("my.toml").write_text(text)
     before = dump(with_vehicle(preset, "my.toml"))
@@ -234,7 +242,7 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     (file,) = tmp_path.glob("datt_*_seed0.safetensors")
     file.write_bytes(file.read_bytes()[:-100])
     other = rivals.train_datt(preset, [0], run, reporter, steps=1)
-    assert "trained again" in said[0]
+    assert "made again" in said[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
     monkeypatch.setattr(provenance, "code", lambda: "changed")
     rivals.train_datt(preset, [0], run, reporter, steps=1)
@@ -257,7 +265,7 @@ def test_a_training_of_datt_that_is_cut_goes_on_where_it_was(tmp_path):
 
     (whole, shares), (nothing, first) = train("whole"), train("cut", stops_at=0.4)
     assert (shares, nothing, first) == ([1, 2, 3, 4], {}, [1, 2])
-    (partly,) = (tmp_path / "cut").glob("*.partly")
+    (partly,) = (tmp_path / "cut").glob("datt_*_state.safetensors")
     kept = partly.read_bytes()
     again, rest = train("cut")
     assert (rest, said) == ([3, 4], ["DATT, seed 0: goes on after 2 of 4 updates"])
@@ -266,7 +274,7 @@ def test_a_training_of_datt_that_is_cut_goes_on_where_it_was(tmp_path):
     made.unlink()
     partly.write_bytes(kept[:-50])
     afresh, shares = train("cut")
-    assert (shares, "trained again" in said[1]) == ([1, 2, 3, 4], True)
+    assert (shares, "made again" in said[1]) == ([1, 2, 3, 4], True)
     for other in (again, afresh):
         jax.tree.map(np.testing.assert_array_equal, *(eqx.filter(n[0], eqx.is_array) for n in (whole, other)))
 

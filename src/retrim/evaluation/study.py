@@ -17,9 +17,9 @@ from ..runkit.run import Run
 from ..runkit.training import nominal_error
 from .executor import Flights, report_progress
 from .fleet import Fleet
-from .flight_store import FlightStore
+from .flight_groups import FlightGroups
 from .limits import check_flights, check_seeds
-from .policy_store import trained_policies
+from .policies import train_policies
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def table_presets(
 def train_all(preset: Preset, seeds: Sequence[int], run: Run, reporter: Reporter) -> Study:
     """Train a policy for each seed, or read it from the run; after an interruption, return the completed ones."""
     setup, policies, errors = Setup.from_preset(preset), dict[int, AbstractPolicy](), list[float]()
-    for seed, policy in trained_policies(preset, seeds, run, reporter).items():
+    for seed, policy in train_policies(preset, seeds, run, reporter).items():
         if run.interrupted:
             break
         with run.interruptible():
@@ -107,8 +107,8 @@ def fly_all(
     if not study.policies or run.interrupted:
         return Flights([], interrupted=True)
     fleet = Fleet(study.preset, study.policies, scenarios, methods=methods, starts=starts, seconds=seconds)
-    kept = FlightStore(run, fleet) if keep else None
-    earlier = {} if kept is None else kept.earlier
+    groups = FlightGroups(run, fleet, reporter) if keep else None
+    earlier = {} if groups is None else groups.earlier
     left = [spec for spec in fleet.specs if spec not in earlier]
     if earlier:
         reporter.say(f"{len(earlier)} of {len(fleet.specs)} flights: as an earlier run of this folder has flown them")
@@ -120,7 +120,7 @@ def fly_all(
                 run.executor,
                 stop=run.stop,
                 progress=report_progress(advance),
-                on_result=None if kept is None else kept.save,
+                on_result=None if groups is None else groups.save,
                 only=left,
                 by_lot=True,
             )

@@ -1,7 +1,6 @@
 """Runs sweeps of policies x scenarios x seeds from one TOML file; a killed sweep can be resumed."""
 
 import dataclasses
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,8 +17,9 @@ from ..config.trust import check_trust
 from ..config.validation import read_toml, validated
 from ..config.vehicle_file import VehicleSpec
 from ..control.policy import AbstractPolicy
-from ..io.files import write_whole
+from ..runkit.codecs import RowsCodec
 from ..runkit.document import Document, TableSection
+from ..runkit.file_digests import file_digests, preset_names, scenario_names
 from ..runkit.flights import Flight, FlightSpec
 from ..runkit.provenance import section_key
 from ..runkit.reporter import Reporter
@@ -30,9 +30,10 @@ from .executor import report_progress
 from .fleet import Fleet
 from .limits import check_seeds
 from .metrics import EFFORT, Rows, cell, failed_record, metres, record, summary
-from .policy_store import trained_policies
-from .section_store import file_digests, named_by, named_in
+from .policies import train_policies
 
+FLIGHTS = "flights"
+"""Key of the rows of completed flights."""
 STRICT = ConfigDict(extra="forbid")
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
 FIGURES = ("error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", *EFFORT)
@@ -111,19 +112,19 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     for fleet in fleets:
         for scenario in sweep.scenarios():
             scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # fails if a package is missing
-    kept = _Kept(run.folder / "flights.jsonl")
+    rows = _FlightRows(run, reporter)
     # The keys are made once, before the first flight; a file that changes in the meantime affects only the next run.
     keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
     for preset, of_fleet in zip(presets, keys, strict=True):
         with run.interruptible():
-            policies = trained_policies(preset, sweep.seeds, run, reporter)
+            policies = train_policies(preset, sweep.seeds, run, reporter)
             if not run.interrupted:
-                _fly(_fleet(preset, policies, sweep), of_fleet, kept, run, reporter)
+                _fly(_fleet(preset, policies, sweep), of_fleet, rows, run, reporter)
         if run.interrupted:
             break
     every = [key for of_fleet in keys for key in of_fleet.values()]
-    run.reused += len(kept.earlier.intersection(every))
-    return _report(sweep, [kept.rows[key] for key in every if key in kept.rows], run, reporter)
+    run.reused += len(rows.earlier.intersection(every))
+    return _report(sweep, [rows.by_key[key] for key in every if key in rows.by_key], run, reporter)
 
 
 def _fleet(preset: Preset, policies: Mapping[int, AbstractPolicy], sweep: Sweep) -> Fleet:
@@ -135,14 +136,14 @@ def _untrained(preset: Preset, sweep: Sweep) -> dict[int, AbstractPolicy]:
     return dict.fromkeys(sweep.seeds, Setup.from_preset(preset).new_policy(random.key(0)))
 
 
-def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, reporter: Reporter) -> None:
+def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], rows: "_FlightRows", run: Run, reporter: Reporter) -> None:
     """Fly the missing flights, and store the rows of the completed ones."""
-    missing = [spec for spec, key in keys.items() if key not in kept.rows]
+    missing = [spec for spec, key in keys.items() if key not in rows.by_key]
     if not missing or run.interrupted:
         return
 
-    def keep(flown: Sequence[Flight]) -> None:
-        kept.add({keys[flight.spec]: {"preset": fleet.preset.name, **record(flight)} for flight in flown})
+    def on_result(flights: Sequence[Flight]) -> None:
+        rows.add({keys[flight.spec]: {"preset": fleet.preset.name, **record(flight)} for flight in flights})
 
     with reporter.progress(f"flying {fleet.preset.name}") as advance:
         advance(0.0, "compiling the programs of a flight")
@@ -150,7 +151,7 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, 
             run.executor,
             stop=run.stop,
             only=missing,
-            on_result=keep,
+            on_result=on_result,
             progress=report_progress(advance),
             by_lot=True,
             forget=True,
@@ -158,31 +159,30 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], kept: "_Kept", run: Run, 
     for spec, why in flights.failed.items():
         vehicle = spec.scenario.vehicle_name(fleet.preset.vehicle)
         row = failed_record(spec, vehicle, fleet.setups[spec.scenario.reference].flight_task.metric, why)
-        kept.add({keys[spec]: {"preset": fleet.preset.name, **row}})
+        rows.add({keys[spec]: {"preset": fleet.preset.name, **row}})
     if flights.failed:
         run.failed = True
         why = next(iter(flights.failed.values()))
         reporter.say(f"{len(flights.failed)} flights failed elsewhere, the first by {why}; the same command flies them")
 
 
-class _Kept:
-    """Rows of completed flights, one line of JSON each; failed flights and those on unreadable lines fly again."""
+class _FlightRows:
+    """Rows of completed flights by their keys, one line of JSON each; failed flights and unusable lines fly again."""
 
-    def __init__(self, path: Path) -> None:
-        self._path, self.rows = path, dict[str, dict[str, Any]]()
-        for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
-            try:
-                row = json.loads(line)
-            except (ValueError, RecursionError):
-                continue
-            if _is_record(row) and row.get("failed") is None:
-                self.rows[row["key"]] = row
-        self.earlier = frozenset(self.rows)
+    def __init__(self, run: Run, reporter: Reporter) -> None:
+        """Read the rows of an earlier run."""
+        self._store = run.store(reporter)
+        lines = self._store.get(FLIGHTS, RowsCodec()) or ()
+        if unusable := sum(not _is_record(row) for row in lines):
+            path = self._store.path(FLIGHTS, RowsCodec())
+            reporter.say(f"{path}: unusable lines, {unusable}; their flights are flown again")
+        self.by_key = {row["key"]: row for row in lines if _is_record(row) and row.get("failed") is None}
+        self.earlier = frozenset(self.by_key)
 
     def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add rows by their keys, and rewrite the file."""
-        self.rows |= {key: {"key": key, **row} for key, row in rows.items()}
-        write_whole(self._path, "".join(json.dumps(each) + "\n" for each in self.rows.values()))
+        """Add rows by their keys, and store all rows."""
+        self.by_key |= {key: {"key": key, **row} for key, row in rows.items()}
+        self._store.put(FLIGHTS, list(self.by_key.values()), RowsCodec())
 
 
 def _is_record(row: Any) -> bool:
@@ -194,14 +194,14 @@ def _is_record(row: Any) -> bool:
 
 
 def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
-    files = file_digests(spec.method, *named_in(preset), *named_by(spec.scenario))
+    files = file_digests(spec.method, *preset_names(preset), *scenario_names(spec.scenario))
     return section_key(preset=dump(preset), spec=repr(spec), seconds=seconds, files=files)
 
 
-def _report(sweep: Sweep, kept: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
+def _report(sweep: Sweep, rows: Sequence[dict[str, Any]], run: Run, reporter: Reporter) -> Rows:
     """Write the documents about the completed flights, in the order of the sweep."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in kept:
+    for row in rows:
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
     result, cells = Rows(), list[tuple[str, ...]]()
     varied = [name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"]

@@ -12,7 +12,9 @@ from typing import Any
 
 from ..io.files import check_writable, write_whole
 from .provenance import code, command_line, commit, describe_hardware, versions
+from .reporter import Reporter
 from .stopwatch import Stopwatch
+from .store import Store
 
 SCHEMA = "retrim.results/2"
 PARTS = "sections"
@@ -66,6 +68,15 @@ class Run:
         if any((self.folder / PARTS).glob("*")):
             return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
         return f"results in {self.folder} are replaced" if any(self.folder.glob("*.json")) else ""
+
+    def store(self, reporter: Reporter | None = None) -> Store:
+        """Return the store of the run's parts in its folder; ``reporter`` receives lines about unusable files."""
+        return Store(self.folder, reporter=reporter, stop=self.stop)
+
+    def reuse(self, part: str, reporter: Reporter) -> None:
+        """Count a part that an earlier run has made, and report it."""
+        self.reused += 1
+        reporter.say(f"{part}: as an earlier run of this folder has made it")
 
     @property
     def interrupted(self) -> bool:

@@ -2,21 +2,23 @@
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import random
+from jaxtyping import Array, Key
 
 from retrim.config.baselines import prediction_of
 from retrim.config.presets import Preset
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError
-from retrim.evaluation.tree_store import load_tree, save_tree
+from retrim.runkit.codecs import TreeCodec
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
+from retrim.runkit.store import Store
 
 from .controller import APART, DattNet
 from .ppo import PpoSettings, PpoState, ppo
@@ -25,10 +27,8 @@ from .problem import DattProblem, discount, reference_bank
 DATT_STEPS = 20_000_000  # as in the paper
 DATT_PPO: dict[str, Any] = {"envs": 64, "steps": 256, "minibatches": 8, "epochs": 6, "learning_rate": 2e-3}
 DATT_TAG = 2**30 + 5  # folded into a seed, so that DATT does not share keys with the policies
-PARTLY = ".partly"
-"""File name suffix for the saved state of an interrupted training."""
-KEEP_EVERY = 30.0
-"""Time between two saved states during training [s]."""
+STATE_EVERY = 30.0
+"""Time between two stored states during training [s]."""
 
 
 def check_steps(steps: int) -> None:
@@ -75,42 +75,49 @@ def train_datt(
         steps: Number of training steps.
     """
     setup, nets = Setup.from_preset(preset), dict[int, DattNet]()
-    tau = prediction_of(setup).path.response.rate_lag[0]
-    about = {"steps": str(steps), "dt": str(preset.dt), "tau": f"{float(tau):.4f}", "vehicle": str(preset.vehicle)}
+    store = Store(run.trained, reporter=reporter, stop=run.stop)
+    tau = float(prediction_of(setup).path.response.rate_lag[0])
+    about = {"steps": str(steps), "dt": str(preset.dt), "tau": f"{tau:.4f}", "vehicle": str(preset.vehicle)}
     name = section_key(datt=about, precision=str(setup.vehicle.mass.dtype))
     for seed in seeds:
         if run.interrupted:
             break
-        path = run.trained / f"datt_{name}_seed{seed}.safetensors"
-        key = random.fold_in(random.key(seed), DATT_TAG)
-        k_net, k_learn = random.split(key)
+        key = f"datt_{name}_seed{seed}"
+        k_net, k_learn = random.split(random.fold_in(random.key(seed), DATT_TAG))
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
-        if (kept := load_tree(path, net, kind="datt", reporter=reporter)) is not None:
-            nets[seed] = kept
-            continue
-        low, high = setup.vehicle.command_min, setup.vehicle.command_max
-        problem = DattProblem(jnp.asarray(reference_bank(seed, dt=preset.dt), low.c.dtype), tau, low, high, preset.dt)
-        settings = PpoSettings(discount=discount(preset.dt), **DATT_PPO)
-        state = _trained(problem, PpoState.of(problem, net, k_learn, settings), settings, steps, path, run, reporter)
-        if state is None:
+        make = partial(_train, setup, net, k_learn, seed, steps, store, f"{key}_state", run, reporter)
+        trained = store.get_or_make(key, make, TreeCodec(net, "datt", about))
+        if trained is None:
             break
-        save_tree(path, state.net, kind="datt", about=about)
-        path.with_suffix(PARTLY).unlink(missing_ok=True)
-        nets[seed] = state.net
+        store.remove(f"{key}_state", TreeCodec(net, "ppo"))
+        nets[seed] = trained
     return nets
 
 
-def _trained(
-    problem: DattProblem, state: PpoState, settings: PpoSettings, steps: int, path: Path, run: Run, reporter: Reporter
-) -> PpoState | None:
-    """Train, and resume from the saved state of an earlier run if there is one.
+def _train(
+    setup: Setup,
+    net: DattNet,
+    k_learn: Key[Array, ""],
+    seed: int,
+    steps: int,
+    store: Store,
+    key: str,
+    run: Run,
+    reporter: Reporter,
+) -> DattNet | None:
+    """Train, and resume from the stored state of an earlier run if there is one.
 
-    Return None if this run is interrupted; its state is then saved next to ``path``.
+    Return None if this run is interrupted; its state is then stored with ``key``.
     """
-    partly, updates = path.with_suffix(PARTLY), settings.updates(steps)
-    title = f"DATT, seed {path.stem.rpartition('_seed')[2]}"
-    if (kept := load_tree(partly, state, kind="ppo", reporter=reporter)) is not None:
-        state = kept
+    low, high, dt = setup.vehicle.command_min, setup.vehicle.command_max, setup.preset.dt
+    tau = prediction_of(setup).path.response.rate_lag[0]
+    problem = DattProblem(jnp.asarray(reference_bank(seed, dt=dt), low.c.dtype), tau, low, high, dt)
+    settings = PpoSettings(discount=discount(dt), **DATT_PPO)
+    updates, title = settings.updates(steps), f"DATT, seed {seed}"
+    state = PpoState.of(problem, net, k_learn, settings)
+    codec = TreeCodec(state, "ppo")
+    if (stored := store.get(key, codec)) is not None:
+        state = stored
         reporter.say(f"{title}: goes on after {int(state.made)} of {updates} updates")
     with run.interruptible(), reporter.progress(f"{title}, {steps:,} steps") as advance:
         written = time.monotonic()
@@ -119,13 +126,14 @@ def _trained(
             advance(int(state.made) / updates, f"reward {told['reward']:.3f}")
             if run.interrupted:
                 break
-            if time.monotonic() - written > KEEP_EVERY:
-                save_tree(partly, state, kind="ppo")
+            if time.monotonic() - written > STATE_EVERY:
+                store.put(key, state, codec)
                 written = time.monotonic()
     if run.interrupted:
-        save_tree(partly, state, kind="ppo")
+        store.put(key, state, codec)
         return None
-    return state
+    trained: DattNet = state.net
+    return trained
 
 
 RIVALS = {"datt": train_datt}

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -9,16 +10,16 @@ import numpy as np
 from retrim.config.loading import changed, dump, load
 from retrim.config.presets import Adapt, Preset
 from retrim.config.scenario import Scenario
-from retrim.evaluation.flight_store import clear_flights
+from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import cell
-from retrim.evaluation.section_store import keep, kept
 from retrim.evaluation.study import Study, fly_all, train_all
+from retrim.runkit.codecs import Rows, SectionCodec
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import Flight
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
-from retrim.runkit.run import Run
+from retrim.runkit.run import PARTS, Run
 
 from ..ablation_options import CONTROL, OFF, ON, Lever
 
@@ -66,14 +67,15 @@ def ablation(
                 table="ablation", preset=dump(preset), lever=lever.label, method=lever.method, seeds=list(seeds),
                 seconds=seconds, starts=starts,
             )  # fmt: skip
-            if (made := kept(run, key)) is not None:
-                reporter.say(f"{name}: {lever.label.strip('*')}, as an earlier run of this folder has made it")
-            else:
-                reporter.say(f"{name}: {lever.label.strip('*')}")
-                made = _flown(preset, lever, task, studies, document, starts=starts, seconds=seconds)
-                if not run.interrupted:
-                    keep(run, key, *made)
-                    clear_flights(run)
+            made = run.store(reporter).get_or_make(
+                f"{PARTS}/{key}",
+                partial(_fly, name, preset, lever, task, studies, document, starts=starts, seconds=seconds),
+                SectionCodec(run.folder),
+                on_reuse=partial(run.reuse, f"{name}: {lever.label.strip('*')}", reporter),
+                on_store=partial(clear_flights, run),
+            )
+            if made is None:
+                break
             if not run.interrupted:
                 lines += made[0].rows
             result += made[1]
@@ -86,7 +88,8 @@ def ablation(
     document.write()
 
 
-def _flown(
+def _fly(
+    name: str,
     preset: Preset,
     lever: Lever,
     task: Task,
@@ -95,9 +98,10 @@ def _flown(
     *,
     starts: int,
     seconds: float,
-) -> tuple[TableSection, list[dict[str, Any]]]:
-    """Fly one component under all disturbances; return its table line and the rows of results behind it."""
+) -> tuple[TableSection, Rows] | None:
+    """Fly one component under all disturbances; return its table line and its rows, None if no flight finished."""
     run, reporter = document.run, document.reporter
+    reporter.say(f"{name}: {lever.label.strip('*')}")
     cells, result = list[str](), list[dict[str, Any]]()
     for reference in REFERENCES[task]:
         study = _study(_follows(preset, reference), studies, document.seeds, run, reporter)
@@ -109,7 +113,7 @@ def _flown(
             if group:
                 result.append(_row(group, preset.name, lever))
                 cells.append(cell(result[-1], digits=4))
-    return TableSection((), ((lever.label, *cells),)), result
+    return (TableSection((), ((lever.label, *cells),)), result) if result else None
 
 
 def _follows(preset: Preset, reference: str | None) -> Preset:

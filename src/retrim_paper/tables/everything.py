@@ -1,11 +1,11 @@
 """Makes all tables of the paper, one after another."""
 
-import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from retrim.errors import PlantError
-from retrim.evaluation.section_store import digest_of
+from retrim.io.digests import file_digest
+from retrim.runkit.codecs import JsonCodec
 from retrim.runkit.document import Document, Link, TableSection
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
@@ -43,6 +43,8 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
 )
 """Each table, its place in the paper, and its options. Timed tables come first, when the machine is least busy."""
 QUICK_LEAVES_OUT = (phase, plants)
+TABLE, TIME = JsonCodec("table"), JsonCodec("time", ".time.json")
+"""Codecs for the time and page digest of a finished table, and for the time of an unfinished one."""
 AT_LEAST = "at least "
 """Prefix for a time that excludes a killed run; the time of an interrupted run is recorded and counted."""
 
@@ -60,7 +62,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
     intro = f"Made by `retrim reproduce all{' --quick' if quick else ''}`."
     overview = f"everything{'_quick' * quick}"
     document = Document(run, overview, "The tables of the paper", intro, [], reporter)
-    rows: list[dict[str, Any]] = []
+    rows, store = list[dict[str, Any]](), run.store(reporter)
     for make, what, options in PLAN:
         if run.interrupted:
             break
@@ -75,30 +77,28 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         place = run.folder / folder
         part = Run("reproduce", place, stop=run.stop, remark=remark, trained=run.folder, executor=run.executor)
         key = f"{PARTS}/{section_key(table=name, options=options)}"
-        done, begun = f"{key}.done", f"{key}.begun"
         page = run.folder / row["page"]
-        before = _read(run, done) if page.is_file() else None
-        if before is not None and before.pop("page") == digest_of(page):
-            reporter.say(f"{name}: as an earlier run of this folder has made it")
-            run.reused += 1
+        before = store.get(key, TABLE) if page.is_file() else None
+        if before is not None and before.pop("page") == file_digest(page):
+            run.reuse(name, reporter)
             row |= before
         else:
-            took = _read(run, begun) or {"s": 0.0, "at_least": False}
-            _write(run, begun, took | {"at_least": True})  # overwritten or removed below unless this run is killed
+            took = store.get(key, TIME) or {"s": 0.0, "at_least": False}
+            store.put(key, took | {"at_least": True}, TIME)  # overwritten or removed below unless this run is killed
             try:
                 make(part, reporter, **options)
             except PlantError as error:
-                (run.folder / begun).unlink()
+                store.remove(key, TIME)
                 rows.append({"table": name, "what": what, "left_out": str(error)})
                 continue
             took |= {"s": round(took["s"] + part.watch.total_s, 1)}
             row |= took
             if run.interrupted:
-                _write(run, begun, took)
+                store.put(key, took, TIME)
             else:
-                (run.folder / begun).unlink()
+                store.remove(key, TIME)
                 if page.is_file():  # the digest shows whether different code or options have overwritten the page
-                    _write(run, done, took | {"page": digest_of(page)})
+                    store.put(key, took | {"page": file_digest(page)}, TABLE)
         rows.append(row)
     lines = [
         (row["what"], f"{row['table']}, left out: {row['left_out']}", "-")
@@ -114,16 +114,3 @@ def _minutes(rows: Sequence[dict[str, Any]]) -> str:
     """Return the total time of the tables [min]."""
     at_least = any(row["at_least"] for row in rows)
     return f"{AT_LEAST * at_least}{sum(row['s'] for row in rows) / 60:.1f}"
-
-
-def _read(run: Run, name: str) -> dict[str, Any] | None:
-    """Return the note of an earlier run; None if there is no such file."""
-    try:
-        noted: dict[str, Any] = json.loads((run.folder / name).read_text())
-    except OSError:
-        return None
-    return noted
-
-
-def _write(run: Run, name: str, noted: dict[str, Any]) -> None:
-    run.write_text(name, json.dumps(noted) + "\n")

@@ -11,7 +11,7 @@ from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError, JobError, PlantError
-from retrim.evaluation.flight_store import clear_flights
+from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.metrics import metres
 from retrim.evaluation.study import fly_all, refuse_misfits, table_presets, train_all
 from retrim.runkit.document import Document, TableSection

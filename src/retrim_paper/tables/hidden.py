@@ -11,7 +11,7 @@ from retrim.config.loading import load_for
 from retrim.config.methods import find_method
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
-from retrim.evaluation.flight_store import clear_flights
+from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import metres
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all

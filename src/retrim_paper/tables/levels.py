@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from jax import random
@@ -13,14 +14,14 @@ from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.evaluation.figures import picture
-from retrim.evaluation.flight_store import clear_flights
+from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.metrics import cell, metres, rows
-from retrim.evaluation.section_store import file_digests, keep, kept, named_by, named_in
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
+from retrim.runkit.codecs import Rows, SectionCodec
 from retrim.runkit.document import Document, TableSection
+from retrim.runkit.file_digests import file_digests, preset_names, scenario_names
 from retrim.runkit.provenance import section_key
-from retrim.runkit.reporter import Reporter
-from retrim.runkit.run import Run
+from retrim.runkit.run import PARTS
 
 from ..datt.training import DATT_STEPS, RIVALS, check_period, check_steps
 from .further_figures import figures_table
@@ -91,56 +92,53 @@ def fly_levels(
         own = [method for method in section.methods if method not in RIVALS] or ["base"]
         refuse_misfits(section.preset, section.scenarios, methods=own, starts=starts, seconds=seconds)
     for section in sections:
-        name = section_key(
+        key = section_key(
             preset=dump(section.preset), scenarios=[repr(each) for each in section.scenarios], title=section.title,
             methods=list(section.methods), seeds=list(document.seeds), starts=starts, seconds=seconds,
             datt_steps=datt_steps if "datt" in section.methods else 0, files=_files_behind(section),
         )  # fmt: skip
-        if (made := kept(run, name)) is not None:
-            reporter.say(f"{section.title}: as an earlier run of this folder has made it")
-            document.add(*made)
-            document.add(figures_table(made[1], section.title, section.levels))
-            continue
-        trains = bool(of_policies(section.methods))
-        key = dump(section.preset), trains
-        if key not in studies and trains:
-            studies[key] = train_all(section.preset, document.seeds, run, reporter)
-        elif key not in studies:  # no method flies a policy, so only the seeds of the study matter
-            untrained = Setup.from_preset(section.preset).new_policy(random.key(0))
-            studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
-        made = _level_section(
-            studies[key], section, run, reporter, starts=starts, seconds=seconds, datt_steps=datt_steps
+        made = run.store(reporter).get_or_make(
+            f"{PARTS}/{key}",
+            partial(_fly_section, section, studies, document, starts=starts, seconds=seconds, datt_steps=datt_steps),
+            SectionCodec(run.folder),
+            on_reuse=partial(run.reuse, section.title, reporter),
+            on_store=partial(clear_flights, run),
         )
         if made is not None:
             document.add(*made)
             document.add(figures_table(made[1], section.title, section.levels))
         if run.interrupted:
             break
-        if made is not None:
-            keep(run, name, *made)
-            clear_flights(run)
     document.write()
 
 
 def _files_behind(section: Levels) -> dict[str, str]:
     """Return digests of the files on which the section depends, except for retrim and the preset itself."""
-    named = list[str | None](section.methods)
+    names = list[str | None](section.methods)
     for each in section.scenarios:
-        named += named_by(each)
-    return file_digests(*named, *named_in(section.preset))
+        names += scenario_names(each)
+    return file_digests(*names, *preset_names(section.preset))
 
 
-def _level_section(
-    study: Study,
+def _fly_section(
     section: Levels,
-    run: Run,
-    reporter: Reporter,
+    studies: dict[tuple[str, bool], Study],
+    document: Document,
     *,
     starts: int,
     seconds: float | None,
     datt_steps: int,
-) -> tuple[TableSection, list[dict[str, Any]]] | None:
-    """Return the section and its rows of results; None if no flight finished."""
+) -> tuple[TableSection, Rows] | None:
+    """Return the section and its rows of results; None if no flight finished. ``studies`` receives a new study."""
+    run, reporter = document.run, document.reporter
+    trains = bool(of_policies(section.methods))
+    key = dump(section.preset), trains
+    if key not in studies and trains:
+        studies[key] = train_all(section.preset, document.seeds, run, reporter)
+    elif key not in studies:  # no method flies a policy, so only the seeds of the study matter
+        untrained = Setup.from_preset(section.preset).new_policy(random.key(0))
+        studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
+    study = studies[key]
     methods, title = section.methods, section.title
     own = [method for method in methods if method not in RIVALS]
     flown = []

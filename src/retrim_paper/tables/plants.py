@@ -5,7 +5,7 @@ from dataclasses import replace
 from retrim.config.plants import PLANTS
 from retrim.config.scenario import Scenario
 from retrim.errors import PlantError
-from retrim.evaluation.flight_store import clear_flights
+from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.metrics import cell, metres, rows
 from retrim.evaluation.study import fly_all, table_presets, train_all
 from retrim.runkit.document import Document, TableSection

@@ -10,7 +10,7 @@ from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError
 from retrim.evaluation.figures import picture
-from retrim.evaluation.flight_store import clear_flights
+from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.metrics import mean_and_deviation, metres, rows
 from retrim.evaluation.study import fly_all, table_presets, train_all
 from retrim.runkit.document import Document, TableSection

@@ -6,8 +6,8 @@ import pytest
 
 from helpers import tiny_preset
 from retrim import load_policy
-from retrim.evaluation import policy_store as kept_policies
-from retrim.evaluation.policy_store import trained_policies
+from retrim.evaluation import policies
+from retrim.evaluation.policies import train_policies
 from retrim.evaluation.study import train_all
 from retrim.runkit import Run, provenance
 from retrim.runkit.reporter import Silent
@@ -23,7 +23,7 @@ def asked(monkeypatch):
         found.append((setup.preset.name, seed))
         return Trained(setup.new_policy(jax.random.key(seed)), [])
 
-    monkeypatch.setattr(kept_policies, "train", train)
+    monkeypatch.setattr(policies, "train", train)
     return found
 
 
@@ -33,15 +33,15 @@ def same(one, other):
 
 def test_a_policy_is_trained_once_for_a_folder(tmp_path, asked, monkeypatch):
     preset = tiny_preset()
-    first = trained_policies(preset, (3, 0), Run("test", tmp_path / "a", trained=tmp_path), Silent())
-    again = trained_policies(preset, (0, 1, 3), Run("test", tmp_path / "b", trained=tmp_path), Silent())
+    first = train_policies(preset, (3, 0), Run("test", tmp_path / "a", trained=tmp_path), Silent())
+    again = train_policies(preset, (0, 1, 3), Run("test", tmp_path / "b", trained=tmp_path), Silent())
     assert (list(first), list(again)) == ([3, 0], [0, 1, 3])
     assert asked == [(preset.name, seed) for seed in (3, 0, 1)]
     assert all(same(first[seed], again[seed]) for seed in first)
     assert not same(again[0], again[1])
-    trained_policies(tiny_preset(pretrain={"learning_rate": 0.5}), (0,), Run("test", tmp_path), Silent())
+    train_policies(tiny_preset(pretrain={"learning_rate": 0.5}), (0,), Run("test", tmp_path), Silent())
     monkeypatch.setattr(provenance, "code", lambda: "changed")
-    trained_policies(preset, (0,), Run("test", tmp_path), Silent())
+    train_policies(preset, (0,), Run("test", tmp_path), Silent())
     assert asked[3:] == [(preset.name, 0)] * 2
     assert len(list((tmp_path / "policies").glob("*-seed0.safetensors"))) == 3
 
@@ -49,29 +49,29 @@ def test_a_policy_is_trained_once_for_a_folder(tmp_path, asked, monkeypatch):
 def test_what_is_kept_is_flown_with_its_preset_and_what_is_damaged_is_trained_again(tmp_path, asked):
     preset, run, reporter, said = tiny_preset(), Run("test", tmp_path), Silent(), []
     reporter.say = said.append
-    trained = trained_policies(preset, (0,), run, reporter)
+    trained = train_policies(preset, (0,), run, reporter)
     (path,) = (tmp_path / "policies").iterdir()
     policy, flown = load_policy(path)
     assert flown == preset
     assert same(policy, trained[0])
     path.write_bytes(path.read_bytes()[:-40])
-    assert same(trained_policies(preset, (0,), run, reporter)[0], policy)
+    assert same(train_policies(preset, (0,), run, reporter)[0], policy)
     assert same(load_policy(path)[0], policy)
     assert len(asked) == 2
-    assert sum("trained again" in line for line in said) == 1
+    assert sum("made again" in line for line in said) == 1
 
 
 def test_an_interruption_keeps_what_was_complete(tmp_path, asked, monkeypatch):
-    preset, run, whole = tiny_preset(), Run("test", tmp_path), kept_policies.train
+    preset, run, whole = tiny_preset(), Run("test", tmp_path), policies.train
 
     def stopped(setup, seed, *, reporter, stop):
         if seed == 1:
             stop.set()
         return whole(setup, seed, reporter=reporter, stop=stop)
 
-    monkeypatch.setattr(kept_policies, "train", stopped)
-    assert list(trained_policies(preset, (0, 1, 2), run, Silent())) == [0]
-    monkeypatch.setattr(kept_policies, "train", whole)
+    monkeypatch.setattr(policies, "train", stopped)
+    assert list(train_policies(preset, (0, 1, 2), run, Silent())) == [0]
+    monkeypatch.setattr(policies, "train", whole)
     asked.clear()
     study = train_all(preset, (0, 1, 2), Run("test", tmp_path), Silent())
     assert asked == [(preset.name, 1), (preset.name, 2)]

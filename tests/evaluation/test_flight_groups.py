@@ -1,4 +1,4 @@
-"""Flights of a table that was killed: kept, to the last bit, until the table is made."""
+"""Flights of a table that was killed: stored, to the last bit, until the table is made."""
 
 import jax
 import numpy as np
@@ -6,11 +6,11 @@ import pytest
 
 from helpers import brief_preset
 from made_up import Watching
-from retrim import Scenario, Setup
-from retrim.evaluation.flight_store import FLIGHTS, clear_flights
-from retrim.evaluation.packed_flights import packed, unpacked
+from retrim import CheckpointError, Scenario, Setup
+from retrim.evaluation.flight_groups import FLIGHTS, clear_flights
 from retrim.evaluation.study import Study, fly_all
 from retrim.runkit import Run, provenance
+from retrim.runkit.flight_codec import FlightCodec
 from retrim.runkit.reporter import Silent
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
@@ -44,11 +44,12 @@ def whole(study, tmp_path_factory):
     return flown(study, tmp_path_factory.mktemp("whole"))[0].flown
 
 
-def test_a_file_of_flights_is_the_flights(whole):
-    specs = [flight.spec for flight in whole]
-    assert bits(unpacked(packed(whole), specs)) == bits(whole)
-    with pytest.raises(ValueError, match="argument"):
-        unpacked(packed(whole), specs[1:])
+def test_a_file_of_flights_is_the_flights(whole, tmp_path):
+    specs, path = [flight.spec for flight in whole], tmp_path / "flights.npz"
+    FlightCodec(specs).write(path, whole)
+    assert bits(FlightCodec(specs).read(path)) == bits(whole)
+    with pytest.raises(CheckpointError, match="other specifications"):
+        FlightCodec(specs[1:]).read(path)
 
 
 def test_an_interrupted_table_flies_what_is_left_and_is_the_same(study, whole, tmp_path):

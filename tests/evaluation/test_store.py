@@ -1,0 +1,177 @@
+"""A store: a value is made once for its key; a file that is damaged or foreign is refused, and the value made again."""
+
+import json
+import pickle
+import threading
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import tiny_preset
+from made_up import flight
+from retrim import Scenario, Setup
+from retrim.runkit import FlightSpec
+from retrim.runkit.codecs import JsonCodec, PolicyCodec, RowsCodec, SectionCodec, TreeCodec
+from retrim.runkit.document import TableSection
+from retrim.runkit.flight_codec import FlightCodec
+from retrim.runkit.reporter import Silent
+from retrim.runkit.store import Store
+
+SPECS = [FlightSpec(Scenario(plant="simple"), "base", start) for start in range(2)]
+TREE = {"weights": jnp.arange(6.0).reshape(2, 3), "key": jax.random.key(3), "name": "kept out of the file"}
+OTHERS = {
+    "json": JsonCodec("other"),
+    "tree": TreeCodec(TREE, "other"),
+    "policy": PolicyCodec(tiny_preset(goal=(0.0, 0.0, 2.0))),
+    "flights": FlightCodec([FlightSpec(Scenario(plant="simple"), "indi", start) for start in range(2)]),
+    "section": JsonCodec("other"),
+}
+
+
+def leaves(value):
+    """Contents of a value, with arrays and keys as bytes."""
+    if isinstance(value, TableSection):
+        return value
+    if isinstance(value, tuple | list) and any(isinstance(each, TableSection) for each in value):
+        return [*value]
+    if isinstance(value, list) and hasattr(value[0], "log"):
+        value = [(f.spec, f.vehicle, f.metric, f.log, f.error) for f in value]
+    found = []
+    for leaf in jax.tree.leaves(value):
+        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        found.append(np.asarray(leaf).tobytes() if isinstance(leaf, np.ndarray | jax.Array) else leaf)
+    return found
+
+
+@pytest.fixture
+def case(request, tmp_path):
+    """A codec and a value of each kind."""
+    picture = tmp_path / "x.png"
+    picture.write_bytes(b"drawn")
+    preset = tiny_preset()
+    policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
+    section = TableSection(("a", "b"), (("1", "2"),), "Title", "About.", picture)
+    return {
+        "json": lambda: (JsonCodec("note"), {"s": 0.1, "names": ["a", None], "infinite": float("inf")}),
+        "tree": lambda: (TreeCodec(TREE, "tree", {"made": "of"}), TREE),
+        "policy": lambda: (PolicyCodec(preset), policy),
+        "flights": lambda: (FlightCodec(SPECS), [flight(0.1 * (1 + spec.start), spec=spec) for spec in SPECS]),
+        "section": lambda: (SectionCodec(tmp_path), (section, [{"error": 1 / 3}])),
+    }[request.param]()
+
+
+def store_in(folder, stop=None):
+    said, reporter = [], Silent()
+    reporter.say = said.append
+    return Store(folder, reporter=reporter, stop=stop), said
+
+
+every_kind = pytest.mark.parametrize("case", list(OTHERS), indirect=True)
+
+
+@every_kind
+def test_a_value_is_made_once_and_is_the_same_to_the_bit(case, tmp_path):
+    codec, value = case
+    store, said = store_in(tmp_path / "store")
+    first = store.get_or_make("folder/key", lambda: value, codec)
+    again = store_in(tmp_path / "store")[0].get_or_make("folder/key", lambda: pytest.fail("made again"), codec)
+    assert leaves(first) == leaves(again) == leaves(value)
+    assert said == []
+    assert [path.name for path in (tmp_path / "store" / "folder").iterdir()] == [f"key{codec.suffix}"]
+    assert store.get("folder/other", codec) is None
+    store.remove("folder/key", codec)
+    store.remove("folder/key", codec)
+    assert store.get("folder/key", codec) is None
+
+
+class Executed:
+    def __reduce__(self):
+        return (pytest.fail, ("a file was executed",))
+
+
+@every_kind
+def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_made_again(case, tmp_path, request):
+    codec, value = case
+    store, said = store_in(tmp_path / "store")
+    store.put("key", value, codec)
+    path = store.path("key", codec)
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    npz = tmp_path / "objects.npz"
+    np.savez(npz, about=np.array([Executed()], dtype=object))
+    flipped = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+    for data in (whole[:-9], whole[:40], b"", flipped, pickle.dumps(Executed()), npz.read_bytes(), b"\xff\xfe{}\n"):
+        path.write_bytes(data)
+        said.clear()
+        assert leaves(store.get_or_make("key", lambda: value, codec)) == leaves(value)
+        assert path.read_bytes() == whole
+        (line,) = said
+        assert str(path) in line
+        assert line.endswith("made again")
+        assert "\n" not in line
+    other = OTHERS[request.node.callspec.params["case"]]
+    foreign = [flight(0.1, spec=spec) for spec in other.specs] if isinstance(other, FlightCodec) else value
+    other.write(path, {} if isinstance(other, JsonCodec) else foreign)
+    said.clear()
+    assert store.get("key", codec) is None
+    assert len(said) == 1
+
+
+def test_a_section_is_made_again_if_its_picture_is_another(tmp_path):
+    picture, codec = tmp_path / "x.png", SectionCodec(tmp_path)
+    picture.write_bytes(b"drawn")
+    store, said = store_in(tmp_path)
+    store.put("key", (TableSection((), (), picture=picture), []), codec)
+    assert store.get("key", codec) is not None
+    picture.write_bytes(b"of another table")
+    assert store.get("key", codec) is None
+    picture.unlink()
+    assert store.get("key", codec) is None
+    assert len(said) == 2
+
+
+def test_what_a_stop_leaves_incomplete_is_returned_but_not_stored(tmp_path):
+    stop, called = threading.Event(), []
+    store, _ = store_in(tmp_path, stop)
+    codec = JsonCodec("note")
+    hooks = {"on_reuse": lambda: called.append("reused"), "on_store": lambda: called.append("stored")}
+
+    def half():
+        stop.set()
+        return {"half": 1}
+
+    assert store.get_or_make("key", half, codec, **hooks) == {"half": 1}
+    stop.clear()
+    assert store.get_or_make("key", lambda: None, codec, **hooks) is None
+    assert (called, store.get("key", codec)) == ([], None)
+    assert store.get_or_make("key", lambda: {"whole": 2}, codec, **hooks) == {"whole": 2}
+    assert store.get_or_make("key", half, codec, **hooks) == {"whole": 2}
+    assert called == ["stored", "reused"]
+
+
+def test_a_folder_of_an_earlier_version_is_no_obstacle(tmp_path):
+    """Files with other names stay; a file with the name of a key is refused."""
+    for name in ("sections/0123456789abcdef.json", "sections/0123456789abcdef.done", "sections/flights/k.npz"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(json.dumps({"section": {}, "rows": []}))
+    store, said = store_in(tmp_path)
+    assert store.get("sections/0123456789abcdef", SectionCodec(tmp_path)) is None
+    assert store.get("sections/flights/k", FlightCodec(SPECS)) is None
+    assert len(said) == 2
+    store.clear("sections/flights")
+    assert {path.name for path in (tmp_path / "sections").iterdir()} == {"0123456789abcdef.json",
+                                                                         "0123456789abcdef.done"}  # fmt: skip
+
+
+def test_rows_are_lines_for_other_programs_and_a_torn_line_leaves_the_others(tmp_path):
+    store, _ = store_in(tmp_path)
+    rows = [{"key": "a", "error": 0.1}, {"key": "b", "error": None}]
+    store.put("flights", rows, RowsCodec())
+    path = Path(tmp_path / "flights.jsonl")
+    assert [json.loads(line) for line in path.read_text().splitlines()] == rows
+    path.write_text(path.read_text() + '{"key": "torn\n' + "[" * 100_000)
+    assert store.get("flights", RowsCodec()) == [*rows, None, None]
