@@ -22,11 +22,11 @@ from retrim.learn.env import Env
 from retrim.learn.pretrain import train_chunk
 from retrim.learn.residuals.ensemble import EnsembleResidual, EnsembleState, fit_ensemble
 from retrim.learn.residuals.targets import Targets, residual_targets
+from retrim.learn.stacking import stack
 from retrim.learn.window import Window
 from retrim.physics.dynamics import AbstractDynamics, Hybrid, PointMass, StraightThrough
 from retrim.physics.rotors import LinearDragQuadrotor
 from retrim.plants.sim import SimPlant
-from retrim.runtime.batched import stacked
 from retrim.runtime.flight import Log
 from retrim.runtime.pilot import ControllerPilot
 from retrim.runtime.together import fly_together
@@ -113,7 +113,7 @@ def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Ke
     """
     k_fit, k_train = random.split(key)
     nominal = _nominal(setup, choice)
-    windows = stacked([log.window(len(log.t) - 1) for log in logs])
+    windows = stack([log.window(len(log.t) - 1) for log in logs])
     rows = _rows(windows, nominal, setup.preset.plant_delay_ticks)
     adapt = setup.preset.adapt
     adam = _adam(adapt.fit_learning_rate)

@@ -11,14 +11,14 @@ from jax import random
 
 from helpers import BRIEF, tiny_preset
 from retrim.adapt import AbstractPolicyOptimiser, OnlineLearner, Rejection, Worker
+from retrim.adapt.batched_workers import learn_together
 from retrim.config import Scenario, Setup, changed, learning_method, register_learner, register_method
 from retrim.config.methods import METHODS, learning_methods
 from retrim.config.online_learners import LEARNERS, OPTIMISERS, register_optimiser
 from retrim.errors import ConfigError
 from retrim.learn import PolicyState
 from retrim.runtime import fly
-from retrim.runtime.batch_learning import Plan
-from retrim.runtime.fleet_learning import learn_together
+from retrim.runtime.batched_learning import Plan
 from retrim.runtime.together import can_fly_together
 
 TICKS = 70

@@ -22,9 +22,9 @@ sys.path.insert(0, "{tests}")
 from helpers import tiny_preset
 from retrim import Fleet, Scenario, Setup
 from retrim.adapt.buffer import RollingBuffer
+from retrim.adapt.batched_workers import learn_base, learn_together, shared_base
 from retrim.adapt.workers import PolicyWorker
 from retrim.physics import Command, State
-from retrim.runtime.fleet_learning import learn_base, learn_together, shared_base
 
 jax.config.update("jax_enable_x64", True)
 assert jax.device_count() == {devices}
@@ -40,10 +40,10 @@ fleet.lots(fleet.specs)
 flights = fleet.run().flown
 low_rank = setup.low_rank(policy, jax.random.key(0))
 state = setup.learner.init(low_rank, jax.random.key(1))
-window, base = RollingBuffer(preset.adapt.window), shared_base(setup.learner, state)
+window = RollingBuffer(preset.adapt.window)
 window.push(0.0, State.at(setup.flight_task.home()), Command.hover(float))
 workers = [PolicyWorker(setup.learner, state, jax.random.key(i)) for i in range(4)]
-base = learn_base(workers, [window.window()] * 4, base, jax.random.key(4))
+base = learn_base(workers, [window.window()] * 4, shared_base(workers[0]), jax.random.key(4))
 if {devices} > 1:
     learn_together(workers[:3], [window.window()] * 3, base)  # another number of vehicles, other devices
 learnt = [jax.tree.leaves(flight.learnt)[0] for flight in flights]

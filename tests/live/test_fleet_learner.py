@@ -11,6 +11,7 @@ import pytest
 from jax import random
 
 from live.test_live_learner import Beside, start  # noqa: F401
+from retrim.adapt.batched_workers import room_for
 from retrim.config.setup import Setup
 from retrim.io.trained import load_learner_state, save_learner_state
 from retrim.live import fleet_learner, fleet_process
@@ -18,7 +19,6 @@ from retrim.live.fleet_learner import FleetLearner
 from retrim.live.fleet_process import FleetProcess
 from retrim.live.learner_process import LearnerPlan
 from retrim.onboard.messages import pack_note
-from retrim.runtime.fleet_learning import room_for
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 SEEDS = {"a": 1, "b": 2, "c": 3, "d": 4}

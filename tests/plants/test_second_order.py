@@ -12,6 +12,7 @@ from jax import lax, random
 from helpers import random_command, stacked
 from retrim import testing
 from retrim.config import Scenario, VehicleSpec
+from retrim.learn.stacking import stack
 from retrim.physics import (
     ActuatorResponse,
     Command,
@@ -23,7 +24,6 @@ from retrim.physics import (
     small,
 )
 from retrim.plants import SensorModel, SimPlant
-from retrim.runtime import batched
 
 DT = 0.02
 START = State.at(jnp.array([0.3, -0.2, 1.5]))
@@ -146,7 +146,7 @@ def simulations():
 def test_a_batch_of_vehicles_equals_its_members():
     us = draw()
     together = eqx.filter_jit(lambda many: eqx.filter_vmap(lambda each: fly(each, us))(many))
-    found = together(batched.stacked(list(simulations())))
+    found = together(stack(list(simulations())))
     for i, each in enumerate(simulations()):
         alone = eqx.filter_jit(fly)(each, us)
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(alone), strict=True):

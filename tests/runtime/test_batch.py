@@ -11,10 +11,10 @@ from retrim.control import Policy, PolicyController
 from retrim.control.controller import AbstractController
 from retrim.control.gravity_frame import GravityFrame
 from retrim.estimation.disturbance_observer import DisturbanceObserver
+from retrim.learn.stacking import stack, unstack
 from retrim.physics import Command, CommandPath, Constant, LinearDragQuadrotor, PointMass, State, small
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, batch_flight, fly
-from retrim.runtime.batched import one, stacked
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +100,8 @@ def test_limits_are_those_of_the_plant_and_are_remembered(parts):
 def test_maps_over_vehicles_that_see_other_noise(parts):
     model, push, controller, x0 = parts
     plants = [SimPlant(model, push, sensors=SENSORS, seed=seed) for seed in (0, 1)]
-    together = stacked([plant.simulation for plant in plants])
+    together = stack([plant.simulation for plant in plants])
     flown = jax.jit(jax.vmap(lambda s: batch_flight(s, controller, x0, ticks=5)))(together)
     assert flown.accepted.c.shape == (2, 5)
     assert not np.array_equal(flown.accepted.c[0], flown.accepted.c[1])
-    assert_same(one(flown, 1), fly(plants[1], ControllerPilot(controller), x0, ticks=5))
+    assert_same(unstack(flown, 1), fly(plants[1], ControllerPilot(controller), x0, ticks=5))

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers import CheapModel, tiny_preset
+from retrim.adapt.batched_workers import AT_ONCE, IN_CACHE, at_once
 from retrim.adapt.updates import Rejection, Skip
 from retrim.adapt.worker import Worker
 from retrim.config import Setup, disturbance
@@ -16,7 +17,7 @@ from retrim.learn import Window
 from retrim.physics import Command
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, FlightStopped, FunctionPilot, LockstepLearner, fly
-from retrim.runtime.batch_learning import AT_ONCE, IN_CACHE, at_once, offers
+from retrim.runtime.batched_learning import offers
 from retrim.runtime.together import can_fly_together, fly_together
 
 TICKS = 70
@@ -127,8 +128,11 @@ def test_pilots_have_learnt_the_same(flown):
 
 
 def test_a_pilot_flies_on_with_what_it_learnt(flown):
-    """And its learners go on from there: nothing of it is left as it was before."""
-    _, pilots, _, _, _, setup = flown
+    """And its learners go on from there, with the next random numbers: nothing of it is left as it was before."""
+    _, pilots, _, alone, _, setup = flown
+    for pilot, other in zip(pilots, alone, strict=True):
+        mine, theirs = (jax.random.key_data(each.learners[1].learner.worker.key) for each in (pilot, other))
+        np.testing.assert_array_equal(mine, theirs)
     pilot, start = pilots[0], setup.flight_starts(1)[0]
     plain = [SimPlant(CheapModel(0.02), disturbance("none")) for _ in range(2)]
     log = fly(plain[0], pilot, start, ticks=3)

@@ -14,7 +14,9 @@ from .updates import Skip as Skip
 from .updates import Update as Update
 from .updates import pack_update as pack_update
 from .updates import unpack_update as unpack_update
+from .worker import BatchUpdate as BatchUpdate
 from .worker import Worker as Worker
+from .worker import WorkerBatch as WorkerBatch
 from .workers import PolicyWorker as PolicyWorker
 from .workers import ResidualWorker as ResidualWorker
 from .workers import make_worker as make_worker

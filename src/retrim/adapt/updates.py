@@ -5,11 +5,14 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
+import numpy as np
+
 from ..errors import MessageError
 from ..learn.bptt import PolicyState
 from ..learn.screening import REASONS, describe_counts
 from ..transport import wire
-from .learner_state import LearnerState
+from .gate import Verdict
+from .learner_state import FitReport, LearnerState
 
 Layer = Literal["residual", "policy"]
 """The two layers of learning."""
@@ -82,6 +85,25 @@ class Skip:
 Update = ResidualUpdate | PolicyUpdate | Rejection | Skip
 KINDS: dict[type, str] = {ResidualUpdate: "residual", PolicyUpdate: "policy", Rejection: "rejected", Skip: "skipped"}
 """Name of each kind of update in messages and logs."""
+
+
+def residual_update(computed_from: float, state: Any, report: FitReport) -> ResidualUpdate | Rejection:
+    """Return the message for a finished fit."""
+    excluded = describe_counts(report.contradictions)
+    if not report.accepted:
+        reason = "the residual's fit is not finite, or no tick of the window can be used"
+        return Rejection(
+            computed_from, "residual", f"{reason} (measurements excluded: {excluded})" if excluded else reason
+        )
+    counts = tuple(np.asarray(report.contradictions).tolist())
+    return ResidualUpdate(computed_from, float(report.rms_error), state, counts)
+
+
+def policy_update(computed_from: float, state: PolicyState, verdict: Verdict) -> PolicyUpdate | Rejection:
+    """Return the message for a finished policy update."""
+    if not verdict.admitted:
+        return Rejection(computed_from, "policy", verdict.reason())
+    return PolicyUpdate(computed_from, float(verdict.candidate), float(verdict.incumbent), state)
 
 
 def pack_update(update: Update) -> bytes:

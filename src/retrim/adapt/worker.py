@@ -1,10 +1,44 @@
 """Interface of a worker, which computes one learning layer and is independent of clock and process."""
 
 import abc
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
 
+from ..control.lora import LoraPolicy
+from ..learn.stacking import unstack
 from ..learn.window import Window
 from .updates import Layer, Update
+
+
+class BatchUpdate(NamedTuple):
+    """Results of a batch of workers."""
+
+    states: Any
+    """New states (leading axis vehicles); the old state of a vehicle that rejects its result."""
+    message: Callable[[int, Any], Update]
+    """Returns the message for a vehicle, by its number and the state that the message contains."""
+
+    def unstack(self, n: int) -> list[Update]:
+        """Return the messages for the first ``n`` vehicles, each with the vehicle's own state."""
+        return [self.message(i, unstack(self.states, i)) for i in range(n)]
+
+
+class WorkerBatch(abc.ABC):
+    """Workers of several vehicles, whose computations run as one program."""
+
+    @abc.abstractmethod
+    def learn(self, states: Any, windows: Window, incumbents: Any = None) -> BatchUpdate:
+        """Learn from the window of each vehicle; all arrays have a leading axis of vehicles.
+
+        Args:
+            states: State of each worker, see :attr:`Worker.state`.
+            windows: Window of each vehicle.
+            incumbents: Policies in flight, if they differ from those of ``states``.
+        """
+
+    @abc.abstractmethod
+    def unstack(self, workers: Sequence[Any]) -> None:
+        """Let the workers continue as if each had learned alone; only their random numbers are not in an update."""
 
 
 class Worker(abc.ABC):
@@ -12,9 +46,21 @@ class Worker(abc.ABC):
 
     A worker's state advances only when the worker receives its own update after publication. A result that is dropped
     on the way (because of a new flight or a lost message) therefore never becomes the base of the next result.
+
+    A class of workers that can also learn as one batch defines ``stack`` and ``state``. A subclass that changes
+    ``learn`` does not inherit this ability.
     """
 
     layer: Layer
+    learner: Any
+    """Online learner of the reference. Workers that form a batch share one learner."""
+    stackable: ClassVar[bool] = False
+    """Whether workers of this class can learn as one batch."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Determine whether the class has a batch that computes the same as ``learn``."""
+        super().__init_subclass__(**options)
+        cls.stackable = "stack" in vars(cls) or (cls.stackable and "learn" not in vars(cls))
 
     @abc.abstractmethod
     def learn(self, window: Window) -> Update:
@@ -31,3 +77,26 @@ class Worker(abc.ABC):
             learner: Online learner of the new reference.
         """
         self.learner = learner
+
+    @classmethod
+    def stack(cls, workers: Sequence[Any]) -> WorkerBatch:
+        """Return workers of this class with one learner as a batch.
+
+        Raises:
+            NotImplementedError: The class is not ``stackable``.
+        """
+        raise NotImplementedError(f"{cls.__name__}: workers must be stackable to form a batch; let each learn alone")
+
+    @property
+    def state(self) -> Any:
+        """State from which the next result starts, a pytree; None for a worker that does not form batches."""
+        return None
+
+    def state_in(self, state: Any) -> Any:
+        """Return the part of a :class:`~retrim.LearnerState` that has the structure of ``state``."""
+        return state
+
+    @property
+    def low_rank(self) -> LoraPolicy | None:
+        """Low-rank policy that the worker trains, whose base it can share with others; None for other workers."""
+        return None

@@ -1,42 +1,22 @@
 """The two workers of an online learner: one fits the residual, and one re-trains the policy."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Key
 
 from ..control.lora import LoraPolicy
-from ..control.policy import AbstractPolicy
 from ..learn.bptt import PolicyState
-from ..learn.devices import suitable_device
-from ..learn.screening import describe_counts
+from ..learn.devices import shard, suitable_device
 from ..learn.window import Window
-from .gate import Verdict
+from .batched_workers import PolicyBatch, ResidualBatch
 from .learner import OnlineLearner
-from .learner_state import FitReport, LearnerState
-from .updates import Layer, PolicyUpdate, Rejection, ResidualUpdate, Update
+from .learner_state import LearnerState
+from .updates import Layer, PolicyUpdate, Rejection, ResidualUpdate, Update, policy_update, residual_update
 from .worker import Worker
-
-
-def residual_update(computed_from: float, state: Any, report: FitReport) -> ResidualUpdate | Rejection:
-    """Return the message for a finished fit."""
-    excluded = describe_counts(report.contradictions)
-    if not report.accepted:
-        reason = "the residual's fit is not finite, or no tick of the window can be used"
-        return Rejection(
-            computed_from, "residual", f"{reason} (measurements excluded: {excluded})" if excluded else reason
-        )
-    counts = tuple(np.asarray(report.contradictions).tolist())
-    return ResidualUpdate(computed_from, float(report.rms_error), state, counts)
-
-
-def policy_update(computed_from: float, state: PolicyState, verdict: Verdict) -> PolicyUpdate | Rejection:
-    """Return the message for a finished policy update."""
-    if not verdict.admitted:
-        return Rejection(computed_from, "policy", verdict.reason())
-    return PolicyUpdate(computed_from, float(verdict.candidate), float(verdict.incumbent), state)
 
 
 class ResidualWorker(Worker):
@@ -51,6 +31,15 @@ class ResidualWorker(Worker):
     def state(self) -> Any:
         """State of the residual model from which the next fit starts."""
         return self._residual
+
+    def state_in(self, state: LearnerState) -> Any:
+        """Return the residual's state."""
+        return state.residual
+
+    @classmethod
+    def stack(cls, workers: Sequence[Any]) -> ResidualBatch:
+        """Return the workers as a batch."""
+        return ResidualBatch(workers[0].learner)
 
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
         """Fit the residual to ``window``."""
@@ -80,19 +69,18 @@ class PolicyWorker(Worker):
         return LearnerState(self._policy, self._residual)
 
     @property
-    def policy(self) -> AbstractPolicy | LoraPolicy:
-        """Policy from which the next update starts."""
-        return self._policy.policy
+    def low_rank(self) -> LoraPolicy | None:
+        """Policy from which the next update starts, if it is a low-rank policy."""
+        return self._policy.policy if isinstance(self._policy.policy, LoraPolicy) else None
 
-    def next_key(self) -> Key[Array, ""]:
-        """Return the key of the next update; each call returns a new key."""
-        self.key, key = random.split(self.key)
-        now: Key[Array, ""] = key
-        return now
+    @classmethod
+    def stack(cls, workers: Sequence[Any]) -> PolicyBatch:
+        """Return the workers as a batch, which starts from their random keys."""
+        return PolicyBatch(workers[0].learner, shard(jnp.stack([worker.key for worker in workers])))
 
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
         """Re-train the policy; the window provides starts for the gate."""
-        key = self.next_key()
+        self.key, key = random.split(self.key)
         with suitable_device(self._policy.policy, self.learner.num_envs):
             updated = self.learner.update_policy(self._policy, self._residual, window, key)
             trained, verdict = jax.block_until_ready(updated)

@@ -14,13 +14,13 @@ from ..config.disturbances import disturbance
 from ..config.setup import Setup
 from ..control.controller import PolicyController
 from ..learn.bptt import PolicyState
+from ..learn.stacking import stack
 from ..learn.window import Window
 from ..physics.bem import BemQuadrotor
 from ..physics.state import State
 from ..physics.vehicle import small
 from ..plants.sim import SimPlant
 from ..runtime.batch import batch_flight
-from ..runtime.batched import stacked
 from .flight import learner_in_flight
 from .timing import compiled, timed
 
@@ -34,7 +34,7 @@ def eight_flights() -> dict[str, Any]:
     controller = PolicyController(setup.flight_task.observation_in_flight, setup.new_policy(random.key(0)))
     simulation = SimPlant(BemQuadrotor.of(small(), 0.02), disturbance("none")).simulation
     starts = setup.flight_starts(8)
-    halves = [stacked(starts[i : i + 4]) for i in (0, 4)]
+    halves = [stack(starts[i : i + 4]) for i in (0, 4)]
 
     @jax.jit
     def four(controller: PolicyController, x0s: State) -> State:

@@ -18,6 +18,7 @@ from jaxtyping import Array
 from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
+from ..learn.stacking import stack
 from ..live.fleet_process import FleetProcess
 from ..live.learner_process import LearnerPlan
 from ..live.plans import plan_of
@@ -31,7 +32,6 @@ from ..onboard.messages import Sample, last_note
 from ..onboard.realtime import sleep_until
 from ..physics.state import Command, State
 from ..plants.sim import SimPlant, SimState, Simulation
-from ..runtime.batched import stacked
 from ..transport.shared_memory import SharedMemoryBus
 from .machine import last_core, on_core
 
@@ -70,8 +70,8 @@ class Air:
         self.buses = [SharedMemoryBus.create(topics(self.spec)) for _ in range(n)]
         self.loops = [self._loop(self.spec, bus) for bus in self.buses]
         plants = [scenario.make("small", dt=self.dt, seed=i) for i in range(n)]
-        self._simulations = stacked([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
-        self._flown, measured = _launch(self._simulations, stacked(starts))
+        self._simulations = stack([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
+        self._flown, measured = _launch(self._simulations, stack(starts))
         self._measured = np.asarray(measured, dtype=float)
         self._accepted = np.tile(np.asarray(Command.hover().vector(), dtype=float), (n, 1))
         self.tick = 0

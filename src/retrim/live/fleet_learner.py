@@ -1,26 +1,20 @@
 """Learn for many vehicles in one process: updates that are due at the same time run as one program."""
 
-import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import numpy as np
 from jax import random
 
+from ..adapt.batched_workers import learn_base, learn_together, refused_by_all, room_for, shared_base
 from ..adapt.updates import Update
-from ..adapt.worker import Worker
-from ..adapt.workers import PolicyWorker
 from ..config.loading import dump
 from ..config.presets import Preset
 from ..config.setup import Setup
-from ..control.lora import LoraPolicy
-from ..control.policy import AbstractPolicy
+from ..io.digests import tree_digest
 from ..learn.bptt import PolicyState
 from ..learn.window import Window
-from ..runtime.fleet_learning import learn_base, learn_together, refused_by_all, room_for, shared_base
 from ..transport.bus import Bus
 from .learner_process import LearnerLoop, LearnerPlan
 
@@ -56,8 +50,8 @@ class FleetLearner:
         """
         loop = LearnerLoop(plan, bus, self._clock, self._setup_of)
         loop.catch_up()
-        policy = loop.state.policy.policy
-        base = fingerprint(policy.base) if isinstance(policy, LoraPolicy) else ""
+        low_rank = loop.new_worker().low_rank
+        base = "" if low_rank is None else tree_digest(low_rank.base)
         self._members[name] = _Member(loop, base, wanted)
 
     def drop(self, name: str) -> None:
@@ -74,9 +68,8 @@ class FleetLearner:
                 some = [loops[i % len(loops)] for i in range(n)]
                 workers, windows = [loop.new_worker() for loop in some], [loop.dummy_window() for loop in some]
                 learn_together(workers, windows)
-                if (low_rank := _low_rank(workers)) and len(loops) > 1:
-                    base = shared_base(low_rank[0].learner, low_rank[0].state)
-                    learn_base(low_rank, windows, base, random.key(0))
+                if workers[0].low_rank is not None and len(loops) > 1:
+                    learn_base(workers, windows, shared_base(workers[0]), random.key(0))
                 self._compiled.add((kind, n, len(loops) > 1))
 
     def step(self) -> int:
@@ -93,7 +86,7 @@ class FleetLearner:
                     windows[name] = window
             if not windows:
                 continue
-            updates = self._learnt(kind, [members[name].loop for name in windows], list(windows.values()))
+            updates = self._learn(kind, [members[name].loop for name in windows], list(windows.values()))
             for name, update in zip(windows, updates, strict=True):
                 if members[name].wanted():
                     members[name].loop.learnt(update)
@@ -101,19 +94,18 @@ class FleetLearner:
             done += len(windows)
         return done
 
-    def _learnt(self, kind: Any, loops: list[LearnerLoop], windows: list[Window]) -> list[Update]:
+    def _learn(self, kind: Any, loops: list[LearnerLoop], windows: list[Window]) -> list[Update]:
         """Learn for some vehicles of a kind; low-rank policies share a base that learns from all of them."""
         workers, members = [loop.worker for loop in loops], self._kinds()[kind].values()
-        low_rank = _low_rank(workers)
-        if not low_rank or len(members) < 2:
+        if workers[0].low_rank is None or len(members) < 2:
             return learn_together(workers, windows)
         backs = sum(member.loop.rolled_back for member in members)
         if backs != self._taken_back.get(kind, backs):
             self._bases.pop(kind, None)  # control has rolled back a policy: continue from the policy in flight
         self._taken_back[kind] = backs
-        before = self._bases.get(kind) or shared_base(low_rank[0].learner, low_rank[0].state)
+        before = self._bases.get(kind) or shared_base(workers[0])
         self._key, key = random.split(self._key)
-        base = learn_base(low_rank, windows, before, key)
+        base = learn_base(workers, windows, before, key)
         updates = learn_together(workers, windows, base)
         self._bases[kind] = before if refused_by_all(updates) else base
         return updates
@@ -141,21 +133,10 @@ class _Member(NamedTuple):
 
     loop: LearnerLoop
     base: str
-    """Fingerprint of the base of a low-rank policy; empty for other policies."""
+    """Digest of the base of the worker's low-rank policy; empty for other workers."""
     wanted: Callable[[], bool]
 
     @property
     def kind(self) -> tuple[str, int, str]:
         """Key of the vehicles that share a program: layer, set-up (its reference may change in flight) and base."""
         return self.loop.plan.layer, id(self.loop.setup), self.base
-
-
-def _low_rank(workers: Sequence[Worker]) -> list[PolicyWorker]:
-    """Return the workers that learn a low-rank delta; for one kind, these are either all workers or none."""
-    return [each for each in workers if isinstance(each, PolicyWorker) and isinstance(each.policy, LoraPolicy)]
-
-
-def fingerprint(policy: AbstractPolicy) -> str:
-    """Return a hash that identifies the weights of a policy."""
-    leaves = jax.tree.leaves(eqx.filter(policy, eqx.is_array))
-    return hashlib.sha256(b"".join(np.ascontiguousarray(leaf).tobytes() for leaf in leaves)).hexdigest()[:16]

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,14 +11,13 @@ import numpy as np
 from jaxtyping import Array
 
 from ..learn.devices import shard
+from ..learn.stacking import stack
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.sim import SimState, Simulation
 from .batch import InFlight, Ticks, fly_ticks, in_flight
 from .events import Event, stage_events, vehicle_events
 from .flight import FlightStopped, Log, States
-
-T = TypeVar("T")
 
 ROOM = 50  # ticks per call; the period of progress reports and stop checks
 
@@ -38,10 +37,10 @@ class Batch:
         self.ticks, self.dt = ticks, dt
         self.controllers: Any = None
         """Controllers of the flights; new ones take over the memory of the previous ones."""
-        self._simulations, self._starts = stacked(simulations), stacked(starts)
+        self._simulations, self._starts = stack(simulations), stack(starts)
         self._progress, self._stop = progress, stop
         # Without disturbances, plants of one kind have the same structure, so one program launches all of them.
-        self._on_the_ground = stacked([simulation.undisturbed() for simulation in simulations])
+        self._on_the_ground = stack([simulation.undisturbed() for simulation in simulations])
         self._flights: InFlight | None = None
         self._flown = 0
         self._measured: Any = None  # from the start on
@@ -114,28 +113,6 @@ class Batch:
             tuple(events),
             self._simulations.age,
         )
-
-
-def stacked(trees: Sequence[T]) -> T:
-    """Return trees of one structure as one tree, with a leading axis that is divided among the devices."""
-    arrays = [eqx.filter(tree, eqx.is_array) for tree in trees]
-    together = jax.tree.map(lambda *leaves: _stack(leaves), *arrays)
-    whole: T = shard(eqx.combine(together, eqx.filter(trees[0], eqx.is_array, inverse=True)))
-    return whole
-
-
-def one(tree: T, i: int) -> T:
-    """Return one of the trees that :func:`stacked` has stacked."""
-    result: T = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[i]), tree)
-    return result
-
-
-def _stack(leaves: Sequence[Any]) -> Array:
-    """Stack arrays in NumPy, to avoid compiling a program for every shape."""
-    if jnp.issubdtype(leaves[0].dtype, jax.dtypes.prng_key):
-        return jnp.stack(leaves)
-    stacked: Array = jax.device_put(np.stack([np.asarray(leaf) for leaf in leaves]))
-    return stacked
 
 
 def _recorded(record: Any, flown: Any, at: int, size: int, *, rows: int) -> Any:

@@ -3,11 +3,17 @@
 import abc
 
 from ..adapt.updates import Update
+from ..adapt.worker import Worker
 from ..learn.window import Window
 
 
 class Learner(abc.ABC):
     """Receives windows of flight and returns updates. It exchanges messages and never calls the pilot."""
+
+    @property
+    def batchable(self) -> tuple[Worker, int] | None:
+        """Worker that can learn in a batch of flights, and its latency [ticks]; None for a learner that cannot."""
+        return None
 
     @abc.abstractmethod
     def submit(self, window: Window, tick: int) -> None:

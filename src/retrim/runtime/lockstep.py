@@ -28,6 +28,13 @@ class LockstepLearner(Learner):
         self._ready: tuple[int, Update] | None = None
         self._skipped: list[Update] = []
 
+    @property
+    def batchable(self) -> tuple[Worker, int] | None:
+        """The worker if it is stackable, and its latency [ticks] if it does not depend on the compute time."""
+        if self.latency_s is None or not self.worker.stackable:
+            return None
+        return self.worker, self.ticks(self.latency_s)
+
     def submit(self, window: Window, tick: int) -> None:
         """Learn from ``window`` now; record a skip if the last update is not visible yet."""
         if self._ready is not None:

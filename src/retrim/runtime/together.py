@@ -7,12 +7,13 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from ..learn.stacking import stack, unstack
 from ..physics.state import State
 from ..plants.plant import Plant
 from ..plants.sim import SimPlant
 from .adaptive import AdaptivePilot
-from .batch_learning import Plan, fly_and_learn
-from .batched import Batch, one, stacked
+from .batched import Batch
+from .batched_learning import Plan, fly_and_learn
 from .events import Event
 from .flight import Log
 from .pilot import ControllerPilot, Pilot
@@ -68,12 +69,12 @@ def fly_together(
     learning = [pilot for pilot in pilots if isinstance(pilot, AdaptivePilot)]
     events: Sequence[Sequence[Event]]
     if learning:
-        plans, begun = [_plan(pilot) for pilot in learning], stacked([pilot.state for pilot in learning])
-        states, events = fly_and_learn(batch, plans, begun, cold=cold)
+        plans, start = [_plan(pilot) for pilot in learning], stack([pilot.state for pilot in learning])
+        states, events = fly_and_learn(batch, plans, start, cold=cold)
         for i, pilot in enumerate(learning):
-            pilot.learn(one(states, i), ticks * batch.dt)
+            pilot.learn(unstack(states, i), ticks * batch.dt)
     else:
-        batch.controllers = stacked([pilot.controller for pilot in pilots if isinstance(pilot, ControllerPilot)])
+        batch.controllers = stack([pilot.controller for pilot in pilots if isinstance(pilot, ControllerPilot)])
         batch.fly_to(ticks)
         events = [()] * len(pilots)
     return [batch.log(i, events[i]) for i in range(len(pilots))]

@@ -7,12 +7,14 @@ import pytest
 from jax import random
 
 from helpers import draw_starts, random_field_flight, tiny_preset
+from retrim.adapt.batched_workers import learn_base, learn_together, refused_by_all, shared_base
 from retrim.adapt.updates import PolicyUpdate, Rejection, Skip
+from retrim.adapt.worker import Worker
 from retrim.adapt.workers import PolicyWorker, ResidualWorker
 from retrim.config.setup import Setup
 from retrim.learn.bptt import PolicyState, policy_loss
 from retrim.learn.residuals.model import FittedResidual
-from retrim.runtime.fleet_learning import learn_base, learn_together, refused_by_all, shared_base
+from retrim.learn.stacking import stack, unstack
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 PUSH = jnp.array([1.5, -1.0, 0.5])
@@ -44,7 +46,7 @@ def weights(base):
 def test_a_base_serves_a_vehicle_that_has_learnt_nothing(fleet):
     """What two have felt lowers the loss of the bare base in the model of the first."""
     learner, workers, windows = fleet
-    first = base = shared_base(learner, workers[0].state)
+    first = base = shared_base(workers[0])
     for i in range(40):
         base = learn_base(workers, windows, base, random.key(i))
     corrected = learner.view(learner.env, FittedResidual(learner.residual_model, workers[0].state.residual))
@@ -55,7 +57,7 @@ def test_a_base_serves_a_vehicle_that_has_learnt_nothing(fleet):
 
 def test_a_step_that_is_not_finite_changes_nothing(fleet):
     learner, workers, windows = fleet
-    base = shared_base(learner, workers[0].state)
+    base = shared_base(workers[0])
     state = workers[0].state
     sick = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.policy.policy.params)
     policy = PolicyState(state.policy.policy.with_params(sick), state.policy.optimiser)
@@ -65,8 +67,8 @@ def test_a_step_that_is_not_finite_changes_nothing(fleet):
 
 
 def test_deltas_go_on_from_the_shared_base(fleet):
-    learner, workers, windows = fleet
-    base = learn_base(workers, windows, shared_base(learner, workers[0].state), random.key(0))
+    _, workers, windows = fleet
+    base = learn_base(workers, windows, shared_base(workers[0]), random.key(0))
     updates = learn_together(workers, windows, base)
     taken = [update.state.policy.base for update in updates if isinstance(update, PolicyUpdate)]
     for each in taken:
@@ -84,6 +86,55 @@ def test_a_fit_of_many_is_each_ones_own(fleet):
         assert one.computed_from == other.computed_from
         for a, b in zip(jax.tree.leaves(one.state), jax.tree.leaves(other.state), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+class Doubled(ResidualWorker):
+    """Computes something else than the class from which it inherits."""
+
+    def learn(self, window):
+        return Rejection(float(window.t[-1]), "residual", "doubled")
+
+
+class Renamed(PolicyWorker):
+    """Computes the same as the class from which it inherits."""
+
+
+def test_a_worker_with_its_own_computation_is_not_stacked(fleet):
+    learner, workers, windows = fleet
+    assert [each.stackable for each in (Worker, ResidualWorker, PolicyWorker, Doubled, Renamed)] == [
+        False, True, True, False, True
+    ]  # fmt: skip
+    doubled = [Doubled(learner, worker.state) for worker in workers]
+    assert [update.reason for update in learn_together(doubled, windows)] == ["doubled"] * 2
+    with pytest.raises(ValueError, match="low-rank"):
+        shared_base(doubled[0])
+
+
+def test_a_policy_of_many_is_each_ones_own_and_so_are_its_next_random_numbers(fleet):
+    """Also of three, whose program is one for four."""
+    learner, workers, windows = fleet
+    make = lambda: [PolicyWorker(learner, workers[i].state, random.key(7 + k)) for k, i in enumerate((0, 1, 0))]  # noqa: E731
+    some = [windows[i] for i in (0, 1, 0)]
+    alone, together = make(), make()
+    updates = learn_together(together, some)
+    for worker, window, update, other in zip(alone, some, updates, together, strict=True):
+        expected = worker.learn(window)
+        assert type(update) is type(expected)
+        np.testing.assert_array_equal(random.key_data(worker.key), random.key_data(other.key))
+        if isinstance(update, PolicyUpdate):
+            np.testing.assert_allclose(update.cost, expected.cost, rtol=1e-6)
+            for a, b in zip(jax.tree.leaves(update.state), jax.tree.leaves(expected.state), strict=True):
+                np.testing.assert_allclose(a, b, atol=1e-8)
+
+
+def test_trees_are_stacked_and_taken_apart_to_the_bit():
+    trees = [{"a": jnp.arange(3.0) + i, "key": random.key(i), "name": "same"} for i in range(2)]
+    whole = stack(trees)
+    assert whole["name"] == "same"
+    for i, tree in enumerate(trees):
+        part = unstack({"a": whole["a"], "key": whole["key"]}, i)
+        np.testing.assert_array_equal(part["a"], tree["a"])
+        np.testing.assert_array_equal(random.key_data(part["key"]), random.key_data(tree["key"]))
 
 
 def test_a_base_that_nobody_admits_is_known(fleet):
