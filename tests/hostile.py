@@ -47,7 +47,7 @@ from retrim.onboard.messages import (
     unpack_note,
 )  # fmt: skip
 from retrim.onboard.topics import INTO, OUT
-from retrim.runkit.codecs import RowsCodec
+from retrim.runkit.codecs import rows_codec
 from retrim.transport import wire
 from retrim.transport.message import pack_arrays
 
@@ -523,8 +523,8 @@ class Maker:
                 yield Case(f"setpoint {i} {value}", lambda data=data: Setpoint.unpack(data), bool(np.isfinite(value)))
         for name, text in texts_and_numbers(toml=False):
             for line in (text, f'{{"key": {text}}}', f'{{"key": "a", "failed": {text}}}', f"{{{text}: 1}}"):
-                yield Case(f"row {name}", lambda line=line: RowsCodec().read(self.file(line, ".jsonl")), True)
-        yield Case("row of bytes", lambda: RowsCodec().read(self.file(b"\xff\xfe{}\n", ".jsonl")), True)
+                yield Case(f"row {name}", lambda line=line: rows_codec().read(self.file(line, ".jsonl")), True)
+        yield Case("row of bytes", lambda: rows_codec().read(self.file(b"\xff\xfe{}\n", ".jsonl")), True)
 
 
 def callers() -> Iterator[str]:

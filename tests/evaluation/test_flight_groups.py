@@ -10,7 +10,7 @@ from retrim import CheckpointError, Scenario, Setup
 from retrim.evaluation.flight_groups import FLIGHTS, clear_flights
 from retrim.evaluation.study import Study, fly_all
 from retrim.runkit import Run, provenance
-from retrim.runkit.flight_codec import FlightCodec
+from retrim.runkit.flight_codec import flight_codec
 from retrim.runkit.reporter import Silent
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
@@ -46,10 +46,10 @@ def whole(study, tmp_path_factory):
 
 def test_a_file_of_flights_is_the_flights(whole, tmp_path):
     specs, path = [flight.spec for flight in whole], tmp_path / "flights.npz"
-    FlightCodec(specs).write(path, whole)
-    assert bits(FlightCodec(specs).read(path)) == bits(whole)
+    flight_codec(specs).write(path, whole)
+    assert bits(flight_codec(specs).read(path)) == bits(whole)
     with pytest.raises(CheckpointError, match="other specifications"):
-        FlightCodec(specs[1:]).read(path)
+        flight_codec(specs[1:]).read(path)
 
 
 def test_an_interrupted_table_flies_what_is_left_and_is_the_same(study, whole, tmp_path):

@@ -14,20 +14,22 @@ from helpers import tiny_preset
 from made_up import flight
 from retrim import Scenario, Setup
 from retrim.runkit import FlightSpec
-from retrim.runkit.codecs import JsonCodec, PolicyCodec, RowsCodec, SectionCodec, TreeCodec
+from retrim.runkit.codecs import json_codec, policy_codec, rows_codec, section_codec, tree_codec
 from retrim.runkit.document import TableSection
-from retrim.runkit.flight_codec import FlightCodec
+from retrim.runkit.flight_codec import flight_codec
 from retrim.runkit.reporter import Silent
 from retrim.runkit.store import Store
 
-SPECS = [FlightSpec(Scenario(plant="simple"), "base", start) for start in range(2)]
+SPECS, OTHER_SPECS = (
+    [FlightSpec(Scenario(plant="simple"), method, start) for start in range(2)] for method in ("base", "indi")
+)
 TREE = {"weights": jnp.arange(6.0).reshape(2, 3), "key": jax.random.key(3), "name": "kept out of the file"}
 OTHERS = {
-    "json": JsonCodec("other"),
-    "tree": TreeCodec(TREE, "other"),
-    "policy": PolicyCodec(tiny_preset(goal=(0.0, 0.0, 2.0))),
-    "flights": FlightCodec([FlightSpec(Scenario(plant="simple"), "indi", start) for start in range(2)]),
-    "section": JsonCodec("other"),
+    "json": json_codec("other"),
+    "tree": tree_codec(TREE, "other"),
+    "policy": policy_codec(tiny_preset(goal=(0.0, 0.0, 2.0))),
+    "flights": flight_codec(OTHER_SPECS),
+    "section": json_codec("other"),
 }
 
 
@@ -56,11 +58,11 @@ def case(request, tmp_path):
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     section = TableSection(("a", "b"), (("1", "2"),), "Title", "About.", picture)
     return {
-        "json": lambda: (JsonCodec("note"), {"s": 0.1, "names": ["a", None], "infinite": float("inf")}),
-        "tree": lambda: (TreeCodec(TREE, "tree", {"made": "of"}), TREE),
-        "policy": lambda: (PolicyCodec(preset), policy),
-        "flights": lambda: (FlightCodec(SPECS), [flight(0.1 * (1 + spec.start), spec=spec) for spec in SPECS]),
-        "section": lambda: (SectionCodec(tmp_path), (section, [{"error": 1 / 3}])),
+        "json": lambda: (json_codec("note"), {"s": 0.1, "names": ["a", None], "infinite": float("inf")}),
+        "tree": lambda: (tree_codec(TREE, "tree", {"made": "of"}), TREE),
+        "policy": lambda: (policy_codec(preset), policy),
+        "flights": lambda: (flight_codec(SPECS), [flight(0.1 * (1 + spec.start), spec=spec) for spec in SPECS]),
+        "section": lambda: (section_codec(tmp_path), (section, [{"error": 1 / 3}])),
     }[request.param]()
 
 
@@ -113,16 +115,16 @@ def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_made_again(case, t
         assert str(path) in line
         assert line.endswith("made again")
         assert "\n" not in line
-    other = OTHERS[request.node.callspec.params["case"]]
-    foreign = [flight(0.1, spec=spec) for spec in other.specs] if isinstance(other, FlightCodec) else value
-    other.write(path, {} if isinstance(other, JsonCodec) else foreign)
+    kind = request.node.callspec.params["case"]
+    foreign = {"flights": [flight(0.1, spec=spec) for spec in OTHER_SPECS], "json": {}, "section": {}}.get(kind, value)
+    OTHERS[kind].write(path, foreign)
     said.clear()
     assert store.get("key", codec) is None
     assert len(said) == 1
 
 
 def test_a_section_is_made_again_if_its_picture_is_another(tmp_path):
-    picture, codec = tmp_path / "x.png", SectionCodec(tmp_path)
+    picture, codec = tmp_path / "x.png", section_codec(tmp_path)
     picture.write_bytes(b"drawn")
     store, said = store_in(tmp_path)
     store.put("key", (TableSection((), (), picture=picture), []), codec)
@@ -137,7 +139,7 @@ def test_a_section_is_made_again_if_its_picture_is_another(tmp_path):
 def test_what_a_stop_leaves_incomplete_is_returned_but_not_stored(tmp_path):
     stop, called = threading.Event(), []
     store, _ = store_in(tmp_path, stop)
-    codec = JsonCodec("note")
+    codec = json_codec("note")
     hooks = {"on_reuse": lambda: called.append("reused"), "on_store": lambda: called.append("stored")}
 
     def half():
@@ -159,8 +161,8 @@ def test_a_folder_of_an_earlier_version_is_no_obstacle(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(json.dumps({"section": {}, "rows": []}))
     store, said = store_in(tmp_path)
-    assert store.get("sections/0123456789abcdef", SectionCodec(tmp_path)) is None
-    assert store.get("sections/flights/k", FlightCodec(SPECS)) is None
+    assert store.get("sections/0123456789abcdef", section_codec(tmp_path)) is None
+    assert store.get("sections/flights/k", flight_codec(SPECS)) is None
     assert len(said) == 2
     store.clear("sections/flights")
     assert {path.name for path in (tmp_path / "sections").iterdir()} == {"0123456789abcdef.json",
@@ -170,8 +172,8 @@ def test_a_folder_of_an_earlier_version_is_no_obstacle(tmp_path):
 def test_rows_are_lines_for_other_programs_and_a_torn_line_leaves_the_others(tmp_path):
     store, _ = store_in(tmp_path)
     rows = [{"key": "a", "error": 0.1}, {"key": "b", "error": None}]
-    store.put("flights", rows, RowsCodec())
+    store.put("flights", rows, rows_codec())
     path = Path(tmp_path / "flights.jsonl")
     assert [json.loads(line) for line in path.read_text().splitlines()] == rows
     path.write_text(path.read_text() + '{"key": "torn\n' + "[" * 100_000)
-    assert store.get("flights", RowsCodec()) == [*rows, None, None]
+    assert store.get("flights", rows_codec()) == [*rows, None, None]

@@ -5,7 +5,7 @@ from collections.abc import Hashable, Sequence
 from ..config.loading import dump
 from ..io.digests import tree_digest
 from ..runkit.file_digests import file_digests, preset_names, scenario_names
-from ..runkit.flight_codec import FlightCodec
+from ..runkit.flight_codec import flight_codec
 from ..runkit.flights import Flight, FlightSpec
 from ..runkit.provenance import section_key
 from ..runkit.reporter import Reporter
@@ -40,7 +40,7 @@ class FlightGroups:
             files = file_digests(method, *names, *preset_names(fleet.preset))
             inputs = {"scenarios": list(map(repr, scenarios)), "method": method, "flights": len(specs), "files": files}
             self._keys[group] = f"{FLIGHTS}/{section_key(**about, **inputs)}"
-            if (flights := self._store.get(self._keys[group], FlightCodec(specs))) is not None:
+            if (flights := self._store.get(self._keys[group], flight_codec(specs))) is not None:
                 self.earlier |= {flight.spec: flight for flight in flights}
                 run.reused += 1
 
@@ -51,7 +51,7 @@ class FlightGroups:
             specs = self._groups[group]
             if all(spec in self._pending for spec in specs):
                 complete = [self._pending.pop(spec) for spec in specs]
-                self._store.put(self._keys[group], complete, FlightCodec(specs))
+                self._store.put(self._keys[group], complete, flight_codec(specs))
 
 
 def clear_flights(run: Run) -> None:

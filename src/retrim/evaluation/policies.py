@@ -7,7 +7,7 @@ from ..config.loading import dump
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..control.policy import AbstractPolicy
-from ..runkit.codecs import PolicyCodec
+from ..runkit.codecs import policy_codec
 from ..runkit.file_digests import file_digests, preset_names
 from ..runkit.provenance import section_key
 from ..runkit.reporter import Reporter
@@ -38,7 +38,7 @@ def train_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Rep
     """
     inputs = section_key(preset=dump(preset), files=file_digests(*preset_names(preset)))
     stem = f"{POLICIES}/{UNSAFE.sub('-', preset.name)}-{inputs[:8]}"
-    store, codec = Store(run.trained, reporter=reporter, stop=run.stop), PolicyCodec(preset)
+    store, codec = Store(run.trained, reporter=reporter, stop=run.stop), policy_codec(preset)
     result = dict[int, AbstractPolicy]()
     for seed in seeds:
         if (policy := store.get(f"{stem}-seed{seed}", codec)) is not None:

@@ -17,7 +17,7 @@ from ..config.trust import check_trust
 from ..config.validation import read_toml, validated
 from ..config.vehicle_file import VehicleSpec
 from ..control.policy import AbstractPolicy
-from ..runkit.codecs import RowsCodec
+from ..runkit.codecs import rows_codec
 from ..runkit.document import Document, TableSection
 from ..runkit.file_digests import file_digests, preset_names, scenario_names
 from ..runkit.flights import Flight, FlightSpec
@@ -172,9 +172,9 @@ class _FlightRows:
     def __init__(self, run: Run, reporter: Reporter) -> None:
         """Read the rows of an earlier run."""
         self._store = run.store(reporter)
-        lines = self._store.get(FLIGHTS, RowsCodec()) or ()
+        lines = self._store.get(FLIGHTS, rows_codec()) or ()
         if unusable := sum(not _is_record(row) for row in lines):
-            path = self._store.path(FLIGHTS, RowsCodec())
+            path = self._store.path(FLIGHTS, rows_codec())
             reporter.say(f"{path}: unusable lines, {unusable}; their flights are flown again")
         self.by_key = {row["key"]: row for row in lines if _is_record(row) and row.get("failed") is None}
         self.earlier = frozenset(self.by_key)
@@ -182,7 +182,7 @@ class _FlightRows:
     def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
         """Add rows by their keys, and store all rows."""
         self.by_key |= {key: {"key": key, **row} for key, row in rows.items()}
-        self._store.put(FLIGHTS, list(self.by_key.values()), RowsCodec())
+        self._store.put(FLIGHTS, list(self.by_key.values()), rows_codec())
 
 
 def _is_record(row: Any) -> bool:

@@ -3,9 +3,8 @@
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -22,77 +21,109 @@ from ..io.files import write_whole
 from ..io.trained import load_policy, save_policy
 from ..transport import wire
 from .document import TableSection
+from .store import Codec
 
 T = TypeVar("T")
 Rows = Sequence[dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class JsonCodec:
-    """One JSON value with its kind and digest."""
+def json_codec(kind: str, suffix: str = ".json") -> Codec[Any]:
+    """Return the codec of a JSON value; the file contains its kind and its digest."""
 
-    kind: str
-    suffix: str = ".json"
-
-    def write(self, path: Path, value: Any) -> None:
-        """Write a value of numbers, strings, lists and dictionaries."""
-        content = {"kind": self.kind, "digest": text_digest(json.dumps(value)), "value": value}
+    def write(path: Path, value: Any) -> None:
+        content = {"kind": kind, "digest": text_digest(json.dumps(value)), "value": value}
         write_whole(path, json.dumps(content) + "\n")
 
-    def read(self, path: Path) -> Any:
-        """Return the value."""
+    def read(path: Path) -> Any:
         content = json.loads(path.read_text())
-        if content["kind"] != self.kind:
-            raise CheckpointError(f"{path}: holds a {content['kind']!r}, expected a {self.kind!r}")
+        if content["kind"] != kind:
+            raise CheckpointError(f"{path}: holds a {content['kind']!r}, expected a {kind!r}")
         if content["digest"] != text_digest(json.dumps(content["value"])):
             raise CheckpointError(f"{path}: the digest does not match; the file was damaged or edited")
         return content["value"]
 
-
-@dataclass(frozen=True)
-class RowsCodec:
-    """Rows of results, one line of JSON each, for other programs, too; lines that are not JSON are read as None."""
-
-    suffix: str = ".jsonl"
-
-    def write(self, path: Path, rows: Sequence[Any]) -> None:
-        """Write the rows."""
-        write_whole(path, "".join(json.dumps(row) + "\n" for row in rows))
-
-    def read(self, path: Path) -> Sequence[Any]:
-        """Return the rows."""
-        return [_json_or_none(line) for line in path.read_text(errors="replace").splitlines()]
+    return Codec(suffix, write, read)
 
 
-def _json_or_none(line: str) -> Any:
-    try:
-        return json.loads(line)
-    except (ValueError, RecursionError):
-        return None
+def rows_codec() -> Codec[Sequence[Any]]:
+    """Return the codec of rows, one line of JSON each, for other programs, too; other lines are read as None."""
+
+    def row(line: str) -> Any:
+        try:
+            return json.loads(line)
+        except (ValueError, RecursionError):
+            return None
+
+    return Codec(
+        ".jsonl",
+        lambda path, rows: write_whole(path, "".join(json.dumps(each) + "\n" for each in rows)),
+        lambda path: [row(line) for line in path.read_text(errors="replace").splitlines()],
+    )
 
 
-@dataclass(frozen=True)
-class TreeCodec(Generic[T]):
-    """The arrays of a pytree as safetensors; random keys are written as their key data."""
+def tree_codec(like: T, kind: str, about: Mapping[str, str] | None = None) -> Codec[T]:
+    """Return the codec of a pytree's arrays as safetensors; random keys are written as their key data.
 
-    like: T
-    """Tree with the same structure; it supplies the leaves that are not arrays."""
-    kind: str
-    about: Mapping[str, str] = field(default_factory=dict)
-    """Further metadata for readers of the file."""
-    suffix: str = ".safetensors"
+    Args:
+        like: Tree with the same structure; it supplies the leaves that are not arrays.
+        kind: Kind of content.
+        about: Further metadata for readers of the file.
+    """
+    arrays, rest = eqx.partition(like, eqx.is_array)
 
-    def write(self, path: Path, tree: T) -> None:
-        """Write the arrays."""
-        write_whole(path, wire.pack(_numbers(tree), kind=self.kind, about=self.about))
-
-    def read(self, path: Path) -> T:
-        """Return the tree."""
-        numbers = wire.unpack(path.read_bytes(), _numbers(self.like), kind=self.kind, source=str(path))
-        arrays, rest = eqx.partition(self.like, eqx.is_array)
+    def read(path: Path) -> T:
+        numbers = wire.unpack(path.read_bytes(), _numbers(like), kind=kind, source=str(path))
         leaves = jax.tree.map(lambda old, new: random.wrap_key_data(new) if _is_key(old) else new, arrays, numbers)
         tree: T = eqx.combine(leaves, rest)
         return tree
+
+    return Codec(
+        ".safetensors",
+        lambda path, tree: write_whole(path, wire.pack(_numbers(tree), kind=kind, about=about or {})),
+        read,
+    )
+
+
+def policy_codec(preset: Preset) -> Codec[AbstractPolicy]:
+    """Return the codec of policies of a preset, in the format that `retrim fly` reads."""
+
+    def read(path: Path) -> AbstractPolicy:
+        policy, other = load_policy(path, trust=python_names(preset))
+        if dump(other) != dump(preset):
+            raise CheckpointError(f"{path}: its preset {other.name!r} is not that of the run, {preset.name!r}")
+        return policy
+
+    return Codec(".safetensors", lambda path, policy: save_policy(path, policy, preset), read)
+
+
+def section_codec(folder: Path) -> Codec[tuple[TableSection, Rows]]:
+    """Return the codec of document sections with their rows of results.
+
+    A digest in the file detects that another run has overwritten the picture of a section.
+
+    Args:
+        folder: Folder of the pictures.
+    """
+    plain = json_codec("section")
+
+    def write(path: Path, value: tuple[TableSection, Rows]) -> None:
+        section, rows = value
+        picture = None if section.picture is None else [section.picture.name, file_digest(section.picture)]
+        plain.write(path, {"section": dataclasses.asdict(section) | {"picture": picture}, "rows": rows})
+
+    def read(path: Path) -> tuple[TableSection, Rows]:
+        content = plain.read(path)
+        section, picture = content["section"], None
+        if section["picture"] is not None:
+            name, digest = section["picture"]
+            picture = folder / name
+            if not picture.is_file() or file_digest(picture) != digest:
+                raise CheckpointError(f"{path}: its picture {name} was overwritten or removed")
+        lines = tuple(tuple(row) for row in section["rows"])
+        columns, title, about = tuple(section["columns"]), section["title"], section["about"]
+        return TableSection(columns, lines, title, about, picture), content["rows"]
+
+    return Codec(plain.suffix, write, read)
 
 
 def _numbers(tree: Any) -> Any:
@@ -103,51 +134,3 @@ def _numbers(tree: Any) -> Any:
 
 def _is_key(leaf: Any) -> bool:
     return bool(jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))
-
-
-@dataclass(frozen=True)
-class PolicyCodec:
-    """A policy with its preset, as `retrim fly` reads it."""
-
-    preset: Preset
-    suffix: str = ".safetensors"
-
-    def write(self, path: Path, policy: AbstractPolicy) -> None:
-        """Write the policy."""
-        save_policy(path, policy, self.preset)
-
-    def read(self, path: Path) -> AbstractPolicy:
-        """Return the policy."""
-        policy, preset = load_policy(path, trust=python_names(self.preset))
-        if dump(preset) != dump(self.preset):
-            raise CheckpointError(f"{path}: its preset {preset.name!r} is not that of the run, {self.preset.name!r}")
-        return policy
-
-
-@dataclass(frozen=True)
-class SectionCodec:
-    """A section of a document with its rows of results; the digest of its picture detects another run's picture."""
-
-    folder: Path
-    """Folder of the pictures."""
-    suffix: str = ".json"
-
-    def write(self, path: Path, value: tuple[TableSection, Rows]) -> None:
-        """Write the section and its rows; the picture is already in the folder."""
-        section, rows = value
-        picture = None if section.picture is None else [section.picture.name, file_digest(section.picture)]
-        content = {"section": dataclasses.asdict(section) | {"picture": picture}, "rows": rows}
-        JsonCodec("section").write(path, content)
-
-    def read(self, path: Path) -> tuple[TableSection, Rows]:
-        """Return the section and its rows."""
-        content = JsonCodec("section").read(path)
-        section, picture = content["section"], None
-        if section["picture"] is not None:
-            name, digest = section["picture"]
-            picture = self.folder / name
-            if not picture.is_file() or file_digest(picture) != digest:
-                raise CheckpointError(f"{path}: its picture {name} was overwritten or removed")
-        lines = tuple(tuple(row) for row in section["rows"])
-        columns, title, about = tuple(section["columns"]), section["title"], section["about"]
-        return TableSection(columns, lines, title, about, picture), content["rows"]

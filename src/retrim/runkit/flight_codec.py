@@ -3,7 +3,6 @@
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +14,15 @@ from ..io.files import npz_bytes, write_whole
 from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from .flights import Flight, FlightSpec
+from .store import Codec
 
 SCALARS = ("vehicle", "metric", "steady_seconds")
 
 
-@dataclass(frozen=True)
-class FlightCodec:
-    """The flights of given specifications, in their order."""
+def flight_codec(specs: Sequence[FlightSpec]) -> Codec[Sequence[Flight]]:
+    """Return the codec of the flights of given specifications, in their order."""
 
-    specs: Sequence[FlightSpec]
-    suffix: str = ".npz"
-
-    def write(self, path: Path, flights: Sequence[Flight]) -> None:
-        """Write the flights; the file contains a digest of their specifications."""
+    def write(path: Path, flights: Sequence[Flight]) -> None:
         arrays, rows = dict[str, Any](), list[dict[str, Any]]()
         for i, flight in enumerate(flights):
             log = flight.log
@@ -38,25 +33,26 @@ class FlightCodec:
             arrays |= {f"{i}.{name}": value for name, value in parts.items() if value is not None}
             scalars = {name: getattr(flight, name) for name in SCALARS}
             rows.append({"flight": scalars, "dt": log.dt, "terminated": log.terminated, "events": log.events})
-        about = {"specs": self._digest([flight.spec for flight in flights]), "flights": rows}
+        about = {"specs": _digest([flight.spec for flight in flights]), "flights": rows}
         write_whole(path, npz_bytes({"about": np.array(json.dumps(about)), **arrays}))
 
-    def read(self, path: Path) -> list[Flight]:
-        """Return the flights."""
+    def read(path: Path) -> Sequence[Flight]:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays: dict[str, np.ndarray] = dict(file)
         about = json.loads(str(arrays.pop("about")))
-        if about["specs"] != self._digest(self.specs):
+        if about["specs"] != _digest(specs):
             raise CheckpointError(f"{path}: holds flights of other specifications")
-        parts = [dict[str, np.ndarray]() for _ in self.specs]
+        parts = [dict[str, np.ndarray]() for _ in specs]
         for name, array in arrays.items():
             number, _, part = name.partition(".")
             parts[int(number)][part] = array
-        return [_flight(*each) for each in zip(parts, self.specs, about["flights"], strict=True)]
+        return [_flight(*each) for each in zip(parts, specs, about["flights"], strict=True)]
 
-    @staticmethod
-    def _digest(specs: Sequence[FlightSpec]) -> str:
-        return text_digest("\n".join(map(repr, specs)))
+    return Codec(".npz", write, read)
+
+
+def _digest(specs: Sequence[FlightSpec]) -> str:
+    return text_digest("\n".join(map(repr, specs)))
 
 
 def _flight(parts: dict[str, np.ndarray], spec: FlightSpec, about: dict[str, Any]) -> Flight:

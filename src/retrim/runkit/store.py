@@ -7,8 +7,9 @@ again if its file is damaged or has other content than its key promises. Reading
 import shutil
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Generic, TypeVar
 
 from ..errors import RetrimError, one_line
 from .reporter import Reporter, Silent
@@ -16,22 +17,16 @@ from .reporter import Reporter, Silent
 T = TypeVar("T")
 
 
-@runtime_checkable
-class Codec(Protocol[T]):
-    """Converts the values of one kind to files and back, bit for bit."""
+@dataclass(frozen=True)
+class Codec(Generic[T]):
+    """Conversion of values of one kind to files and back, bit for bit."""
 
-    @property
-    def suffix(self) -> str:
-        """Suffix of the file names."""
-        ...
-
-    def write(self, path: Path, value: T) -> None:
-        """Write a value completely or not at all; create the folder if necessary."""
-        ...
-
-    def read(self, path: Path) -> T:
-        """Return the value in a file; raise any exception if the file is damaged, or of another kind or content."""
-        ...
+    suffix: str
+    """Suffix of the file names."""
+    write: Callable[[Path, T], None]
+    """Writes a value completely or not at all, and creates the folder if necessary."""
+    read: Callable[[Path], T]
+    """Returns the value in a file; raises any exception if the file is damaged, or of another kind or content."""
 
 
 class Store:

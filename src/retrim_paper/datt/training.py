@@ -14,7 +14,7 @@ from retrim.config.baselines import prediction_of
 from retrim.config.presets import Preset
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError
-from retrim.runkit.codecs import TreeCodec
+from retrim.runkit.codecs import tree_codec
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
@@ -86,10 +86,10 @@ def train_datt(
         k_net, k_learn = random.split(random.fold_in(random.key(seed), DATT_TAG))
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
         make = partial(_train, setup, net, k_learn, seed, steps, store, f"{key}_state", run, reporter)
-        trained = store.get_or_make(key, make, TreeCodec(net, "datt", about))
+        trained = store.get_or_make(key, make, tree_codec(net, "datt", about))
         if trained is None:
             break
-        store.remove(f"{key}_state", TreeCodec(net, "ppo"))
+        store.remove(f"{key}_state", tree_codec(net, "ppo"))
         nets[seed] = trained
     return nets
 
@@ -115,7 +115,7 @@ def _train(
     settings = PpoSettings(discount=discount(dt), **DATT_PPO)
     updates, title = settings.updates(steps), f"DATT, seed {seed}"
     state = PpoState.of(problem, net, k_learn, settings)
-    codec = TreeCodec(state, "ppo")
+    codec = tree_codec(state, "ppo")
     if (stored := store.get(key, codec)) is not None:
         state = stored
         reporter.say(f"{title}: goes on after {int(state.made)} of {updates} updates")

@@ -14,7 +14,7 @@ from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import cell
 from retrim.evaluation.study import Study, fly_all, train_all
-from retrim.runkit.codecs import Rows, SectionCodec
+from retrim.runkit.codecs import Rows, section_codec
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import Flight
 from retrim.runkit.provenance import section_key
@@ -70,7 +70,7 @@ def ablation(
             made = run.store(reporter).get_or_make(
                 f"{PARTS}/{key}",
                 partial(_fly, name, preset, lever, task, studies, document, starts=starts, seconds=seconds),
-                SectionCodec(run.folder),
+                section_codec(run.folder),
                 on_reuse=partial(run.reuse, f"{name}: {lever.label.strip('*')}", reporter),
                 on_store=partial(clear_flights, run),
             )

@@ -5,7 +5,7 @@ from typing import Any
 
 from retrim.errors import PlantError
 from retrim.io.digests import file_digest
-from retrim.runkit.codecs import JsonCodec
+from retrim.runkit.codecs import json_codec
 from retrim.runkit.document import Document, Link, TableSection
 from retrim.runkit.provenance import section_key
 from retrim.runkit.reporter import Reporter
@@ -43,7 +43,7 @@ PLAN: tuple[tuple[Callable[..., None], str, Options], ...] = (
 )
 """Each table, its place in the paper, and its options. Timed tables come first, when the machine is least busy."""
 QUICK_LEAVES_OUT = (phase, plants)
-TABLE, TIME = JsonCodec("table"), JsonCodec("time", ".time.json")
+TABLE, TIME = json_codec("table"), json_codec("time", ".time.json")
 """Codecs for the time and page digest of a finished table, and for the time of an unfinished one."""
 AT_LEAST = "at least "
 """Prefix for a time that excludes a killed run; the time of an interrupted run is recorded and counted."""

@@ -17,7 +17,7 @@ from retrim.evaluation.figures import picture
 from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.metrics import cell, metres, rows
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
-from retrim.runkit.codecs import Rows, SectionCodec
+from retrim.runkit.codecs import Rows, section_codec
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.file_digests import file_digests, preset_names, scenario_names
 from retrim.runkit.provenance import section_key
@@ -100,7 +100,7 @@ def fly_levels(
         made = run.store(reporter).get_or_make(
             f"{PARTS}/{key}",
             partial(_fly_section, section, studies, document, starts=starts, seconds=seconds, datt_steps=datt_steps),
-            SectionCodec(run.folder),
+            section_codec(run.folder),
             on_reuse=partial(run.reuse, section.title, reporter),
             on_store=partial(clear_flights, run),
         )
