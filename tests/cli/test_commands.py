@@ -30,7 +30,7 @@ def folder(tmp_path_factory, as_a_user):
     out = retrim("pretrain", "hover", "--config", "small.toml", "--out", "p", cwd=here)
     assert "hover error in its own model" in out
     out = retrim("fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--out", "f", cwd=here)
-    assert "hover error [m], last 2 s of 2 s, 2 starts" in out
+    assert "hover error, last 2 s of 2 s, 2 starts" in out
     return here
 
 
@@ -90,7 +90,7 @@ def test_a_full_disk_loses_no_flight(folder, monkeypatch):
     monkeypatch.setattr(os, "fsync", full)
     words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--out", "full"
     out = retrim(*words, cwd=folder, code=1)
-    assert "hover error [m], last 2 s of 2 s, 2 starts" in out
+    assert "hover error, last 2 s of 2 s, 2 starts" in out
     (place,) = {Path(found) for found in re.findall(r"\(No space left on device\); it is in (\S+)", out)}
     for name in ("what was learnt", "events.jsonl", "the logs", "results.json"):
         assert f"retrim: {name} cannot be written to full (No space left on device); it is in {place}" in out

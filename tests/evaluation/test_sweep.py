@@ -14,6 +14,7 @@ from made_up import flight
 from retrim import ConfigError, Fleet, Scenario, Setup
 from retrim.evaluation import policies, sweep
 from retrim.evaluation.executor import Flights
+from retrim.evaluation.flight_table import millimetres
 from retrim.evaluation.metrics import record
 from retrim.evaluation.sweep import Sweep, read_sweep, run_sweep
 from retrim.runkit import FlightSpec, Run, provenance
@@ -63,8 +64,8 @@ def test_a_sweep_leaves_a_table_json_a_picture_policies_and_rows(folder):
     assert found["seeds"] == [0, 1]
     assert found["sweep"]["seconds"] == 1.2
     text = (folder / "whole" / "sweep.md").read_text()
-    assert "| disturbance | method | mean ± std [m] | median [m] | maximum [m] |" in text
-    assert all(f"| {name} | {method} | {row['mean']:.3f} ±" in text
+    assert "| disturbance | method | error at the end [mm] | median [mm] | maximum [mm] | worst after 0.6" in text
+    assert all(f"| {name} | {method} | {millimetres(row['mean'])} ±" in text
                for (name, method), row in zip(COMBINATIONS, found["rows"], strict=True))  # fmt: skip
     assert "![sweep](sweep.png)" in text
     assert (folder / "whole" / "sweep.png").stat().st_size > 10_000
@@ -183,10 +184,10 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
         ("none", "base", 4, 0), ("none", "indi", 4, 0), ("large", "base", 4, 1), ("large", "indi", 4, 0)
     ]  # fmt: skip
     text = (tmp_path / "sweep.md").read_text()
-    assert "| disturbance | method | mean ± std [m] | median [m] | maximum [m] |" in text
-    assert "| none | base | 0.200 ± 0.141 | 0.150 | 0.400 |" in text
-    assert "| large | base | 0.233 ± 0.153, 1 of 4 crashed | 0.300 | crashed |" in text
-    assert "| large | indi | 0.233 ± 0.153, 1 of 4 failed | 0.200 | 0.400 |" in text
+    assert "| disturbance | method | error at the end [mm] | median [mm] | maximum [mm] | worst after" in text
+    assert "| none | base | 200 ± 141 | 150 | 400 |" in text
+    assert "| large | base | 233 ± 153, 1 of 4 crashed | 300 | crashed |" in text
+    assert "| large | indi | 233 ± 153, 1 of 4 failed | 200 | 400 |" in text
     assert results(tmp_path, "sweep.json")["rows"] == found
     (bars,) = shown
     assert bars == {

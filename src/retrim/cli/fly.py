@@ -14,7 +14,8 @@ from ..errors import ConfigError
 from ..evaluation.executor import report_progress
 from ..evaluation.figures import picture
 from ..evaluation.fleet import Fleet
-from ..evaluation.metrics import cell, notes, rows
+from ..evaluation.flight_table import figure_cells, figure_columns
+from ..evaluation.metrics import notes, rows
 from ..runkit.document import TableSection
 from ..runkit.flights import Flight
 from ..runkit.interrupts import interrupts_only_set
@@ -105,9 +106,10 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file:
         drawn = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []
         results = outlet.write_results(run, result, seeds=list(fleet.policies), preset=preset.name)
     n, steady = result[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
-    title = f"{preset.task} error [m], last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
-    lines = tuple((row["disturbance"], row["method"], cell(row)) for row in result)
-    show_table(TableSection(("disturbance", "method", "error"), lines, title))
+    title = f"{preset.task} error, last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
+    title += f", plant {scenario.plant}, sensors {scenario.sensors}"
+    lines = tuple((row["disturbance"], row["method"], *figure_cells(row)) for row in result)
+    show_table(TableSection(("disturbance", "method", *figure_columns(fleet.seconds)), lines, title))
     for note in notes(flights, preset):
         console.print(note, markup=False, soft_wrap=True)
     saved, code = save_flight_vehicle(flights[-1], setup, vehicle_file)

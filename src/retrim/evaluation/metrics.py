@@ -210,10 +210,22 @@ def cell(row: dict[str, Any], digits: int | None = None) -> str:
         row: Result from :func:`summary`.
         digits: Decimal places; by default those of :func:`metres`.
     """
+    text = ""
+    if row["mean"] is not None:
+        text = _with_deviation(row["mean"], row["std"], digits or _digits(row["mean"]))
+    return with_counts(row, text)
+
+
+def with_counts(row: Mapping[str, Any], text: str) -> str:
+    """Return the text of a mean error with the numbers of terminated flights and of failed jobs.
+
+    Args:
+        row: Result from :func:`summary`.
+        text: The mean error; not used if no flight has one.
+    """
     failed = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
     if row["mean"] is None:
         return f"crashed, {row['crashes']} of {row['n']}" + failed if row["crashes"] else failed.removeprefix(", ")
-    text = _with_deviation(row["mean"], row["std"], digits or _digits(row["mean"]))
     return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "") + failed
 
 

@@ -28,8 +28,9 @@ from ..viz.panels import bars
 from ..viz.plots import save
 from .executor import report_progress
 from .fleet import Fleet
+from .flight_table import figure_cells, figure_columns, millimetres
 from .limits import check_seeds
-from .metrics import EFFORT, Rows, cell, failed_record, metres, record, summary
+from .metrics import EFFORT, Rows, failed_record, record, summary
 from .policies import train_policies
 
 FLIGHTS = "flights"
@@ -209,14 +210,20 @@ def _report(sweep: Sweep, rows: Sequence[dict[str, Any]], run: Run, reporter: Re
         row = summary(flights, GROUP)
         result.append(row)
         none = "crashed" if row["crashes"] else "-"
-        figures = (none if row[name] is None else metres(row[name]) for name in ("median", "max"))
-        cells.append((*(str(flights[0][name]) for name in varied), cell(row), *figures))
-    intro = "Made by `retrim sweep`. Error [m] over the last seconds of each flight, over seeds and starts."
+        spread = (none if row[name] is None else millimetres(row[name]) for name in ("median", "max"))
+        error, *others = figure_cells(row)
+        cells.append((*(str(flights[0][name]) for name in varied), error, *spread, *others))
+    intro = (
+        "Made by `retrim sweep`. Error over the last seconds of each flight: mean ± standard deviation, median and "
+        "maximum over seeds and starts. Median of the largest error after the flight to the goal, and of the time from "
+        "which the error stays below the bound."
+    )
     more = {"sweep": dataclasses.asdict(sweep)}
     document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, more)
     if cells:
         drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
-        columns = (*varied, "mean ± std [m]", "median [m]", "maximum [m]")
+        error, *others = figure_columns(sweep.seconds)
+        columns = (*varied, error, "median [mm]", "maximum [mm]", *others)
         document.add(TableSection(columns, tuple(cells), picture=drawn[0]), result)
     document.write()
     return result
