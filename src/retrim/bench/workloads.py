@@ -18,6 +18,7 @@ from ..config.setup import Setup
 from ..evaluation.fleet import Fleet
 from ..onboard.launch import PYTHON
 from ..physics.state import Command
+from ..progress import no_progress
 from ..runkit.stopwatch import Stopwatch
 from ..runtime.flight import fly
 from .background_load import policies
@@ -62,9 +63,9 @@ def _tick() -> dict[str, Any]:
     setup = Setup.from_preset("hover/fast")
     policy, plant, x0 = setup.new_policy(random.key(0)), Scenario().make(), setup.flight_starts(1)[0]
     began = time.perf_counter()
-    fly(plant, setup.pilot(policy), x0, ticks=2)
+    fly(plant, setup.pilot(policy), x0, ticks=2, progress=no_progress)
     compile_s = time.perf_counter() - began
-    row = timed(compile_s, lambda: fly(plant, setup.pilot(policy), x0, ticks=1500).p, 5)
+    row = timed(compile_s, lambda: fly(plant, setup.pilot(policy), x0, ticks=1500, progress=no_progress).p, 5)
     row["remarks"] = f"{1000 * row['run_s'] / 1500:.2f} ms a tick; " + row["remarks"]
     return row
 

@@ -238,3 +238,18 @@ class Preset:
         if self.adapt.window < self.plant_delay_ticks + 12:
             raise ValueError(f"adapt.window = {self.adapt.window} is too short for plant_delay_ticks")
         return self
+
+    def __repr__(self) -> str:
+        """Return the main numbers, in a few lines; ``dataclasses.asdict`` returns all of them."""
+        train, adapt = self.pretrain, self.adapt
+        vehicle = self.vehicle if isinstance(self.vehicle, str) else self.vehicle.name
+        return "\n".join(
+            [
+                f"Preset {self.name}: task {self.task}, vehicle {vehicle}, control period {1000 * self.dt:g} ms",
+                f"  pretraining: {train.num_updates} steps x {train.num_envs} starts x {train.horizon} ticks, "
+                f"network {train.network} {' x '.join(map(str, train.hidden_sizes))}, reward {self.reward}",
+                f"  adaptation: residual {adapt.residual} every {adapt.fit_every:g} s, "
+                f"{adapt.num_updates} steps x {adapt.num_envs} starts every {adapt.update_every:g} s, "
+                f"learner {adapt.learner}, frame {adapt.frame}",
+            ]
+        )

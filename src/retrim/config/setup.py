@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -29,6 +28,7 @@ from ..learn.pretrain import pretrain
 from ..learn.residuals.model import FittedResidual, ResidualModel
 from ..physics.state import State
 from ..physics.vehicle import Vehicle
+from ..progress import Progress, show_progress
 from ..runtime.adaptive import AdaptivePilot, Scheduled
 from ..runtime.lockstep import LockstepLearner
 from ..runtime.pilot import Pilot
@@ -184,10 +184,20 @@ class Setup:
         )
         return ((state.policy.merged(), losses) for state, losses in chunks)
 
-    def pretrained(self, seed: int = 0) -> AbstractPolicy:
-        """Return a policy trained from scratch, without progress reports; :meth:`pretraining` reports progress."""
-        ((last, _),) = deque(self.pretraining(seed), maxlen=1)
-        return last
+    def pretrained(self, seed: int = 0, *, progress: Progress = show_progress) -> AbstractPolicy:
+        """Return a policy trained from scratch.
+
+        Args:
+            seed: Seed of the weights and the starts.
+            progress: Display of the progress; by default a bar in a notebook or a terminal, and nothing elsewhere.
+        """
+        steps, last = 0, self.preset.pretrain.num_updates
+        with progress(f"pretraining {self.preset.name}") as advance:
+            advance(0.0, "compiling")
+            for each, losses in self.pretraining(seed):
+                policy, steps = each, steps + len(losses)
+                advance(steps / last, f"{steps} of {last} steps, loss {float(losses[-1]):.3f}")
+        return policy
 
     def pilot(
         self,
@@ -268,6 +278,13 @@ class Setup:
         The starts depend only on the seed and the home, so all presets of a task use the same starts.
         """
         return flight_starts(self.flight_task.home(), n, seed)
+
+    def __repr__(self) -> str:
+        """Return the preset, the vehicle, and the task of the flight, in a few lines."""
+        v, task = self.vehicle, self.flight_task
+        vehicle = f"vehicle: mass {float(v.mass):.3g} kg, largest thrust {float(v.thrust_max):.3g} N"
+        flight = f"flight: {task.flight_seconds:g} s, {task.metric} over the last {task.steady_seconds:g} s"
+        return "\n  ".join(["Setup", *repr(self.preset).splitlines(), vehicle, flight])
 
     def limits_exceeded(self, vehicle: Vehicle | None = None) -> str | None:
         """Describe the limits of a vehicle that the flight's reference exceeds; return None if there are none.

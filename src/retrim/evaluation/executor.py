@@ -5,14 +5,23 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TYPE_CHECKING
 
 from ..errors import ConfigError, JobError
 from ..runkit.flights import Flight, FlightSpec
 from ..runkit.interrupts import interrupts_only_set
 from ..runtime.flight import FlightStopped
+from ..viz.flight_curves import FlightCurves, curves_figure
 from .batches import FlightBatch
+from .flight_table import figure_cells, figure_columns
 from .metrics import Rows, rows
 
+if TYPE_CHECKING:
+    from ..viz.flight_curves import Figure
+
+MOST_ROWS = 6  # rows of results in the text of flights
+SCENARIO = ("plant", "vehicle", "sensors", "thrust_error", "delay", "fault", "reference")
+"""Conditions of a scenario that the text of flights states if they differ; the disturbance is always stated."""
 GONE: "Future[list[Flight]]" = Future()
 """Placeholder for a future whose flights were discarded; it is cancelled, and never waited for."""
 GONE.cancel()
@@ -25,7 +34,7 @@ Submit = Callable[[FlightBatch, Callable[[float], None]], "Future[list[Flight]]"
 
 def report_progress(advance: Callable[[float, str], None]) -> Progress:
     """Return a progress callback for a progress bar; ``advance`` receives a share and a text."""
-    return lambda done, n: advance(done / n, f"{done:.0f} of {n} flights")
+    return lambda done, n: advance(done / n, f"{int(done)} of {n} flights")
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,44 @@ class Flights:
     def rows(self) -> Rows:
         """Return one row of results per scenario and method."""
         return rows(self.flown)
+
+    def __repr__(self) -> str:
+        """Return the number of flights, and the errors of the first few scenarios and methods."""
+        crashes = sum(flight.log.terminated for flight in self.flown)
+        lines = [f"Flights: {len(self.flown)} flown, {crashes} crashed, {len(self.failed)} failed"]
+        lines[0] += ", interrupted" if self.interrupted else ""
+        groups = self._groups()
+        for label, flights in list(groups.items())[:MOST_ROWS]:
+            figures = zip(figure_columns(), figure_cells(rows(flights)[0]), strict=True)
+            lines.append(f"  {label}: {', '.join(f'{name} {text}' for name, text in figures)}")
+        return "\n".join(lines + [f"  and {len(groups) - MOST_ROWS} more rows"] * (len(groups) > MOST_ROWS))
+
+    def plot(self) -> "Figure":
+        """Draw the errors with the policy updates, the paths from above, and the commands.
+
+        Returns:
+            A matplotlib figure, which a notebook shows.
+        """
+        curves = [
+            FlightCurves(
+                label, flight.log.t, flight.log.p, flight.log.u, flight.error, flight.target, flight.swaps,
+                flight.log.terminated,
+            )
+            for label, flights in self._groups().items()
+            for flight in flights
+        ]  # fmt: skip
+        return curves_figure(f"{len(curves)} flight{'s' * (len(curves) != 1)}", curves)
+
+    def _groups(self) -> dict[str, list[Flight]]:
+        """Return the flights by scenario and method; the labels state the conditions in which the flights differ."""
+        scenarios = {flight.spec.scenario for flight in self.flown}
+        varied = [name for name in SCENARIO if len({getattr(scenario, name) for scenario in scenarios}) > 1]
+        groups: dict[str, list[Flight]] = {}
+        for flight in self.flown:
+            spec = flight.spec
+            conditions = [str(getattr(spec.scenario, name)) for name in ("disturbance", *varied)]
+            groups.setdefault(", ".join([*conditions, spec.method]), []).append(flight)
+        return groups
 
 
 def gathered(

@@ -16,11 +16,12 @@ from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
 from ..errors import ConfigError
 from ..plants.plant import Measurement
+from ..progress import show_progress
 from ..runkit.compile_cache import release_programs
 from ..runkit.flights import Flight, FlightSpec
 from ..runkit.flying import fly_batch, fly_one, plant_of, program_of
 from .batches import FlightBatch, in_batches, lanes
-from .executor import Flights, Progress, Submit, gathered
+from .executor import Flights, Progress, Submit, gathered, report_progress
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 
@@ -136,7 +137,8 @@ class Fleet:
             executor: Any executor; each of its jobs is a single flight. An executor with other processes builds its own
                 programs. Without an executor, flights of a simulated plant run in batches, each as one program, and
                 other flights run one by one, on one thread per core.
-            progress: Called in this thread when flights are completed, and periodically while they run.
+            progress: Called in this thread when flights are completed, and periodically while they run. By default, a
+                notebook or a terminal shows a bar.
             on_result: Receives completed flights, in this thread.
             stop: Aborts the running flights when it is set. Ctrl-C sets it, too.
             only: Fly only these specifications, a part of ``specs``.
@@ -152,6 +154,13 @@ class Fleet:
         Raises:
             PlantError: A plant refused to fly, or its package is not installed.
         """
+        if progress is None:
+            with show_progress("flying") as advance:
+                advance(0.0, "compiling")
+                return self.run(
+                    executor, progress=report_progress(advance), on_result=on_result, stop=stop, only=only,
+                    by_lot=by_lot, forget=forget,
+                )  # fmt: skip
         stop = stop or threading.Event()
         specs = self.specs if only is None else list(only)
         if isinstance(executor, ThreadPoolExecutor):

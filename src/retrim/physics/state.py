@@ -3,6 +3,8 @@
 Throughout the library, the world frame has z up, the body frame is forward-left-up, and ``R`` maps body to world.
 """
 
+import math
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -45,6 +47,16 @@ class State(eqx.Module):
         """Return [p, vec R (row by row), v]."""
         return jnp.concatenate([self.p, self.R.reshape(9), self.v])
 
+    def __repr__(self) -> str:
+        """Return the rounded numbers of one drone's state; the shapes of a batch and of traced arrays."""
+        if not _has_numbers(self.p, (3,)) or not _has_numbers(self.R, (3, 3)) or not _has_numbers(self.v, (3,)):
+            return super().__repr__()
+        R = self.R.tolist()
+        angles = math.atan2(R[2][1], R[2][2]), math.asin(min(1.0, max(-1.0, -R[2][0]))), math.atan2(R[1][0], R[0][0])
+        roll_pitch_yaw = _rounded(map(math.degrees, angles), 1)
+        p, v = (_rounded(vector.tolist(), 3) for vector in (self.p, self.v))
+        return f"State(p={p} m, v={v} m/s, roll_pitch_yaw={roll_pitch_yaw} deg)"
+
 
 class Command(eqx.Module):
     """Command u = (c, omega): collective thrust and body rates (CTBR), 4 numbers."""
@@ -74,6 +86,12 @@ class Command(eqx.Module):
         """Return the command from a vector, the inverse of :meth:`vector`."""
         return cls(vector[0], vector[1:])
 
+    def __repr__(self) -> str:
+        """Return the rounded numbers of one command; the shapes of a batch and of traced arrays."""
+        if not _has_numbers(self.c, ()) or not _has_numbers(self.omega, (3,)):
+            return super().__repr__()
+        return f"Command(c={self.c.tolist():z.3f} m/s^2, omega={_rounded(self.omega.tolist(), 3)} rad/s)"
+
     def within(self, low: "Command", high: "Command") -> "Command":
         """Return the command clipped to limits, entry by entry, in the command's own precision."""
         return Command(
@@ -86,3 +104,12 @@ def where(condition: Array, yes: T, no: T) -> T:
     """Apply ``jnp.where`` leaf by leaf, for a scalar condition."""
     chosen: T = jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
     return chosen
+
+
+def _has_numbers(leaf: Any, shape: tuple[int, ...]) -> bool:
+    """Return whether a leaf is an array of this shape whose values are known, which those of a tracer are not."""
+    return hasattr(leaf, "tolist") and not isinstance(leaf, jax.core.Tracer) and leaf.shape == shape
+
+
+def _rounded(values: Iterable[float], digits: int) -> str:
+    return "[" + ", ".join(f"{value:z.{digits}f}" for value in values) + "]"

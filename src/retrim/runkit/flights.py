@@ -65,6 +65,15 @@ class Flight:
     target: np.ndarray | None = None
     """The vehicle's target position in each row, in the world frame [m]."""
 
+    def __repr__(self) -> str:
+        """Return the conditions and the errors, in one line."""
+        spec, log = self.spec, self.log
+        error = "terminated" if log.terminated else f"error {self.steady:.2g} m at the end, {self.peak:.2g} m at most"
+        return (
+            f"Flight: {self.vehicle}, {spec.scenario.disturbance}, {spec.method}, seed {spec.seed}, "
+            f"start {spec.start}: {log.t[-1]:.2f} s, {error}"
+        )
+
     @property
     def steady(self) -> float:
         """Mean error over the last few seconds [m]; NaN for a flight that was terminated."""

@@ -16,6 +16,7 @@ from ..config.setup import Latency, Setup
 from ..physics.state import State
 from ..plants.plant import Plant
 from ..plants.sim import SimPlant
+from ..progress import no_progress
 from ..runtime.adaptive import AdaptivePilot
 from ..runtime.events import Event, Observer
 from ..runtime.flight import Log, States, fly
@@ -75,7 +76,10 @@ def fly_one(
     def terminated(t: float, x: State) -> bool:
         return bool(_terminated(task, np.float64(t), x))
 
-    log = fly(plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, observers=observers, stop=stop)
+    log = fly(
+        plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, observers=observers, stop=stop,
+        progress=no_progress,
+    )  # fmt: skip
     return scored(setup, spec, log, learnt_by(pilot))
 
 

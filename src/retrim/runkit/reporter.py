@@ -1,11 +1,10 @@
 """Defines the interface for progress reports on long tasks; the library itself never prints."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
-Advance = Callable[[float, str], None]
-"""Receives the completed share (0 to 1) and a short text."""
+from ..progress import Advance as Advance
+from ..progress import no_progress
 
 
 @runtime_checkable
@@ -29,8 +28,4 @@ class Silent:
 
     def progress(self, title: str) -> AbstractContextManager[Advance]:
         """Ignore the progress."""
-        return nullcontext(_ignore)
-
-
-def _ignore(share: float, text: str) -> None:
-    """Ignore the advance."""
+        return no_progress(title)

@@ -1,19 +1,25 @@
 """The flight loop and the record of a flight."""
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..errors import ConfigError, RetrimError
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.plant import Measurement, Plant, as_numpy
+from ..progress import Progress, show_progress
 from .events import Event, Observer
 from .pilot import Pilot
+
+if TYPE_CHECKING:
+    from ..viz.flight_curves import Figure
 
 
 class FlightStopped(RetrimError):
@@ -34,6 +40,11 @@ class States(NamedTuple):
         """Return the same states as a :class:`State` of JAX arrays."""
         state: State = jax.vmap(State)(*map(jnp.asarray, self))
         return state
+
+    def __repr__(self) -> str:
+        """Return the number of rows, and the first and the last position."""
+        ends = f" from {_place(self.p[0])} to {_place(self.p[-1])} m" if len(self.p) else ""
+        return f"States: {len(self.p)} rows{ends}"
 
 
 class Log(NamedTuple):
@@ -74,6 +85,37 @@ class Log(NamedTuple):
     def missed_ticks(self) -> int:
         """Number of ticks without a measurement, on the plant's clock."""
         return int(np.sum(np.maximum(np.round(np.diff(self.t) / self.dt).astype(int) - 1, 0)))
+
+    def __repr__(self) -> str:
+        """Return the duration, the ends of the path and the numbers of events, in a few lines."""
+        kinds = Counter(event.kind for event in self.events)
+        ending = "terminated" if self.terminated else "not terminated"
+        return "\n".join(
+            [
+                f"Log: {self.t[-1]:.2f} s, {len(self.t) - 1} ticks of {1000 * self.dt:g} ms, "
+                f"{self.missed_ticks} missed, {ending}",
+                f"  position: from {_place(self.p[0])} to {_place(self.p[-1])} m",
+                f"  events: {', '.join(f'{n} {kind}' for kind, n in kinds.items()) or 'none'}",
+            ]
+        )
+
+    def plot(self, target: Float[np.ndarray, "*rows 3"] | Sequence[float] | None = None) -> "Figure":
+        """Draw the error with the policy updates, the path from above, and the commands.
+
+        Args:
+            target: Target position in the world frame [m], a point or one for each row; without it, the coordinates
+                are drawn instead of the error.
+
+        Returns:
+            A matplotlib figure, which a notebook shows.
+        """
+        from ..viz.flight_curves import FlightCurves, curves_figure
+
+        places = None if target is None else np.broadcast_to(np.asarray(target, dtype=float), self.p.shape)
+        error = None if places is None else np.linalg.norm(self.p - places, axis=1)
+        updates = tuple(event.t for event in self.events if event.kind == "policy")
+        curves = FlightCurves("flight", self.t, self.p, self.u, error, places, updates, self.terminated)
+        return curves_figure(f"Flight of {self.t[-1]:.2f} s", [curves])
 
     def window(self, ticks: int, *, end: int | None = None) -> Window:
         """Return a learner's input: measured states, each with the command that *followed* it.
@@ -127,6 +169,7 @@ def fly(
     terminated: Callable[[float, State], bool] = lambda t, x: False,
     observers: Sequence[Observer] = (),
     stop: threading.Event | None = None,
+    progress: Progress = show_progress,
 ) -> Log:
     """Fly a plant with a pilot. The plant is always stopped at the end, even after an error.
 
@@ -139,6 +182,7 @@ def fly(
             early.
         observers: Observers, which receive every measurement and event.
         stop: Event that aborts the flight; set it from another thread.
+        progress: Display of the progress; by default a bar in a notebook or a terminal, and nothing elsewhere.
 
     Returns:
         The log, with one more row than ticks.
@@ -154,7 +198,8 @@ def fly(
         )
     recorder, ended = Recorder(), False
     everyone: tuple[Observer, ...] = (recorder, *observers)
-    with plant:
+    with plant, progress("flying") as advance:
+        advance(0.0, "compiling")
         measurement = plant.reset(x0)
         start = measurement.t
         pilot.reset(measurement)
@@ -167,7 +212,9 @@ def fly(
             if accepted is not u:
                 pilot.accepted(accepted)
             _tell(everyone, measurement, accepted, pilot.take_events())
-            ended = terminated(measurement.t - start, measurement.true_state)
+            t = measurement.t - start
+            ended = terminated(t, measurement.true_state)
+            advance(min(1.0, t / (ticks * plant.dt)), f"{t:.1f} of {ticks * plant.dt:g} s")
     return recorder.log(plant.dt, terminated=ended)
 
 
@@ -180,3 +227,8 @@ def _tell(observers: Sequence[Observer], measurement: Measurement, u: Command, e
 
 def _stacked(states: Sequence[State]) -> States:
     return States(*(np.stack([np.asarray(getattr(x, name)) for x in states]) for name in ("p", "R", "v")))
+
+
+def _place(p: np.ndarray) -> str:
+    """Return a position as rounded numbers."""
+    return "[" + ", ".join(f"{value:z.3f}" for value in p.tolist()) + "]"

@@ -21,7 +21,8 @@ def sheet(size: tuple[float, float], font_size: float, *, boxed: bool = False) -
         boxed: Whether axes have lines on all four sides; otherwise only below and on the left.
     """
     import matplotlib
-    from matplotlib.figure import Figure
+
+    from .notebook import NotebookFigure
 
     with matplotlib.rc_context(
         {
@@ -33,4 +34,4 @@ def sheet(size: tuple[float, float], font_size: float, *, boxed: bool = False) -
             "text.usetex": False,
         }
     ):
-        yield Figure(figsize=size, layout="constrained", facecolor="white")
+        yield NotebookFigure(figsize=size, layout="constrained", facecolor="white")
