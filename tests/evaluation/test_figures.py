@@ -59,7 +59,7 @@ def test_what_a_person_did_is_marked_where_it_was_done(tmp_path):
     ]
     shown = flight(0.1, spec=FlightSpec(Scenario("large"), "full", 0), events=acts)
     text = picture([shown], Setup.from_preset(tiny_preset()), shown.spec.scenario, tmp_path)[1].read_text()
-    assert all(words in text for words in ("method lora $x_$", "push 1 0 0", "somebody acts"))
+    assert all(words in text for words in ("method lora $x_$", "push 1 0 0", "operator action"))
     assert "hold: gone" not in text
 
 

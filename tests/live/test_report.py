@@ -9,6 +9,7 @@ from helpers import tiny_preset
 from live_processes import DT, level
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
+from retrim.live.display import FIGURES, figures
 from retrim.live.events import LiveEvents
 from retrim.live.plant_process import CRASHED
 from retrim.live.report import flight_of, histograms, missing, results
@@ -55,6 +56,17 @@ def test_a_crash_is_counted_with_its_last_row_and_without(asked):
     assert reported(asked, rows, CRASHED, reason="landing")["steady"]["crashes"] == 0
     rows[-1, TRUE] = rows[-1, MEASURED] = level((0.0, 0.0, -1.0))
     assert reported(asked, rows, CRASHED)["steady"]["crashes"] == 1
+
+
+def test_the_table_of_a_flight_has_labels_in_words_and_leaves_out_nothing(asked):
+    rows = list(reported(asked, flown(asked), "landed", missed=5).values())
+    shown = figures([*rows, {"metric": "later_figure", "value": 1.0}])
+    assert len(shown) < len(rows)
+    assert not any("_" in label for label, _, _ in shown)
+    assert ("missed ticks, in stalls of the machine", "", "5, -") in shown
+    assert ("later figure", "", "1") in shown
+    assert {name for _, _, names, _ in FIGURES for name in names} == {row["metric"] for row in rows}
+    assert ("error, last seconds", "mm", "0") in shown
 
 
 def test_ticks_that_were_missed_while_the_machine_stood_still_are_told_apart(asked):

@@ -1,5 +1,6 @@
 """What a person asks for in flight is done, once, and told."""
 
+import dataclasses
 import time
 
 import jax
@@ -108,5 +109,22 @@ def test_knobs_are_an_event_once_they_rest(asked, monkeypatch):
     asked._supervisor.bus.publish("knobs", b"noise")
     assert asked.obey(status()) == []
     asked._supervisor.bus.publish("knobs", ManualDisturbance(load=0.05, push=(1.0, 0.0, 0.0)).pack())
-    assert [event.kind for event in asked.obey(status())] == ["knobs"]
+    assert [event[1:] for event in asked.obey(status())] == [("knobs", "push 1 0 0 m/s², load 0.05 kg")]
     assert asked.obey(status()) == []
+
+
+def test_a_knobs_event_states_the_change_and_its_time(asked, monkeypatch):
+    def turned(**knobs):
+        asked._supervisor.bus.publish("knobs", ManualDisturbance(**knobs).pack())
+        monkeypatch.setattr(wishes, "SETTLED_S", 60.0)
+        assert asked.obey(dataclasses.replace(status(), t=3.0)) == []
+        monkeypatch.setattr(wishes, "SETTLED_S", 0.0)
+        return [tuple(event) for event in asked.obey(dataclasses.replace(status(), t=3.5))]
+
+    push, kick = {"push": (1.0, 0.0, 0.0)}, {"kick": (8.0, 0.0, 0.0), "kicks": 1}
+    assert turned(**push) == [(3.0, "knobs", "push 1 0 0 m/s²")]
+    assert turned(**push) == []
+    assert turned(**push, rotor=0.8) == [(3.0, "knobs", "rotor 0.8")]
+    assert turned(**push, rotor=0.8, **kick) == [(3.0, "knobs", "kick 8 0 0 m/s²")]
+    assert turned(**kick) == [(3.0, "knobs", "all added effects removed")]
+    assert turned(kick=kick["kick"], kicks=2) == [(3.0, "knobs", "kick 8 0 0 m/s²")]

@@ -100,7 +100,7 @@ def test_a_flight_is_one_line():
     assert "terminated" in short(flight(0.1, terminated=True), 1)
 
 
-@pytest.mark.parametrize(("target", "label"), [(None, "position [m]"), ((0.0, 0.0, 1.0), "error [m]")])
+@pytest.mark.parametrize(("target", "label"), [(None, "position [m]"), ((0, 0, 1), "error [m]")])
 def test_the_figure_of_a_log_shows_errors_updates_path_and_commands(target, label):
     figure = log(10.0, events=EVENTS).plot(target)
     labels = {axes.get_ylabel() for axes in figure.axes}

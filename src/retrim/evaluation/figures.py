@@ -15,6 +15,7 @@ from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..physics.effects import ExternalEffects
 from ..physics.state import State
+from ..runkit.disturbance_text import describe_effects
 from ..runkit.flights import Flight
 from ..runkit.recovery import FEW, timeline
 from ..tasks.keypoints import Keypoints
@@ -95,25 +96,9 @@ def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
     for first, after in itertools.pairwise([0, *changes, len(times)]):
         end = float(times[after]) if after < len(times) else seconds
         here: ExternalEffects = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], result)
-        if label := _label(here):
+        if label := describe_effects(here):
             marked.append(plots.Span(float(times[first]), end, label, strong=bool(here.push[0] < 0)))
     return marked
-
-
-def _label(here: ExternalEffects) -> str:
-    """Return the effects in words; an empty string if there are no effects."""
-    words = list[str]()
-    if np.any(here.push):
-        same = len(set(here.push.tolist())) == 1
-        vector = ", ".join(f"{a:+g}" for a in here.push)
-        words.append(f"pushed by {here.push[0]:+g} m/s² per axis" if same else f"pushed by ({vector}) m/s²")
-    if np.any(here.wind):
-        words.append(f"wind of {np.linalg.norm(here.wind):.1f} m/s")
-    if here.mass > 0:
-        words.append(f"{1000 * here.mass:.0f} g of load")
-    if np.any(here.gain != 1):
-        words.append("rotors at " + ", ".join(f"{100 * g:.0f}" for g in here.gain) + " %")
-    return "; ".join(words)
 
 
 def _colours(methods: Sequence[str]) -> dict[str, int]:

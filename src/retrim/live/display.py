@@ -6,7 +6,25 @@ from typing import Any
 from .events import LiveEvents
 from .status import Status
 
-UNITS = {"steady": "m", "recovery_5cm": "s", "flight_to_swap_s": "s", "simulation_lost_s": "s"}
+FIGURES: tuple[tuple[str, str, tuple[str, ...], float], ...] = (
+    ("error, last seconds", "mm", ("steady",), 1000.0),
+    ("time until the error stays below 50 mm", "s", ("recovery_5cm",), 1.0),
+    ("policy updates, rolled back", "", ("policies", "rolled_back"), 1.0),
+    ("age of the flight data at an update, median", "s", ("flight_to_swap_s",), 1.0),
+    ("age of the flight data of the policy, median", "s", ("policy_age_p50_s",), 1.0),
+    ("missed ticks, in stalls of the machine", "", ("missed_ticks", "missed_in_stalls"), 1.0),
+    ("stalls of the machine", "", ("stalls",), 1.0),
+    ("longest stall", "ms", ("stall_max_ms",), 1.0),
+    ("lateness of a step: median, 99 %, maximum", "ms", ("lateness_p50_ms", "lateness_p99_ms", "lateness_max_ms"), 1.0),
+    ("duration of a step: median, 99 %, maximum", "ms", ("step_p50_ms", "step_p99_ms", "step_max_ms"), 1.0),
+    ("other work in a tick: median, 99 %, maximum", "ms", ("idle_p50_ms", "idle_p99_ms", "idle_max_ms"), 1.0),
+    ("age of the state, 99 %", "ms", ("state_age_p99_ms",), 1.0),
+    ("late samples, held commands", "", ("samples_late", "commands_held"), 1.0),
+    ("simulation behind the clock", "s", ("simulation_lost_s",), 1.0),
+    ("restarted processes, refused messages", "", ("restarts", "refused_messages"), 1.0),
+    ("ticks of the fallback controller", "", ("fallback_ticks",), 1.0),
+)
+"""Label, unit, metrics and factor of each line of the table at the end of a flight."""
 
 
 def live_line(status: Status) -> str:
@@ -24,10 +42,10 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
     """Return the status of a flight as rows, each with a label and a value."""
     control = status.control
     rows: list[tuple[str, str]] = []
-    rows.append(("flown by", "watchdog" if status.watchdog_flies else control.get("mode", "not started")))
+    rows.append(("in control", "watchdog" if status.watchdog_flies else control.get("mode", "not started")))
     rows.append(("error", f"{control.get('error', 0.0):.4f} m"))
     for half, version in control.get("versions", {}).items():
-        rows.append((f"{half} swaps", str(version)))
+        rows.append((f"{half} updates", str(version)))
     rows.append(("missed ticks", str(control.get("missed", 0))))
     if refused := control.get("refused"):
         rows.append(("refused messages", ", ".join(f"{what}: {n}" for what, n in refused.items())))
@@ -41,9 +59,23 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
 
 
 def figures(rows: Sequence[dict[str, Any]]) -> tuple[tuple[str, str, str], ...]:
-    """Return the metric, unit and value of each row of the results."""
-    return tuple((row["metric"], UNITS.get(row["metric"], ""), _shown(row["value"])) for row in rows)
+    """Return the label, the unit and the value of each figure of a flight, for a table.
+
+    Args:
+        rows: Rows of ``results.json``, in which a figure has the name of its metric.
+    """
+    values = {row["metric"]: row["value"] for row in rows}
+    known = {name for _, _, names, _ in FIGURES for name in names}
+    result = [
+        (label, unit, ", ".join(_shown(values[name], factor) for name in names))
+        for label, unit, names, factor in FIGURES
+        if values.keys() >= set(names)
+    ]
+    rest = [(name.replace("_", " "), "", _shown(value, 1.0)) for name, value in values.items() if name not in known]
+    return (*result, *rest)
 
 
-def _shown(value: object) -> str:
-    return "-" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)
+def _shown(value: Any, factor: float) -> str:
+    if value is None:
+        return "-"
+    return f"{factor * value:.3g}" if isinstance(value, float) else str(value)

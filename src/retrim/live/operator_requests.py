@@ -19,6 +19,7 @@ from .session import LiveRequest, learner_state
 from .status import Status
 from .supervisor import Supervisor
 
+KNOBS, UNITS = ("push", "wind", "load", "rotor"), {"push": "m/s²", "wind": "m/s", "load": "kg", "kick": "m/s²"}
 SETTLED_S = 0.5  # [s] without a further change, after which the new knob positions become an event
 
 
@@ -31,7 +32,9 @@ class OperatorRequests:
         self._wish: dict[str, Any] = {"method": request.method, "paused": False}
         self._method, self._starts = request.method, 0
         self._versions = {"wish": 0, "knobs": 0}
-        self._turned: tuple[float, ManualDisturbance] | None = None
+        self._turned: tuple[float, float, ManualDisturbance] | None = None
+        """Time on the clock and in the flight [s] of the last change of the knobs, and their positions."""
+        self._knobs_before = ManualDisturbance()
         self._work = ThreadPoolExecutor(1)
         self.following = ReferenceSwitcher(request, supervisor, self._work)
         self._coming: tuple[str, Future[Path]] | None = None
@@ -94,11 +97,18 @@ class OperatorRequests:
     def _knobs(self, t: float) -> list[Event]:
         if (turned := self._new("knobs")) is not None:
             with contextlib.suppress(MessageError):
-                self._turned = time.monotonic(), ManualDisturbance.unpack(turned)
+                self._turned = time.monotonic(), t, ManualDisturbance.unpack(turned)
         if self._turned is None or time.monotonic() - self._turned[0] < SETTLED_S:
             return []
-        knobs, self._turned = self._turned[1], None
-        return [Event(t, "knobs", ", ".join(f"{name} {_shown(value)}" for name, value in vars(knobs).items()))]
+        (_, at, knobs), self._turned = self._turned, None
+        before, self._knobs_before = self._knobs_before, knobs
+        changed = [name for name in KNOBS if getattr(knobs, name) != getattr(before, name)]
+        if knobs.kicks != before.kicks:
+            changed.append("kick")
+        elif changed and knobs == ManualDisturbance(kick=knobs.kick, kicks=knobs.kicks):
+            return [Event(at, "knobs", "all added effects removed")]
+        words = (f"{name} {_shown(getattr(knobs, name))} {UNITS.get(name, '')}".rstrip() for name in changed)
+        return [Event(at, "knobs", ", ".join(words))] if changed else []
 
     def _new(self, topic: str) -> bytes | None:
         message = self._supervisor.bus.latest(topic, self._versions[topic])

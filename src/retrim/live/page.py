@@ -34,7 +34,7 @@ from .spec import PageSpec
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # [refreshes]
 FLOWN_BY = {
-    "policy": " (the neural policy, with what it has learnt so far)",
+    "policy": " (network with its updates)",
     "hold": " (the guard, which holds the vehicle, and lands it then)",
     "descend": " (the guard, which lands)",
     "blind": " (the guard, without a measurement)",
@@ -242,25 +242,26 @@ def _text(
 ) -> str:
     reason = f": {_escaped(status['reason'])}" if status.get("reason") else ""
     mode = status.get("mode", "not known")
-    lines = [f"flown by: **{_escaped(mode)}**{reason or _escaped(FLOWN_BY.get(mode, ''))}"]
+    lines = [f"in control: **{_escaped(mode)}**{reason or _escaped(FLOWN_BY.get(mode, ''))}"]
     if ended:
         lines = [f"**flight over**: {_escaped(ended.get('reason', ''))}"]
     versions = status.get("versions", {})
     if "policy" in versions:
-        lines.append(f"policy {versions['policy']}, taken back: {len(status.get('given_up', []))}")
+        lines.append(f"policy updates in use: {versions['policy']}, rolled back: {len(status.get('given_up', []))}")
     lines.append(f"error {100.0 * status.get('error', 0.0):.1f} cm, missed ticks {status.get('missed', 0)}")
     felt, estimate = (_arrow(status.get(name, [])) for name in ("felt", "estimate"))
     lines.append(f"<span style='color:#d64541'>disturbance</span> {felt} m/s²")
     lines.append(f"<span style='color:#3070d6'>estimate</span> {estimate} m/s²")
     for layer, note in learners.items():
-        lines.append(f"{layer} learner: {note.get('learnt', 0)} times, {1e3 * note.get('took', 0.0):.0f} ms each")
+        results, took = note.get("learnt", 0), 1e3 * note.get("took", 0.0)
+        lines.append(f"{layer} learner: {results} results, last in {took:.0f} ms")
     if excluded := describe_counts(learners.get("residual", {}).get("excluded", [])):
         lines.append(f"measurements excluded from the fit: {excluded}")
     for at, stage, cause in status.get("stages", [])[-1:]:
         if stage:
             lines.append(f"since {at:.1f} s {describe_condition(stage, cause)}")
     if not status.get("learning", True):
-        lines.append("what was learnt does not fly")
+        lines.append("the policy from take-off is in use, without updates")
     if world.get("knobs_refused"):
         lines.append(f"knobs refused: {_escaped(world['knobs_refused'])}")
     return "<br>".join(lines)

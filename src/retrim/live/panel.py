@@ -9,6 +9,8 @@ import numpy as np
 from .manual_disturbance import LOAD, PUSH, WEAKEST, WIND, ManualDisturbance
 
 HISTORY_S = 60.0  # [s]
+START_S = 2.5  # [s], flight to the goal
+LEAST = 0.5  # [cm], smallest top of the scale
 KICKS = {"+x": (8.0, 0.0, 0.0), "-x": (-8.0, 0.0, 0.0), "+y": (0.0, 8.0, 0.0), "-y": (0.0, -8.0, 0.0)}  # [m/s^2]
 WAITING = "Waiting for take-off."
 
@@ -50,9 +52,9 @@ class Panel:
         self._history: deque[tuple[float, float, float]] = deque(maxlen=round(HISTORY_S * rate))
         self._text = self._gui.add_markdown(WAITING)
         self._plot = _history_plot(self._gui)
-        with self._gui.add_folder("World"):
-            self._gui.add_markdown(world)
-            self._gui.add_markdown("On top of that, grab the vehicle with the mouse and pull, or:")
+        self._gui.add_markdown(world)
+        with self._gui.add_folder("Added to the scenario"):
+            self._gui.add_markdown("Grab the vehicle with the mouse and pull, or set:")
             self._push = _vector(self._gui, "push [m/s²]", knobs.push, PUSH, 0.1)
             self._wind = _vector(self._gui, "wind [m/s]", knobs.wind, WIND, 0.5)
             most = float(f"{min(LOAD, 0.8 * mass):.2g}")
@@ -105,7 +107,7 @@ class Panel:
         self._text.content = text
         if len(self._history) > 1:
             t, error, policies = np.array(self._history).T
-            top = max(1.0, 1.1 * error.max())
+            top = top_of(t, error)
             marks = np.where(np.append(False, np.diff(policies) > 0), error, -10.0 * top)  # hide others below the axis
             self._plot.scales = _scales((t[0], t[-1]), top)
             self._plot.data = (t, error, marks)
@@ -173,6 +175,17 @@ def _history_plot(gui: Any) -> Any:
         scales=_scales((0.0, 1.0), 1.0),
         aspect=2.3,
     )
+
+
+def top_of(t: np.ndarray, error: np.ndarray) -> float:
+    """Return the top of the history's scale [cm], which leaves out the flight to the goal once that is over.
+
+    Args:
+        t: Flight times [s].
+        error: Distances from the target [cm].
+    """
+    after = error[t >= START_S]
+    return max(LEAST, 1.1 * float((after if t[-1] >= 2.0 * START_S else error).max()))
 
 
 def _scales(span: tuple[float, float], top: float) -> dict[str, Any]:

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 RED, BLUE, GREY, GREEN, DARK = (214, 69, 65), (48, 112, 214), (150, 150, 150), (60, 160, 90), (45, 45, 50)
-METRES = 0.25  # [m per m/s^2], length of arrows
+METRES = 0.1  # [m per m/s^2], length of arrows
+ZENITH, HORIZON, GROUND = (176, 203, 232), (238, 243, 248), (222, 227, 224)
+LEAST_DISTANCE, ARMS = 0.7, 6.0  # camera distance [m], and in arms of the vehicle, plus the size of the reference
 ROPE = 5.0  # [1/s^2], acceleration per metre between grip and hand
 TRAIL_S = 6.0  # [s]
 FORWARD = np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, 1.0]])
@@ -30,13 +32,14 @@ class Scene:
         server.scene.configure_default_lights(cast_shadow=False)
         self._scene, self._trail = server.scene, deque[np.ndarray](maxlen=round(TRAIL_S * rate))
         middle, size = path.mean(0), float(np.ptp(path, axis=0).max())
-        server.initial_camera.position = tuple(middle + (1.3 + size) * np.array([-0.8, -0.7, 0.35]))
-        server.initial_camera.look_at = tuple(middle)
-        ground = 2.0 * np.ceil(3.0 + size)
-        self._scene.add_grid("/ground", width=ground, height=ground, position=(middle[0], middle[1], 0.0))
+        distance = max(LEAST_DISTANCE, ARMS * arm) + size
+        server.initial_camera.position = tuple(middle + distance * np.array([-0.8, -0.7, 0.35]))
+        server.initial_camera.look_at = tuple(middle - distance * np.array([0.0, 0.0, 0.25]))  # shows the ground, too
+        _world(self._scene, middle, 2.0 * np.ceil(3.0 + size))
         if size > 0.01:
             self.follow(path)
         self._target = self._scene.add_icosphere("/target", 0.03, GREEN, opacity=0.6, cast_shadow=False)
+        self._scene.add_label("/target/name", "target", position=(0.0, 0.0, 0.05), font_screen_scale=0.8)
         self._shadow = self._scene.add_cylinder(
             "/shadow", radius=1.2 * max(arm, 0.08), height=0.002, color=GREY, opacity=0.4
         )
@@ -112,13 +115,27 @@ def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
     return float(w), float(x), float(y), float(z)
 
 
+def _world(scene: Any, middle: np.ndarray, size: float) -> None:
+    """Add a sky, the ground with a grid of half metres, and the world axes below the reference."""
+    share = np.linspace(0.0, 1.0, 64)[:, None, None]
+    sky = (1.0 - share) * np.array(ZENITH) + share * np.array(HORIZON)
+    scene.set_background_image(np.broadcast_to(sky, (64, 2, 3)).astype(np.uint8), format="png")
+    scene.add_grid(
+        "/ground", width=size, height=size, position=(middle[0], middle[1], 0.0), plane_color=GROUND, plane_opacity=0.8,
+        infinite_grid=True, fade_distance=2.0 * size,
+    )  # fmt: skip
+    scene.add_frame("/axes", axes_length=0.3, axes_radius=0.008, position=(middle[0], middle[1], 0.0))
+    for name, place in zip("xyz", 0.35 * np.eye(3), strict=True):
+        scene.add_label(f"/axes/{name}", name, position=tuple(place), font_screen_scale=0.8)
+
+
 def _quadrotor(scene: Any, arm: float) -> None:
     across = arm / 2.0**0.5
     scene.add_box("/vehicle/body", DARK, dimensions=(0.7 * arm, 0.45 * arm, 0.25 * arm))
     scene.add_box("/vehicle/nose", RED, dimensions=(0.12 * arm, 0.3 * arm, 0.2 * arm), position=(0.4 * arm, 0.0, 0.0))
     for i, (x, y) in enumerate(across * FORWARD):
         name, color = f"/vehicle/rotor{i}", RED if x > 0 else GREY
-        scene.add_cylinder(name, radius=0.55 * arm, height=0.04 * arm, color=color, opacity=0.5,
-                           position=(x, y, 0.2 * arm))  # fmt: skip
+        # Opaque, since the transparent grip around the vehicle would hide transparent rotors.
+        scene.add_cylinder(name, radius=0.55 * arm, height=0.04 * arm, color=color, position=(x, y, 0.2 * arm))
         ends = np.array([[[0.0, 0.0, 0.0], [x, y, 0.0]], [[x, y, 0.0], [x, y, 0.2 * arm]]])
         scene.add_line_segments(f"/vehicle/arm{i}", ends, DARK, thickness=0.12 * arm)

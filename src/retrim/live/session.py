@@ -26,6 +26,7 @@ from ..onboard.guard import Limits
 from ..onboard.messages import MOST_TICKS
 from ..physics.state import State
 from ..plants.plant import as_numpy
+from ..runkit.disturbance_text import describe_disturbance
 from ..runkit.flights import FlightSpec
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
@@ -38,6 +39,7 @@ from .states import vector_of
 
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
 PATH_S = 20.0  # [s], duration of the reference path on the page
+WORLD_S = 60.0  # [s], flight time for which the page describes the disturbance
 STEP = 0.05  # [s] between two positions on the path
 BELOW_GROUND = 0.3  # [m], depth of the fence below z = 0: flights may start at z = 0, and transients go lower
 LONGEST = 3600.0  # [s], maximum duration of a flight
@@ -238,6 +240,9 @@ def _page(request: LiveRequest) -> PageSpec:
     places = _places(request, PATH_S)
     scenario = request.scenario
     world = f"plant {scenario.plant}, disturbance {scenario.disturbance}"
+    seconds = min(request.seconds, WORLD_S)
+    if effects := describe_disturbance(scenario.disturbance, request.setup.flight_task.home(), seconds):
+        world += f" ({effects})"
     return PageSpec(host, free_port(host, port), name, places, methods, arm, mass, paths(offered, PATH_S), world)
 
 

@@ -3,12 +3,11 @@
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from ..errors import ConfigError, RetrimError
 from ..learn.window import Window
@@ -99,12 +98,12 @@ class Log(NamedTuple):
             ]
         )
 
-    def plot(self, target: Float[np.ndarray, "*rows 3"] | Sequence[float] | None = None) -> "Figure":
+    def plot(self, target: np.ndarray | Sequence[Any] | None = None) -> "Figure":
         """Draw the error with the policy updates, the path from above, and the commands.
 
         Args:
-            target: Target position in the world frame [m], a point or one for each row; without it, the coordinates
-                are drawn instead of the error.
+            target: Target position in the world frame [m], (3,) or (rows, 3); without it, the coordinates are drawn
+                instead of the error.
 
         Returns:
             A matplotlib figure, which a notebook shows.

@@ -149,7 +149,7 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
 def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top: float) -> None:
     """Draw a line for each user action, with text if there are few actions."""
     for i, (t, words) in enumerate(marks):
-        axes.axvline(t, color=INK, linestyle=":", linewidth=1.2, label=None if i else "somebody acts")
+        axes.axvline(t, color=INK, linestyle=":", linewidth=1.2, label=None if i else "operator action")
         if len(marks) <= MOST_WORDS:
             axes.text(t, 0.9 * top, f" {words[:40]}", rotation=90, ha="right", va="top", color=INK, fontsize=8,
                       parse_math=False)  # fmt: skip
