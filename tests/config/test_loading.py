@@ -91,6 +91,7 @@ def test_whole_numbers_are_numbers(overlay):
         (b"name = '\xff'", "not TOML"),
         ("x = " + "[" * 5000 + "]" * 5000, r"not TOML|x: unknown key"),
         ("x" + ".x" * 5000 + " = 1", r"not TOML|x: unknown key"),
+        ("goal = 1.0", r"goal: must be a list of values in brackets, not 1\.0"),
         ("#" * (MAX_TOML_BYTES + 1), rf"larger than the {MAX_TOML_BYTES} bytes that are accepted"),
     ],
 )

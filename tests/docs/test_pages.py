@@ -8,12 +8,15 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from made_up import flight
 from retrim.cli.main import commands
 from retrim.config.loading import overlaid
 from retrim.config.named_presets import PRESETS
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
+from retrim.evaluation.metrics import CONDITIONS, failed_record, record, summary
 from retrim.evaluation.sweep import Sweep, read_sweep
 from retrim.io.logs import read_map
 from retrim.io.logs.named_maps import names
@@ -69,6 +72,16 @@ def test_the_page_of_replay_tells_the_limits_and_every_map():
     for name in names():
         assert f"`{name}`" in page
         assert name in command
+
+
+def test_the_first_page_tells_every_figure_of_the_results():
+    plain = summary([record(flight(0.1))])
+    tracking = summary(
+        [record(flight(0.1, cross=np.full(501, 0.1))), failed_record(flight(0.1).spec, "small", "e", "no")]
+    )
+    page = (DOCS / "getting-started.md").read_text()
+    told = {name for row in re.findall(r"^\| (`[^|]+) \|", page, re.M) for name in re.findall(r"`(\w+)`", row)}
+    assert (plain | tracking).keys() - {*CONDITIONS, "metric"} <= told
 
 
 def test_toml_files_of_pages_are_accepted(tmp_path):

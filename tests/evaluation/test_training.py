@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import brief_preset
+from helpers import brief_preset, tiny_preset
 from made_up import Watching
 from retrim import Setup
+from retrim.config.loading import changed
 from retrim.errors import JobError
 from retrim.learn.rollout import rollout
 from retrim.runkit import training
@@ -124,3 +125,11 @@ def test_a_job_trains_what_it_is_told(setup, monkeypatch):
     policy = training.train_job(training.dump(setup.preset), 6)
     assert asked == [(setup.preset, 6)]
     assert bool(jnp.array_equal(policy.layers[0].weight, setup.new_policy(jax.random.key(6)).layers[0].weight))
+
+
+@pytest.mark.parametrize(("z", "warned"), [(1.0, False), (0.0, False), (-1.5, True)])
+def test_a_goal_below_the_ground_is_reported(z, warned):
+    setup = Setup.from_preset(changed(tiny_preset(), goal=(0.0, 0.0, z)))
+    assert (training.ground_warning(setup) is not None) == warned
+    if warned:
+        assert "z = -1.5 m, below the ground" in training.ground_warning(setup)

@@ -110,5 +110,5 @@ def test_where_nothing_can_be_recorded_is_named(tmp_path):
 
 def test_a_viewer_that_is_not_installed_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("retrim.io.logs.viewers.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"flight\.rrd needs rerun: pip install 'retrim\[rerun\]'"):
+    with pytest.raises(ConfigError, match=r"flight\.rrd needs rerun: pip install rerun-sdk"):
         check_recording(tmp_path / "flight.rrd")

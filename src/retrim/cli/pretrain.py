@@ -12,7 +12,7 @@ from ..errors import CheckpointError
 from ..evaluation.limits import check_seeds
 from ..runkit.outputs import write_trained
 from ..runkit.run import INTERRUPTED, Run
-from ..runkit.training import nominal_error, train
+from ..runkit.training import ground_warning, nominal_error, train
 from .arguments import training_preset
 from .console import RichReporter, Trust, console, show_paths, started
 
@@ -60,6 +60,8 @@ def pretrain(
 def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event) -> int:
     setup = Setup.from_preset(preset)
     run, reporter = started(Run("pretrain", out, stop=stop)), RichReporter()
+    if warning := ground_warning(setup):
+        console.print(f"[yellow]warning:[/] {warning}", soft_wrap=True)
     policy, losses = train(setup, seed, reporter=reporter, stop=stop)
     if not losses:
         console.print("interrupted before the first steps were done; nothing was saved")

@@ -65,7 +65,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
 def _explained(kind: type[Any], error: ValidationError) -> str:
     """Return a text with the first mistakes: the path of each and, for an unknown key, the valid keys."""
-    result, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False, include_input=False)
+    result, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False)
     for each in mistakes[:CHECKED]:
         path = [excerpt(str(part), quotes=False) for part in each["loc"] if not str(part).startswith("function-")]
         where = ".".join(path)
@@ -74,6 +74,8 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
             message = f"{UNKNOWN}; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
+        elif each["type"] in ("tuple_type", "list_type"):
+            message = f"must be a list of values in brackets, not {excerpt(str(each['input']), quotes=False)}"
         if result.get(where) in (None, NO_NAME):  # a table and a name are valid here: prefer the mistake in the table
             result[where] = message
     ordered = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys

@@ -30,7 +30,7 @@ def write_onnx(path: Path, policy: Portable) -> list[Path]:
         ConfigError: The package ``onnx`` is not installed.
     """
     if find_spec("onnx") is None:
-        raise ConfigError("--to onnx needs onnx: pip install 'retrim[export]'")
+        raise ConfigError("--to onnx needs onnx: pip install onnx onnxruntime")
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 

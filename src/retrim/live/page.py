@@ -92,8 +92,8 @@ def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], N
         raise ConfigError(f"--page-port {port} must be between 1 and 65535")
     if find_spec("viser") is None:
         if demanded:
-            raise ConfigError("--page needs viser: pip install 'retrim[page]'")
-        say("no page in the browser: pip install 'retrim[page]' brings it")
+            raise ConfigError("--page needs viser: pip install viser")
+        say("no page in the browser: pip install viser brings it")
         return None
     free_port(host, port)
     if host not in LOOPBACK:

@@ -100,7 +100,7 @@ def only_for(token: str, host: str) -> Iterator[None]:
     finally:
         servers.serve = serve  # type: ignore[misc]
     if not started:
-        raise PlantError("page: this version of viser cannot be protected by a token; pip install 'retrim[page]'")
+        raise PlantError("page: this version of viser cannot be protected by a token; pip install --upgrade viser")
 
 
 def _authorities(host: str, local: tuple[Any, ...]) -> set[str]:

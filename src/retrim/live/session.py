@@ -186,7 +186,7 @@ def learners_at(text: str | None, say: Callable[[str], None], key: Path | None =
     address = Address.of(text, shared)
     address.check_shared()
     if address.kind == "zenoh" and find_spec("zenoh") is None:
-        raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'")
+        raise ConfigError("a bus by zenoh needs zenoh: pip install eclipse-zenoh")
     if not address.loopback:
         where = address.host if address.kind == "zenoh" else "the network of its rosmaster"
         say(f"warning: this machine listens on {where}; messages are signed, but anybody on the way can read them")

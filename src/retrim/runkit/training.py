@@ -114,6 +114,15 @@ def train_job(preset: str, seed: int) -> AbstractPolicy:
     return train(Setup.from_preset(parse(preset, source="preset")), seed).policy
 
 
+def ground_warning(setup: Setup) -> str | None:
+    """Return a line if the goal or the reference of the flight is below the ground; None if it is not."""
+    home, followed = setup.flight_task.home(), setup.followed
+    lowest = float(home[2]) if followed is None else float(followed.rows[:, 2].min())
+    if lowest >= 0.0:
+        return None
+    return f"the goal or the reference is at z = {lowest:g} m, below the ground; z points up, so negate z of NED data"
+
+
 def nominal_error(setup: Setup, policy: AbstractPolicy, *, n: int = 64, seed: int = 1) -> float:
     """Return the mean error in the policy's own model [m], over the last half second of 6 s.
 

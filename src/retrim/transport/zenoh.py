@@ -47,7 +47,7 @@ class ZenohBus(NetworkBus):
             import zenoh
             from zenoh import ext as _ext
         except ImportError as error:
-            raise ConfigError("a bus by zenoh needs zenoh: pip install 'retrim[zenoh]'") from error
+            raise ConfigError("a bus by zenoh needs zenoh: pip install eclipse-zenoh") from error
         ext: Any = _ext
         super().__init__(capacities, session)
         config = zenoh.Config()

@@ -37,7 +37,7 @@ def read_bag(
     Times come from the map's time field, the header or the stamps of PX4 messages, and otherwise from the recording.
     """
     if find_spec("rosbags") is None:
-        raise LogError(f"{path}: a bag needs rosbags: pip install 'retrim[logs]'")
+        raise LogError(f"{path}: a bag needs rosbags: pip install rosbags")
     try:
         return _read(path, wanted, time, optional)
     except LogError:

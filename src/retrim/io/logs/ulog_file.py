@@ -29,7 +29,7 @@ def read_ulog(
     if available, and its message times if not.
     """
     if find_spec("pyulog") is None:
-        raise LogError(f"{path}: a ULog needs pyulog: pip install 'retrim[logs]'")
+        raise LogError(f"{path}: a ULog needs pyulog: pip install pyulog")
     log = _parsed(path)
     topics = {f"{d.name}#{d.multi_id}" if d.multi_id else d.name: d for d in log.data_list}
     notes = ["the file is damaged; what could be read is used"] if log.file_corruption else []

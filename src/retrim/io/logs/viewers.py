@@ -17,13 +17,13 @@ class Viewer(NamedTuple):
     write: Callable[[Path, Recording], None]
     package: str
     """Import name of the package that writes the format."""
-    extra: str
-    """Extra of retrim that installs the package."""
+    install: str
+    """Name of the package in the package index."""
 
 
 VIEWERS: Mapping[str, Viewer] = {
-    ".mcap": Viewer(write_mcap, "rosbags", "mcap"),
-    ".rrd": Viewer(write_rrd, "rerun", "rerun"),
+    ".mcap": Viewer(write_mcap, "rosbags", "rosbags"),
+    ".rrd": Viewer(write_rrd, "rerun", "rerun-sdk"),
 }
 
 
@@ -39,7 +39,7 @@ def check_recording(path: Path | None) -> None:
     if viewer is None:
         raise ConfigError(f"--record {path}: the name must end with {' or '.join(VIEWERS)}")
     if not can_record(path):
-        raise ConfigError(f"--record {path} needs {viewer.package}: pip install 'retrim[{viewer.extra}]'")
+        raise ConfigError(f"--record {path} needs {viewer.package}: pip install {viewer.install}")
     if path.is_dir():
         raise ConfigError(f"--record {path}: it is a folder")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
