@@ -18,9 +18,10 @@ from .track import track as track
 from .transfer import transfer as transfer
 from .tuning import tuning as tuning
 from .vision import vision as vision
+from .where_learning_pays import where_learning_pays as where_learning_pays
 
 MADE = (
     hover, reversing, track, phase, vision, plants, model, fast, ablation, design, efficiency, transfer, raptor,
-    buses, tuning, scaling,
+    buses, tuning, scaling, where_learning_pays,
 )  # fmt: skip
 """Tables of ``retrim reproduce``; the gauntlet has its own command."""

@@ -23,6 +23,7 @@ QUICK: dict[str, Options] = {
     "phase": {**FEW, "seconds": 24.0, "references": ("figure8",)},
     "plants": {**SHORT, "plant": ("bem", "simple")},
     "ablation": {**FEW, "seconds": 14.0},
+    "where_learning_pays": {**FEW, "columns": ("base", "observer", "geometric + I", "INDI", "INDI, wrong by two")},
     "scaling": {"flights": (12, 40), "seconds": 6.0},
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
 }
@@ -30,7 +31,8 @@ QUICK: dict[str, Options] = {
 ALONE = ("model", "efficiency", "buses", "tuning", "design", "scaling")
 """Tables that do not use other machines."""
 GO_ON = (
-    "hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "reversing", "plants", "everything"
+    "hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "reversing", "plants", "everything",
+    "where_learning_pays",
 )  # fmt: skip
 """Tables that are made in parts, so that the same command resumes after a kill."""
 REMARK = "A quick look, smaller than the table: figures to look at, not to quote."

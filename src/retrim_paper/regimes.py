@@ -1,0 +1,154 @@
+"""Regimes of flight in which learning may pay: conditions, opponents, scores, and published values.
+
+A regime is one row of ``docs/results/where_learning_pays.md``. To add one, append it to :func:`regimes`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from retrim.config.hidden_vehicles import draw_vehicles
+from retrim.config.loading import changed, load
+from retrim.config.presets import Preset
+from retrim.config.scenario import Scenario
+from retrim.runkit.flights import Flight
+
+from .slow_vehicle import slow_quadrotor
+
+PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
+LAST, TAIL = 2.0, 10.0  # [s], scored intervals at the end of hover flights and of tracking flights
+HIDDEN = 8  # number of hidden vehicles
+UNSEEN = 48  # seed of their draw
+
+
+@dataclass(frozen=True)
+class Score:
+    """A figure of a flight."""
+
+    of: Callable[[Flight], float]
+    """Function that returns the figure of a flight that was not lost [m]."""
+    about: str
+
+
+@dataclass(frozen=True)
+class Regime:
+    """One row of the page."""
+
+    name: str
+    about: str
+    preset: Preset
+    scenarios: tuple[Scenario, ...]
+    seconds: float
+    """Length of a flight [s]."""
+    score: Score
+    adapted: str = "full"
+    """Method of the column "adapted"."""
+    published: str = "-"
+    """Result of others in a comparable regime, with its source."""
+
+
+def mean_error(flight: Flight) -> float:
+    """Return the mean error over the last two seconds [m]."""
+    return float(np.mean(flight.error[_tail(flight, LAST)]))
+
+
+def tracking_error(flight: Flight) -> float:
+    """Return the mean distance from the reference over the last ten seconds [m]."""
+    return float(np.mean(flight.error[_tail(flight, TAIL)]))
+
+
+def height_error(flight: Flight) -> float:
+    """Return the root mean square of the height error over the last ten seconds [m].
+
+    Raises:
+        ValueError: The flight has no target.
+    """
+    if flight.target is None:
+        raise ValueError("height_error needs a flight with a target")
+    missed = flight.log.true.p[:, 2] - flight.target[:, 2]
+    return float(np.sqrt(np.mean(missed[_tail(flight, TAIL)] ** 2)))
+
+
+def _tail(flight: Flight, seconds: float) -> np.ndarray:
+    t = np.asarray(flight.log.t)
+    rows: np.ndarray = t > t[-1] - seconds
+    return rows
+
+
+def regimes() -> tuple[Regime, ...]:
+    """Return the rows of the page, in their order."""
+    hover, any_hover = load("hover/retrim"), load("hover/any")
+    tracking = load("track/retrim")
+    over_places = changed(tracking, vehicle="large", adapt=replace(tracking.adapt, residual="place"))
+    slow = slow_quadrotor()
+    circle = "circle=1"
+    hidden = tuple(vehicle.scenario(PUSH) for vehicle in draw_vehicles(HIDDEN, UNSEEN))
+    at_rest = Score(mean_error, f"mean error, last {LAST:g} s")
+    on_path = Score(tracking_error, f"mean error, last {TAIL:g} s")
+    in_height = Score(height_error, f"RMS height error, last {TAIL:g} s")
+    return (
+        Regime(
+            "S1 hidden vehicles",
+            f"{HIDDEN} vehicles of 30 g to 3 kg, unknown to every method; a push of 2 m/s² per axis",
+            any_hover, hidden, 10.0, at_rest, adapted="base-id",
+            published="xadapt 100 % survive, 0.154 m; RAPTOR 0.1 to 0.3 m",
+        ),
+        Regime(
+            "S2 slow rate loop",
+            "body rates lag by 100 ms (vehicle file: 15 ms); a push",
+            any_hover, (Scenario(PUSH, plant="second-order", vehicle=slow, delay=0.03),), 10.0, at_rest,
+            adapted="base-id", published="INDI acceptable below 40 ms (arXiv 2605.05483)",
+        ),
+        Regime(
+            "S3 unknown delay",
+            "commands act 60 ms late (declared: 20 ms); a push",
+            any_hover, (Scenario(PUSH, delay=0.06),), 10.0, at_rest, adapted="base-id",
+            published="RAPTOR oscillates from 10 to 30 ms on",
+        ),
+        Regime(
+            "corners",
+            "the star, through its corners at constant speed",
+            tracking, (Scenario(reference="star"),), 30.0, on_path,
+        ),
+        Regime(
+            "S5 downwash",
+            "a circle at 1 m/s, 0.75 m below a second vehicle; after the third pass",
+            over_places, (Scenario("downwash", reference=circle),), 32.0, in_height,
+            published="-75 % height error (arXiv 2304.07794)",
+        ),
+        Regime(
+            "S6 table edge",
+            "a circle at 1 m/s over the edge of a table, 2 cm above it; after eight passes",
+            over_places, (Scenario("table-edge", reference=circle),), 38.0, in_height,
+            published="-72 % height error (arXiv 2203.07747)",
+        ),
+        Regime(
+            "S8 off-centre load",
+            "a third of the mass, 3 cm off the centre",
+            hover, (Scenario("off-centre=0.03"),), 20.0, at_rest,
+        ),
+        Regime(
+            "S10 weak rotor, 50 %",
+            "one rotor has half of its thrust",
+            hover, (Scenario("weak-rotor=0.5"),), 20.0, at_rest,
+            published="95 % survive, 0.129 m (arXiv 2505.08223)",
+        ),
+        Regime(
+            "S10 weak rotor, 30 %",
+            "one rotor has 30 % of its thrust",
+            hover, (Scenario("weak-rotor=0.3"),), 20.0, at_rest,
+            published="95 % survive, 0.129 m (arXiv 2505.08223)",
+        ),
+        Regime(
+            "constant push",
+            "2 m/s² per axis, known vehicle",
+            hover, (Scenario("large"),), 20.0, at_rest, published="0.02 m (the paper, hover)",
+        ),
+        Regime(
+            "steady wind", "6 m/s, known vehicle", hover, (Scenario("wind=6"),), 20.0, at_rest,
+        ),
+        Regime(
+            "gusts", "4 m/s and Dryden turbulence, known vehicle", hover, (Scenario("gusts"),), 20.0, at_rest,
+        ),
+    )  # fmt: skip

@@ -1,0 +1,170 @@
+"""Makes the page that states in which regimes learning in flight pays, and in which it does not."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from retrim.errors import ConfigError
+from retrim.evaluation.flight_groups import clear_flights
+from retrim.evaluation.limits import check_seeds
+from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
+from retrim.runkit.document import Document, TableSection
+from retrim.runkit.flights import Flight
+from retrim.runkit.reporter import Reporter
+from retrim.runkit.run import Run
+
+from ..regimes import Regime, regimes
+
+OPPONENTS: dict[str, tuple[str, ...]] = {
+    "base": ("base",),
+    "observer": ("base-do",),
+    "geometric + I": ("geometric-i",),
+    "INDI": ("indi",),
+    "INDI, wrong by two": ("indi-half", "indi-double"),
+    "MPPI + L1": ("l1-mpc",),
+}
+"""Methods of each column; with several methods, the cell shows the worst one."""
+ADAPTED, COMPARABLE = "adapted", ("observer", "geometric + I", "INDI", "MPPI + L1")
+TIE, AS_GOOD = 1e-3, 0.7  # [m]; differences below TIE are ties, and an error below AS_GOOD times another one is better
+INTRO = """\
+Made by `retrim reproduce where_learning_pays`. Each row is a regime; each cell is the median over flights [mm], with
+the 95 % interval of the median (bootstrap over flights) in brackets, and the number of lost flights, which count as
+infinite. No method knows the disturbance. "INDI, wrong by two": INDI that assumes half or twice the thrust per command,
+the worse of the two. "adapted": learned in flight, charged to flight time by the preset's fixed latencies; in the rows
+S1 to S3, one policy for many vehicles with the identification of the vehicle (`base-id`), and otherwise all weights
+(`full`). The verdict follows from the numbers: learning pays if the adapted flights have less than 0.7 times the error
+of the best opponent that has no vehicle file of its own (observer, geometric + I, INDI, MPPI + L1), and by more than
+1 mm; it is a tie within 1 mm; otherwise the best opponent is named."""
+
+
+def where_learning_pays(
+    run: Run,
+    reporter: Reporter,
+    *,
+    only: tuple[str, ...] = (),
+    columns: tuple[str, ...] = tuple(OPPONENTS),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    starts: int = 8,
+) -> None:
+    """In which regimes learning in flight pays, with strong opponents: one row per regime, one verdict per row.
+
+    Args:
+        run: Folder for where_learning_pays.md and where_learning_pays.json.
+        reporter: Receives progress and the table.
+        only: Names, or beginnings of names, of the rows to make; all by default.
+        columns: Columns of opponents.
+        seeds: Training seeds; each also seeds the starts, gusts and learners of its flights.
+        starts: Flights per row, method and seed.
+    """
+    check_seeds(seeds)
+    chosen = [row for row in regimes() if not only or row.name.startswith(only)]
+    if not chosen:
+        raise ConfigError(f"no row {only[0]!r}; there are {', '.join(row.name for row in regimes())}")
+    if unknown := [name for name in columns if name not in OPPONENTS]:
+        raise ConfigError(f"no column {unknown[0]!r}; there are {', '.join(OPPONENTS)}")
+    for row in chosen:
+        options: dict[str, Any] = {"methods": _methods(row, columns), "starts": starts, "seconds": row.seconds}
+        refuse_misfits(row.preset, row.scenarios[:1], **options)
+    document = Document(run, "where_learning_pays", "Where learning pays", INTRO, seeds, reporter)
+    lines, results = list[tuple[str, ...]](), list[dict[str, Any]]()
+    studies = dict[str, Study]()
+    for row in chosen:
+        if run.interrupted:
+            break
+        reporter.say(f"{row.name}: {row.about}")
+        key = repr(row.preset)
+        if key not in studies:
+            studies[key] = train_all(row.preset, seeds, run, reporter)
+        methods = _methods(row, columns)
+        flights = fly_all(
+            studies[key], list(row.scenarios), run, reporter, methods=methods, starts=starts, seconds=row.seconds
+        ).flown
+        if len(flights) < len(methods) * len(row.scenarios) * len(seeds) * starts:
+            break
+        line, rows = _line(row, flights, columns)
+        lines.append(line)
+        results += rows
+    head = ("regime", "condition", "score", *columns, ADAPTED, "published", "verdict")
+    document.add(TableSection(head, tuple(lines), "Regimes"), results)
+    if not run.interrupted:
+        clear_flights(run)
+
+
+def _methods(row: Regime, columns: Sequence[str]) -> tuple[str, ...]:
+    """Return the methods of a row, each once."""
+    wanted = [method for column in columns for method in OPPONENTS[column]]
+    return tuple(dict.fromkeys([*wanted, row.adapted]))
+
+
+def _line(
+    row: Regime, flights: Sequence[Flight], columns: Sequence[str]
+) -> tuple[tuple[str, ...], list[dict[str, Any]]]:
+    """Return the cells of a row, and the scores of its flights."""
+    scores = {method: _scores(row, flights, method) for method in _methods(row, columns)}
+    cells = dict[str, str]()
+    medians = dict[str, float]()
+    for column in columns:
+        worst = max(OPPONENTS[column], key=lambda method: (float(np.median(scores[method])), np.sum(scores[method])))
+        cells[column], medians[column] = _cell(scores[worst]), float(np.median(scores[worst]))
+    cells[ADAPTED], medians[ADAPTED] = _cell(scores[row.adapted]), float(np.median(scores[row.adapted]))
+    verdict = decide(medians, {name: _lost(scores, columns, name, row) for name in medians})
+    line = (row.name, row.about, row.score.about, *cells.values(), row.published, verdict)
+    rows = [
+        {"regime": row.name, "method": method, "score_m": [value if np.isfinite(value) else None for value in values]}
+        for method, values in scores.items()
+    ]
+    return line, rows
+
+
+def _scores(row: Regime, flights: Sequence[Flight], method: str) -> np.ndarray:
+    own = [flight for flight in flights if flight.spec.method == method]
+    return np.array([np.inf if flight.log.terminated else row.score.of(flight) for flight in own])
+
+
+def _lost(scores: dict[str, np.ndarray], columns: Sequence[str], name: str, row: Regime) -> int:
+    methods = (row.adapted,) if name == ADAPTED else OPPONENTS[name]
+    return max(int(np.sum(np.isinf(scores[method]))) for method in methods)
+
+
+def _cell(scores: np.ndarray) -> str:
+    """Return the median [mm], its bootstrap interval, and the number of lost flights."""
+    lost = int(np.sum(np.isinf(scores)))
+    draw = np.random.default_rng(0)
+    resampled = np.median(scores[draw.integers(0, len(scores), (1000, len(scores)))], axis=1)
+    low, high = np.quantile(resampled, [0.025, 0.975], method="nearest")
+    text = f"{_mm(float(np.median(scores)))} ({_mm(float(low))} to {_mm(float(high))})"
+    return f"{text}, {lost} of {len(scores)} lost" if lost else text
+
+
+def _mm(metres: float) -> str:
+    if not np.isfinite(metres):
+        return "∞"
+    value = 1000.0 * metres
+    return f"{value:.2f}" if value < 1.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
+
+
+def decide(medians: dict[str, float], lost: dict[str, int]) -> str:
+    """Return the verdict of a row.
+
+    Args:
+        medians: Median score of each column [m]; infinite if most flights were lost.
+        lost: Number of lost flights of each column.
+    """
+    rivals = {name: medians[name] for name in COMPARABLE if name in medians}
+    if not rivals:
+        return "no opponent was flown"
+    fewest = min(lost[name] for name in rivals)
+    if lost[ADAPTED] > fewest:
+        best = min((name for name in rivals if lost[name] == fewest), key=lambda name: rivals[name])
+        return f"use {best} here: adapted flights are lost"
+    safe = {name: value for name, value in rivals.items() if lost[name] == lost[ADAPTED]}
+    if not safe:
+        return "learning pays: every opponent loses flights"
+    best = min(safe, key=lambda name: safe[name])
+    gain = safe[best] - medians[ADAPTED]
+    if abs(gain) <= TIE:
+        return f"a tie: {best} is as good and simpler"
+    if medians[ADAPTED] < AS_GOOD * safe[best]:
+        return f"learning pays: {safe[best] / max(medians[ADAPTED], 1e-6):.1f} times less error than {best}"
+    return f"use {best} here" if gain < 0.0 else f"learning helps a little; {best} is simpler"

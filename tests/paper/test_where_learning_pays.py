@@ -1,0 +1,63 @@
+"""The page of regimes: verdicts follow from the numbers, every row can be flown, and lost flights are shown."""
+
+import numpy as np
+import pytest
+
+from retrim.config.methods import find_method
+from retrim.errors import ConfigError
+from retrim.evaluation.study import refuse_misfits
+from retrim_paper.tables.where_learning_pays import OPPONENTS, _cell, _methods, decide, regimes, where_learning_pays
+
+NONE_LOST = dict.fromkeys((*OPPONENTS, "adapted"), 0)
+
+
+def medians(**millimetres):
+    names = {"geometric": "geometric + I", "mppi": "MPPI + L1"}
+    return {names.get(name, name): value / 1000.0 for name, value in millimetres.items()}
+
+
+@pytest.mark.parametrize(
+    ("figures", "verdict"),
+    [
+        ({"observer": 20.0, "INDI": 9.0, "adapted": 3.0}, "learning pays: 3.0 times less error than INDI"),
+        ({"observer": 0.4, "INDI": 0.1, "adapted": 0.2}, "a tie: INDI is as good and simpler"),
+        ({"observer": 9.0, "INDI": 2.0, "adapted": 6.0}, "use INDI here"),
+        ({"observer": 9.0, "geometric": 11.0, "adapted": 7.0}, "learning helps a little; observer is simpler"),
+    ],
+)
+def test_the_verdict_follows_from_the_numbers(figures, verdict):
+    assert decide(medians(**figures), NONE_LOST) == verdict
+
+
+def test_lost_flights_decide_before_errors():
+    figures = medians(observer=5.0, INDI=1.0, adapted=4.0)
+    assert decide(figures, NONE_LOST | {"adapted": 1}) == "use INDI here: adapted flights are lost"
+    assert decide(figures, NONE_LOST | {"observer": 2, "INDI": 1}) == "learning pays: every opponent loses flights"
+    assert "INDI" not in decide(figures, NONE_LOST | {"INDI": 1})
+
+
+def test_a_cell_shows_lost_flights_and_millimetres():
+    assert _cell(np.array([0.002, 0.002, 0.002])) == "2.0 (2.0 to 2.0)"
+    text = _cell(np.array([0.002, 0.003, np.inf]))
+    assert text.startswith("3.0 (2.0 to ∞)")
+    assert text.endswith("1 of 3 lost")
+    assert _cell(np.array([np.inf, np.inf])).startswith("∞")
+
+
+def test_regimes_have_unique_names_and_registered_methods():
+    names = [row.name for row in regimes()]
+    assert len(set(names)) == len(names)
+    for row in regimes():
+        for method in _methods(row, tuple(OPPONENTS)):
+            find_method(method)
+
+
+@pytest.mark.parametrize("row", regimes(), ids=lambda row: row.name)
+def test_every_regime_can_be_flown(row):
+    refuse_misfits(row.preset, row.scenarios[:1], methods=("base", row.adapted), starts=1, seconds=row.seconds)
+
+
+@pytest.mark.parametrize("options", [{"only": ("S99",)}, {"columns": ("PID",)}])
+def test_wrong_names_are_refused_before_training(options):
+    with pytest.raises(ConfigError, match="there are"):
+        where_learning_pays(None, None, **options)
