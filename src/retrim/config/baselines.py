@@ -20,7 +20,6 @@ from ..estimation.l1 import L1Estimator
 from ..estimation.prediction import Prediction
 from ..physics.actuator_response import ActuatorResponse
 from ..physics.command_path import CommandPath
-from ..tasks.occluded import OccludedKeypoints
 from .command_paths import ACTUATOR_LAG, declared_path, lag_of
 
 if TYPE_CHECKING:
@@ -56,8 +55,8 @@ class Baseline:
 
     def settings_for(self, setup: "Setup") -> Settings:
         """Return the settings that suit the observation of the set-up: a measured state or keypoints."""
-        seen = isinstance(setup.flight_task.observation_in_flight, OccludedKeypoints)
-        return self.settings_from_keypoints if seen else self.settings
+        estimated = setup.flight_task.observation_in_flight.state_estimator is not None
+        return self.settings_from_keypoints if estimated else self.settings
 
 
 def prediction_of(setup: "Setup") -> Prediction:

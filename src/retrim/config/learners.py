@@ -26,8 +26,6 @@ from ..physics.actuators import Lagged
 from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.vehicle import Vehicle
-from ..tasks.keypoints import Keypoints
-from ..tasks.occluded import OccludedKeypoints
 from ..tasks.task import AbstractTask
 from .command_paths import declared_path, longest_delay, response_of
 from .presets import Preset, Pretrain
@@ -93,19 +91,19 @@ def learner_settings(
 def _view(preset: Preset, task: AbstractTask) -> AbstractView:
     if preset.adapt.frame == "world":
         return WorldView()
-    limit = jnp.array(TILT_LIMIT)  # all frames in an image memory have the same gravity
-    return RestView(limit) if isinstance(task.observation, Keypoints) else GravityView(limit)
+    limit = jnp.array(TILT_LIMIT)
+    return RestView(limit) if task.observation.has_frame_in_memory else GravityView(limit)
 
 
 def check_frame(preset: Preset, task: AbstractTask) -> None:
     """Raise an error if a preset's task does not support the frame of effective gravity.
 
     Raises:
-        ConfigError: The task cannot be rotated, or the policy sees keypoints without a pose filter. The message names
-            the task and the part that cannot be rotated.
+        ConfigError: The task cannot be rotated, or the observation neither measures nor estimates the state. The
+            message names the task and the part that cannot be rotated.
     """
     seen = task.observation_in_flight
-    if isinstance(seen, Keypoints):
+    if not seen.measures_state and seen.state_estimator is None:
         raise ConfigError(
             f"preset {preset.name!r}: the frame of effective gravity needs a measured state or a pose filter; set "
             "[vision] occlusion = true"
@@ -119,17 +117,18 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 def effective_gravity_frame(
     controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known: FittedResidual | None = None
 ) -> GravityFrame | PoseFrame:
-    """Return a controller in the frame of effective gravity, which an observer or a pose filter estimates.
+    """Return a controller in the frame of effective gravity, which an observer or the observation estimates.
 
     Args:
         controller: Controller that can be rotated into this frame.
         preset: Preset with the control period and the declared delay of the observer.
         vehicle: Vehicle with the command limits and the lag of the observer.
         known: Learned residual, including the learned body-rate bias. The observer estimates the remaining
-            disturbance. A pose filter ignores the residual and estimates the whole disturbance.
+            disturbance. The estimator of an observation ignores the residual and
+            estimates the whole disturbance.
     """
     limit = jnp.array(TILT_LIMIT)
-    if isinstance(controller, PolicyController) and isinstance(controller.observation, OccludedKeypoints):
+    if isinstance(controller, PolicyController) and controller.observation.state_estimator is not None:
         return PoseFrame(controller, limit)
     path = declared_path(preset, vehicle)
     observer = DisturbanceObserver(

@@ -18,8 +18,6 @@ from ..control.pose_filtered import PoseFilteredController
 from ..errors import ConfigError
 from ..plants.plant import Plant
 from ..runtime.pilot import ControllerPilot, Pilot
-from ..tasks.keypoints import Keypoints
-from ..tasks.occluded import OccludedKeypoints
 from .baselines import BASELINES, Baseline
 from .families import identify_vehicle, policy_controller, track_actuators
 from .learners import check_frame, effective_gravity_frame
@@ -58,19 +56,19 @@ class MethodRequest:
         )
 
     def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
-        """Adapt a state-feedback controller to the observation: add a pose filter if the policy observes keypoints.
+        """Adapt a state-feedback controller to the observation, whose state estimator it uses if there is one.
 
         Args:
             controller: Controller that needs the state.
             called: Name of the method in error messages; by default, the name of the controller class.
 
         Raises:
-            ConfigError: The policy observes keypoints, and the preset has no pose filter.
+            ConfigError: The observation neither measures nor estimates the state.
         """
         seen = self.setup.flight_task.observation_in_flight
-        if isinstance(seen, OccludedKeypoints):
+        if seen.state_estimator is not None:
             return PoseFilteredController(seen, controller)
-        if isinstance(seen, Keypoints):
+        if not seen.measures_state:
             name = called or type(controller).__name__
             raise ConfigError(
                 f"method {name!r} needs the state, and preset {self.setup.preset.name!r} shows keypoints, from which "
@@ -158,7 +156,7 @@ def _base(request: MethodRequest) -> Pilot:
 
 
 def _integral(request: MethodRequest) -> Pilot:
-    if isinstance(request.setup.env.task.observation, Keypoints):
+    if not request.setup.env.task.observation.measures_state:
         raise ConfigError("method 'base-i' shifts the measured position; a policy that sees keypoints is shown none")
     integral = IntegralAction(
         request.controller(), request.setup.flight_task, gain=jnp.array(0.8), limit=jnp.array(2.0)

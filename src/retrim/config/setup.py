@@ -33,8 +33,7 @@ from ..runtime.adaptive import AdaptivePilot, Scheduled
 from ..runtime.lockstep import LockstepLearner
 from ..runtime.pilot import Pilot
 from ..tasks.abstract_reference import AbstractReference
-from ..tasks.keypoints import Keypoints
-from ..tasks.motions import MOTIONS
+from ..tasks.motions import MOTIONS, NEAR
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .command_paths import delayed, longest_delay, model_path
@@ -168,8 +167,8 @@ class Setup:
         k_init, k_train = random.split(random.key(seed))
         fresh, p = self.new_policy(k_init), self.preset.pretrain
         vision, observation = self.preset.vision, self.env.task.observation
-        if vision is not None and vision.encoder_steps and isinstance(observation, Keypoints):
-            steps, motions = vision.encoder_steps, MOTIONS[vision.encoder_motions]
+        steps, motions = (0, NEAR) if vision is None else (vision.encoder_steps, MOTIONS[vision.encoder_motions])
+        if steps and observation.state_examples(motions) is not None:
             if not isinstance(fresh, Policy):
                 raise ConfigError("vision.encoder_steps needs a perceptron, pretrain.network = 'mlp'")
             fresh, _ = pretrain_encoder(fresh, observation, random.split(k_init)[1], motions=motions, steps=steps)

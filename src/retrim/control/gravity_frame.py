@@ -22,7 +22,6 @@ from ..physics.dynamics import Hybrid, Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
-from ..tasks.occluded import OccludedMemory
 from .controller import AbstractController, PolicyController
 
 SHARE_OF_LATENESS = 0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
@@ -129,8 +128,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return (self.trust_known * self.rate_bias).astype(dtype)
 
 
-class PoseFrame(AbstractController[tuple[OccludedMemory, Command]]):
-    """A policy with :class:`OccludedKeypoints`, in the frame of the effective gravity that its pose filter estimates.
+class PoseFrame(AbstractController[tuple[Any, Command]]):
+    """A policy whose observation has a state estimator, in the frame of the effective gravity that it estimates.
 
     The policy does not need the measured state.
     """
@@ -139,21 +138,31 @@ class PoseFrame(AbstractController[tuple[OccludedMemory, Command]]):
     limit: Float[Array, ""]
     """Largest norm of the disturbance that turns the frame [m/s^2]."""
 
-    def init(self, x: State) -> tuple[OccludedMemory, Command]:
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if the observation does not estimate the disturbance."""
+        observation = self.inner.observation
+        if observation.state_estimator is None:
+            raise ValueError(
+                f"PoseFrame: the observation must have a state_estimator, got {type(observation).__name__}, which has "
+                "none"
+            )
+
+    def init(self, x: State) -> tuple[Any, Command]:
         """Return the memory at the start of a flight."""
         return self.inner.init(x)
 
     def __call__(
-        self, memory: tuple[OccludedMemory, Command], t: Float[Array, ""], x: State
-    ) -> tuple[Command, tuple[OccludedMemory, Command]]:
+        self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
+    ) -> tuple[Command, tuple[Any, Command]]:
         """Return the command of the inner controller, in the frame of the effective gravity one tick ago."""
-        seen, last = memory
-        frame = EffectiveGravityFrame.of(capped(seen.pose.d, self.limit))
+        (seen, last), estimator = memory, self.inner.observation.state_estimator
+        assert estimator is not None
+        frame = EffectiveGravityFrame.of(capped(estimator(seen).d, self.limit))
         u, (seen, _) = self.inner.in_frame(frame)((seen, frame.command(last)), t, frame.state(x))
         u = frame.world_command(u)
         return u, (seen, u)
 
-    def accepted(self, memory: tuple[OccludedMemory, Command], u: Command) -> tuple[OccludedMemory, Command]:
+    def accepted(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
         """Remember the accepted command."""
         return memory[0], u
 

@@ -1,8 +1,8 @@
-"""Give state-based controllers a pose from camera images.
+"""Give state-based controllers the state that an observation estimates, such as a pose from camera images.
 
-The pose filter of :class:`OccludedKeypoints`, which estimates the pose for a policy, also estimates it for these
-controllers, from the same points and the same commands. A controller that uses an inertial unit continues to do so: the
-estimated attitude transforms the unit's measurements from the body frame to the world frame.
+The estimator of an observation, such as the pose filter of :class:`~retrim.tasks.OccludedKeypoints`, serves policies
+and these controllers alike, with the same measurements and the same commands. A controller that uses an inertial unit
+continues to do so: the estimated attitude transforms the unit's measurements from the body frame to the world frame.
 """
 
 import dataclasses
@@ -14,27 +14,36 @@ from jaxtyping import Array, Float
 
 from ..physics import so3
 from ..physics.state import STANDARD_GRAVITY, Command, State
-from ..tasks.occluded import OccludedKeypoints, OccludedMemory
+from ..tasks.observation import AbstractObservation
 from .controller import AbstractController
 
 
 class SeenPoseState(eqx.Module):
-    """Memory of the filter and of the inner controller."""
+    """Memory of the observation and of the inner controller."""
 
-    seen: OccludedMemory
+    seen: Any
     inner: Any
     last: Command
 
 
 class PoseFilteredController(AbstractController[SeenPoseState]):
-    """A controller that receives position, attitude and velocity from the pose filter of the keypoints."""
+    """A controller that receives position, attitude and velocity from the state estimator of an observation."""
 
-    observation: OccludedKeypoints
+    observation: AbstractObservation[Any]
+    """Observation with a state estimator."""
     inner: AbstractController[Any]
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
     """Mean acceleration over the last tick, in the world frame [m/s^2]; None if it is not measured."""
+
+    def __check_init__(self) -> None:
+        """Raise ``ValueError`` if the observation does not estimate the state."""
+        if self.observation.state_estimator is None:
+            raise ValueError(
+                f"PoseFilteredController: the observation must have a state_estimator, got "
+                f"{type(self.observation).__name__}, which has none"
+            )
 
     def with_age(self, age: float | Float[Array, ""]) -> "PoseFilteredController":
         """Return the same controller for frames that are ``age`` seconds old."""
@@ -47,12 +56,12 @@ class PoseFilteredController(AbstractController[SeenPoseState]):
     def init(self, x: State) -> SeenPoseState:
         """Return the memory at the start of a flight; the filter starts near the state, not exactly at it."""
         seen = self.observation.init(x)
-        return SeenPoseState(seen, self.inner.init(seen.pose.x), Command.hover(x.p.dtype))
+        return SeenPoseState(seen, self.inner.init(self._estimate(seen)), Command.hover(x.p.dtype))
 
     def __call__(self, memory: SeenPoseState, t: Float[Array, ""], x: State) -> tuple[Command, SeenPoseState]:
         """Return the command for the estimated pose; the state only defines the poses of camera and inertial unit."""
         _, seen = self.observation(memory.seen, t, x, memory.last)
-        here, controller = seen.pose.x, self.inner
+        here, controller = self._estimate(seen), self.inner
         if self.omega is not None and self.a is not None:
             gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
             felt = so3.act(x.R.T, self.a - gravity)  # as an accelerometer measures it, in the body frame
@@ -63,3 +72,8 @@ class PoseFilteredController(AbstractController[SeenPoseState]):
     def accepted(self, memory: SeenPoseState, u: Command) -> SeenPoseState:
         """Remember the accepted command, here and in the inner controller."""
         return SeenPoseState(memory.seen, self.inner.accepted(memory.inner, u), u)
+
+    def _estimate(self, seen: Any) -> State:
+        estimator = self.observation.state_estimator
+        assert estimator is not None
+        return estimator(seen).x

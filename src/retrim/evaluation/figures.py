@@ -5,7 +5,9 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array
@@ -18,7 +20,7 @@ from ..physics.state import State
 from ..runkit.disturbance_text import describe_effects
 from ..runkit.flights import Flight
 from ..runkit.recovery import FEW, timeline
-from ..tasks.keypoints import Keypoints
+from ..tasks.observation import AbstractObservation
 from ..tasks.reference import Reference
 from ..tasks.track import AbstractTrack
 from ..tasks.transition import Spliced
@@ -66,14 +68,15 @@ def picture(
     kind = preset.task if ":" in preset.task else preset.task.capitalize()
     title = title or f"{kind}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
 
-    observation = setup.env.task.observation
-    if isinstance(observation, Keypoints):
-        home = jax.tree.map(lambda leaf: leaf[None], State.at(task.home()))
+    firsts = [_image_track(setup.env.task.observation, by[method][0].log.true.as_state()) for method in methods]
+    at_home = _image_track(setup.env.task.observation, jax.tree.map(lambda leaf: leaf[None], State.at(task.home())))
+    if at_home is not None:
         seen = [
-            plots.Group(names[method], [_image_track(observation, by[method][0].log.true.as_state())], colours[method])
-            for method in methods
+            plots.Group(names[method], [track], colours[method])
+            for method, track in zip(methods, firsts, strict=True)
+            if track is not None
         ]
-        beside = partial(plots.camera, groups=seen, wanted=_image_track(observation, home).pixel[0])
+        beside = partial(plots.camera, groups=seen, wanted=at_home.pixel[0])
     elif isinstance(task, AbstractTrack) and isinstance(task.reference, Reference):
         beside = partial(plots.laps, groups=groups, lap=np.asarray(task.reference.rows)[:, :3])
     elif isinstance(task, AbstractTrack) and isinstance(task.reference, Spliced):
@@ -119,10 +122,12 @@ def _track(flight: Flight) -> plots.Track:
     )  # fmt: skip
 
 
-def _image_track(observation: Keypoints, x: State) -> plots.ImageTrack:
-    return plots.ImageTrack(*map(np.asarray, _pixels(observation, x)))
+def _image_track(observation: AbstractObservation[Any], x: State) -> plots.ImageTrack | None:
+    points = _image(observation, x)
+    return None if points is None else plots.ImageTrack(*map(np.asarray, points))
 
 
-@jax.jit
-def _pixels(observation: Keypoints, x: State) -> tuple[Array, Array]:
-    return jax.vmap(observation.pixels)(x)
+@eqx.filter_jit
+def _image(observation: AbstractObservation[Any], x: State) -> tuple[Array, Array] | None:
+    points: tuple[Array, Array] | None = jax.vmap(observation.image)(x)
+    return points

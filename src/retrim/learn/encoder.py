@@ -1,8 +1,10 @@
-"""Pretrain a vision policy's hidden layers to predict the state from keypoints.
+"""Pretrain a vision policy's hidden layers to predict the state from images.
 
 The paper (Sec. IV-A.2, after Heeg et al.) trains these layers on flights of a random policy. Here, the histories are
 synthetic: random motions with constant velocity and body rates, redrawn at each step, without roll-outs.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,15 +14,14 @@ from jax import lax, random
 from jaxtyping import Array, Float, Key
 
 from ..control.policy import Policy
-from ..tasks.keypoints import Keypoints
 from ..tasks.motions import NEAR, Motions
-from ..tasks.observation import POSITION_SCALE, VELOCITY_SCALE
+from ..tasks.observation import AbstractObservation
 
 
 @eqx.filter_jit
 def pretrain_encoder(
     policy: Policy,
-    observation: Keypoints,
+    observation: AbstractObservation[Any],
     key: Key[Array, ""],
     *,
     motions: Motions = NEAR,
@@ -34,7 +35,7 @@ def pretrain_encoder(
 
     Args:
         policy: A policy with at least one hidden layer.
-        observation: The observation of the policy.
+        observation: The observation of the policy, which provides examples of states.
         key: Random key, consumed.
         motions: Distribution of the motions for training; the encoder does not generalise far beyond it.
         steps: Optimiser steps.
@@ -49,13 +50,8 @@ def pretrain_encoder(
     head = _glorot(eqx.nn.Linear(policy.layers[-1].weight.shape[1], 15, key=k_out), k_out)
     optimiser = optax.adam(optax.cosine_decay_schedule(1e-3, steps))
 
-    def sample(key: Key[Array, ""]) -> tuple[Float[Array, " o"], Float[Array, "15"]]:
-        x, omega = motions.draw(key, observation.goal)
-        features = observation.features(observation.stacked(observation.history(x, omega)))
-        _, visible = observation.pixels(x)
-        still = jnp.zeros(observation.size - features.shape[0] - 7, dtype=x.p.dtype)
-        state = jnp.concatenate([(x.p - observation.goal) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])
-        return jnp.concatenate([features, visible.astype(x.p.dtype), still]), state
+    sample = observation.state_examples(motions)
+    assert sample is not None, f"{type(observation).__name__} provides no examples of states"
 
     def loss(layers: list[eqx.nn.Linear], key: Key[Array, ""]) -> Float[Array, ""]:
         h, state = jax.vmap(sample)(random.split(key, batch))

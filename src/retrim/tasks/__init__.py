@@ -17,6 +17,7 @@ from .reference import Reference as Reference
 from .reference import joined as joined
 from .shapes import REFERENCES as REFERENCES
 from .shapes import smooth_start as smooth_start
+from .state_estimate import StateEstimate as StateEstimate
 from .task import AbstractTask as AbstractTask
 from .task import Start as Start
 from .task import huber as huber

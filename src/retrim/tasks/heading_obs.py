@@ -10,12 +10,13 @@ from ..physics import so3
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .observation import AbstractObservation
+from .wrapped_observation import AbstractWrappedObservation
 
 M = TypeVar("M")
 SMALLEST = 1e-6  # regularises the length of the heading, which is zero if the vehicle is upside down
 
 
-class HeadingObs(AbstractObservation[M]):
+class HeadingObs(AbstractWrappedObservation[M]):
     """Observation of the state turned about the vertical through ``origin``, so that the heading is zero.
 
     Hover is the same for every heading: thrust and body rates are commands in body axes, and the reward does not depend
@@ -24,14 +25,8 @@ class HeadingObs(AbstractObservation[M]):
     180 degrees.
     """
 
-    inner: AbstractObservation[M]
     origin: Float[Array, "3"]
     """Point on the vertical in the world frame [m]."""
-
-    @property
-    def size(self) -> int:
-        """Length of the inner observation."""
-        return self.inner.size
 
     def init(self, x: State) -> M:
         """Return the memory of the inner observation."""

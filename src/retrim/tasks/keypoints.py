@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,8 +15,8 @@ from ..estimation.camera import Camera, in_camera
 from ..physics import so3
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
-from .motions import NEAR
-from .observation import AbstractObservation
+from .motions import NEAR, Motions
+from .observation import POSITION_SCALE, VELOCITY_SCALE, AbstractObservation
 
 Statistics = tuple[Float[Array, "70"], Float[Array, "70 70"]]
 """Mean and whitening matrix of the pixels."""
@@ -137,6 +138,35 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         """Return the keypoints on the ground in the world frame [m]."""
         flat = jnp.array(PATTERN, dtype=self.goal.dtype)
         return self.goal[None] + jnp.concatenate([flat, jnp.full((7, 1), -BELOW, dtype=flat.dtype)], axis=1)
+
+    @property
+    def measures_state(self) -> bool:
+        """False: only images are measured."""
+        return False
+
+    @property
+    def has_frame_in_memory(self) -> bool:
+        """True: all images in the memory belong to one frame."""
+        return True
+
+    def state_examples(
+        self, motions: Motions
+    ) -> Callable[[Key[Array, ""]], tuple[Float[Array, " o"], Float[Array, "15"]]]:
+        """Return a function that draws an observation of a random motion, and the scaled state [p, R, v]."""
+
+        def sample(key: Key[Array, ""]) -> tuple[Float[Array, " o"], Float[Array, "15"]]:
+            x, omega = motions.draw(key, self.goal)
+            features = self.features(self.stacked(self.history(x, omega)))
+            _, visible = self.pixels(x)
+            still = jnp.zeros(self.size - features.shape[0] - 7, dtype=x.p.dtype)
+            state = jnp.concatenate([(x.p - self.goal) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])
+            return jnp.concatenate([features, visible.astype(x.p.dtype), still]), state
+
+        return sample
+
+    def image(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
+        """Return the pixels of the seven keypoints and their visibility."""
+        return self.pixels(x)
 
     def __call__(
         self, memory: KeypointMemory, t: Float[Array, ""], x: State, last: Command

@@ -20,29 +20,19 @@ from .flatness import flat_command
 from .hover import AbstractHover
 from .observation import AbstractObservation
 from .task import AbstractTask, Start
+from .wrapped_observation import AbstractWrappedObservation
 
 M = TypeVar("M")
 GoalPath = Callable[[Float[Array, ""]], Float[Array, "3"]]
 """Function from time [s] to the goal's world position [m]; three times differentiable by JAX."""
 
 
-class GoalObs(AbstractObservation[M]):
-    """Observation of the position and velocity relative to a moving goal."""
+class GoalObs(AbstractWrappedObservation[M]):
+    """Observation relative to a moving goal, from the observation of a hover task at the origin."""
 
-    inner: AbstractObservation[M]
-    """Observation of a hover task at the origin."""
     path: GoalPath = eqx.field(static=True)
     frame: EffectiveGravityFrame | None = None
     """Frame of the states; None for the world frame."""
-
-    @property
-    def size(self) -> int:
-        """Length of the inner observation."""
-        return self.inner.size
-
-    def init(self, x: State) -> M:
-        """Return the memory of the inner observation."""
-        return self.inner.init(x)
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
         """Return the observation of the relative state."""

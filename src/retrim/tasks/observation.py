@@ -1,17 +1,20 @@
 """Observations o = h(x); roll-outs, evaluation and flight use the same function."""
 
 import abc
+from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Key
 
 from ..errors import FrameError
 from ..physics.actuator_response import ActuatorState
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import PathBelief
 from ..physics.state import STANDARD_GRAVITY, Command, State
+from .motions import Motions
+from .state_estimate import StateEstimate
 
 M = TypeVar("M")
 
@@ -75,6 +78,49 @@ class AbstractObservation(eqx.Module, Generic[M]):
             FrameError: The observation does not support other frames.
         """
         raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
+
+    @property
+    def measures_state(self) -> bool:
+        """Whether the vehicle measures its state, so that controllers may use it; False for images, for example."""
+        return True
+
+    @property
+    def state_estimator(self) -> Callable[[M], StateEstimate] | None:
+        """Function that reads an estimate of state and disturbance from the memory; by default, None.
+
+        Controllers that need the full state use this estimate in flight, and so does the frame of effective gravity.
+        """
+        return None
+
+    @property
+    def has_frame_in_memory(self) -> bool:
+        """Whether the memory depends on the frame, so the frame must be constant in training; by default, False."""
+        return False
+
+    def state_examples(
+        self, motions: Motions
+    ) -> Callable[[Key[Array, ""]], tuple[Float[Array, " o"], Float[Array, "15"]]] | None:
+        """Return a function from a random key to an observation and the scaled state [p, R, v]; by default, None.
+
+        The hidden layers of a policy can be pretrained with such examples, see :mod:`retrim.learn.encoder`.
+
+        Args:
+            motions: Distribution of the motions in the examples.
+        """
+        del motions
+        return None
+
+    def image(self, x: State) -> tuple[Float[Array, "points 2"], Bool[Array, " points"]] | None:
+        """Return the points in the camera image and whether each is visible; by default, None, for no camera.
+
+        Args:
+            x: State of the vehicle.
+
+        Returns:
+            Image coordinates, in which the image is [-1, 1] x [-1, 1], and the visibility of each point.
+        """
+        del x
+        return None
 
 
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):

@@ -1,19 +1,21 @@
 """In-flight observation of keypoints in a camera image; some points are outside the image, noisy or missed."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax, random
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from ..estimation.pose_filter import PoseFilter
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .keypoints import COMMANDS, Keypoints, key_of
 from .observation import AbstractObservation
+from .state_estimate import StateEstimate
 
 LEAST_NOISE = 0.5  # [px], smallest noise that the filter assumes for a camera
 
@@ -59,6 +61,20 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
     def size(self) -> int:
         """Length of the observation: 89."""
         return self.full.size
+
+    @property
+    def measures_state(self) -> bool:
+        """False: only images are measured."""
+        return False
+
+    @property
+    def state_estimator(self) -> Callable[[OccludedMemory], StateEstimate]:
+        """Function that returns the estimate of the pose filter, in the world frame."""
+        return lambda memory: StateEstimate(memory.pose.x, memory.pose.d)
+
+    def image(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
+        """Return the pixels of the seven keypoints and their visibility."""
+        return self.full.pixels(x)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "OccludedKeypoints":
         """Return the observation of a camera in ``frame``, in which the ground is level."""

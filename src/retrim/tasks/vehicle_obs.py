@@ -1,6 +1,7 @@
 """Observation of a policy for many vehicles: task observation, actuators, and the belief about the vehicle."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax.numpy as jnp
@@ -11,11 +12,13 @@ from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import COORDINATES, PathBelief
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .observation import AbstractObservation
+from .state_estimate import StateEstimate
+from .wrapped_observation import AbstractWrappedObservation
 
 M = TypeVar("M")
 
 
-class VehicleObs(AbstractObservation[M]):
+class VehicleObs(AbstractWrappedObservation[M]):
     """o = [task observation, thrust, body rates and their slope, belief]: 15 more numbers than the task observation.
 
     The task observation should contain as many past commands as the longest delay has ticks, since these may not have
@@ -24,8 +27,6 @@ class VehicleObs(AbstractObservation[M]):
     :class:`~retrim.physics.path_family.PathBelief`.
     """
 
-    inner: AbstractObservation[M]
-    """Task observation."""
     omega_max: Float[Array, "3"]
     """Scale of body rates [rad/s]."""
     belief: PathBelief
@@ -48,9 +49,10 @@ class VehicleObs(AbstractObservation[M]):
         """Length of the observation: that of the task observation plus 15."""
         return self.inner.size + 7 + 2 * COORDINATES
 
-    def init(self, x: State) -> M:
-        """Return the memory of a vehicle that has hovered until now."""
-        return self.inner.init(x)
+    @property
+    def state_estimator(self) -> Callable[[M], StateEstimate] | None:
+        """State estimator of the task observation."""
+        return self.inner.state_estimator
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
         """Return the task observation with the scaled actuators and belief."""

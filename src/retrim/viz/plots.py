@@ -57,9 +57,9 @@ class ImageTrack:
     """Image points of the camera during one flight."""
 
     pixel: np.ndarray
-    """Image coordinates, ticks x 7 x 2; the image is [-1, 1] x [-1, 1]."""
+    """Image coordinates, ticks x points x 2; the image is [-1, 1] x [-1, 1]."""
     visible: np.ndarray
-    """Visibility of the points, ticks x 7."""
+    """Visibility of the points, ticks x points."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.n
 
 
 def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], wanted: np.ndarray) -> None:
-    """Draw image points in the first flight of each group; ``wanted`` (7 x 2) holds their positions at the goal."""
+    """Draw image points in the first flight of each group; ``wanted`` (points x 2): those at the goal."""
     for sightings, color, name in _coloured(groups):
         for sighting in sightings[:1]:
             seen = np.where(sighting.visible[:, :, None], sighting.pixel, np.nan)
@@ -207,7 +207,7 @@ def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], wa
                 first[:, 0], first[:, 1], ".", color="#999999", label="at the start" if name == groups[0].name else None
             )
     axes.plot(wanted[:, 0], wanted[:, 1], "+", color=INK, markersize=14, markeredgewidth=1.6, label="at the target")
-    axes.set(xlabel="image, across", ylabel="image, down", title="what the camera saw of the seven points")
+    axes.set(xlabel="image, across", ylabel="image, down", title="what the camera saw of the points")
     ticks = (-1.0, -0.5, 0.0, 0.5, 1.0)
     axes.set(xlim=(-1, 1), ylim=(1, -1), xticks=ticks, yticks=ticks, aspect=ASPECT)
     axes.spines[["top", "right"]].set_visible(True)

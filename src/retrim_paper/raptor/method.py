@@ -9,7 +9,6 @@ from retrim.physics.bem import BemQuadrotor
 from retrim.plants.plant import Plant
 from retrim.plants.sim import SimPlant
 from retrim.runtime.pilot import ControllerPilot, Pilot
-from retrim.tasks.keypoints import Keypoints
 
 from .passive import HoverController
 from .plant import RaptorNet, RaptorQuadrotor
@@ -34,7 +33,7 @@ def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
 
 
 def _pilot(request: MethodRequest) -> Pilot:
-    if isinstance(request.setup.env.task.observation, Keypoints):
+    if not request.setup.env.task.observation.measures_state:
         raise ConfigError("method 'raptor' needs the measured state; a policy that sees keypoints is shown none")
     return ControllerPilot(HoverController())
 
