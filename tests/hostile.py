@@ -35,7 +35,7 @@ from retrim.io.checkpoint import architecture, load_delta, lora_header
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.log_map import LogMap
 from retrim.live.learner_mission import LearnerMission
-from retrim.live.manual_disturbance import ManualDisturbance
+from retrim.live.operator.manual_disturbance import ManualDisturbance
 from retrim.onboard.messages import (
     COLUMNS,
     FlightRows,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from live_processes import DT, HOME
 from retrim.config.setup import Setup
 from retrim.control import AbstractController
-from retrim.live.controllers import _source, plain_source
+from retrim.live.processes.controllers import _source, plain_source
 from retrim.onboard.guard import UP, G, Limits
 from retrim.onboard.plan import ControlPlan
 from retrim.physics import Command, State

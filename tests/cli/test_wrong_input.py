@@ -198,7 +198,7 @@ def test_wrong_input_gives_one_clear_line_and_leaves_nothing(folder, words, mess
 
 
 def test_nothing_is_remarked_before_a_flight_is_refused(folder, monkeypatch):
-    monkeypatch.setattr("retrim.live.page.find_spec", lambda name: None)
+    monkeypatch.setattr("retrim.live.operator.page.find_spec", lambda name: None)
     out = retrim("live", "--plant", "mavlink:udp:nowhere", cwd=folder, code=1)
     assert out.startswith("retrim: address 'udp:nowhere': expected udp:HOST:PORT")
     assert out.count("\n") == 1

@@ -16,7 +16,7 @@ from retrim.config.named_presets import PRESETS
 from retrim.config.setup import Setup
 from retrim.control.mppi import MppiController
 from retrim.errors import ConfigError
-from retrim.live.controllers import plain_source
+from retrim.live.processes.controllers import plain_source
 from retrim.onboard.pilot import LivePilot
 from retrim.physics import so3
 from retrim.physics.state import State

@@ -21,7 +21,7 @@ from retrim.errors import CheckpointError, ConfigError, LogError, RetrimError
 from retrim.evaluation import sweep
 from retrim.io.logs import npz_members, read_flight_log, read_map
 from retrim.io.logs.npz_members import NpzMembers
-from retrim.live.page import free_port
+from retrim.live.operator.page import free_port
 from retrim.runkit import Run
 from retrim.runkit.reporter import Silent
 from retrim.tasks.trajectory_csv import from_csv

@@ -161,7 +161,7 @@ def test_a_crazyflie_whose_bridge_is_killed_falls(small, tmp_path):
 def bridge_of(supervisor):
     """The process of the vehicle's link among the children of a flight."""
     for child in map(int, Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()):
-        if b"vehicle_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+        if b"processes.vehicle" in Path(f"/proc/{child}/cmdline").read_bytes():
             return child
     raise AssertionError("no process of a vehicle")
 

@@ -8,8 +8,8 @@ import pytest
 
 from bus_ends import arrived
 from live_processes import Beside
-from retrim.live import bridge_process
-from retrim.live.bridge_process import BridgePlan
+from retrim.live.processes import bridge as bridge_process
+from retrim.live.processes.bridge import BridgePlan
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import last_note, pack_note
 from retrim.onboard.topics import INTO, OUT
@@ -35,7 +35,7 @@ def between():
 def carried(between, tmp_path):
     """The same, with the bridge in place of its plan; it carries already."""
     here, there, parent, plan = between
-    bridge = launch("retrim.live.bridge_process:carry", plan, tmp_path / "bridge.log")
+    bridge = launch("retrim.live.processes.bridge:carry", plan, tmp_path / "bridge.log")
     arrived(here, "ready.bridge", patience=30.0)
     yield here, there, parent, bridge
     bridge.kill()

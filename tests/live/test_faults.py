@@ -14,7 +14,7 @@ from live_processes import DT, HOME, DrillPlan, level
 from retrim.config import PRESETS, Scenario
 from retrim.config.loading import dump
 from retrim.live.events import LiveEvents
-from retrim.live.spec import MAINS, LiveSpec
+from retrim.live.spec import LiveSpec
 from retrim.live.supervisor import Supervisor
 from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch
@@ -59,7 +59,7 @@ def spec_in(folder, controller, **changes):
     return replace(
         LiveSpec(
             controller, ("residual", "policy"), start, None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])),
-            HOME, made.limits, DT, 1, 150, SECONDS, 0, folder, mains=MAINS | DRILL,
+            HOME, made.limits, DT, 1, 150, SECONDS, 0, folder, mains=DRILL,
         ),
         **changes,
     )  # fmt: skip

@@ -14,10 +14,11 @@ from live.test_live_learner import Beside, start  # noqa: F401
 from retrim.adapt.batched_workers import room_for
 from retrim.config.setup import Setup
 from retrim.io.trained import load_learner_state, save_learner_state
-from retrim.live import fleet_learner, fleet_process
-from retrim.live.fleet_learner import FleetLearner
-from retrim.live.fleet_process import FleetProcess
-from retrim.live.learner_process import LearnerPlan
+from retrim.live.processes import fleet as fleet_process
+from retrim.live.processes import fleet_learner
+from retrim.live.processes.fleet import FleetProcess
+from retrim.live.processes.fleet_learner import FleetLearner
+from retrim.live.processes.learner import LearnerPlan
 from retrim.onboard.messages import pack_note
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")

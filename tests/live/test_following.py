@@ -16,11 +16,11 @@ from live_processes import DT, level, moved
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.io.trained import save_learner_state
-from retrim.live import reference_switcher as following
-from retrim.live.controllers import adaptive_source
-from retrim.live.learner_process import LearnerLoop, LearnerPlan
 from retrim.live.live_options import choices, paths
-from retrim.live.reference_switcher import ReferenceSwitcher
+from retrim.live.operator import reference_switcher as following
+from retrim.live.operator.reference_switcher import ReferenceSwitcher
+from retrim.live.processes.controllers import adaptive_source
+from retrim.live.processes.learner import LearnerLoop, LearnerPlan
 from retrim.live.session import LiveRequest, live_spec
 from retrim.live.status import Status
 from retrim.live.supervisor import Supervisor

@@ -18,7 +18,7 @@ from retrim.live import remote_learners
 from retrim.live.events import LiveEvents
 from retrim.live.learner_mission import LearnerMission
 from retrim.live.learner_server import LearnerServer, learn_for
-from retrim.live.page import free_port
+from retrim.live.operator.page import free_port
 from retrim.live.spec import PageSpec
 from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch

@@ -11,8 +11,8 @@ from live_helpers import TOPICS
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.evaluation.fleet import Fleet
-from retrim.live.controllers import plain_source, vehicle_half
-from retrim.live.identifier_process import IdentifierLoop
+from retrim.live.processes.controllers import plain_source, vehicle_half
+from retrim.live.processes.identifier import IdentifierLoop
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, last_note
 from retrim.onboard.pilot import LivePilot
 from retrim.onboard.topics import VEHICLE

@@ -8,7 +8,7 @@ import pytest
 
 from retrim.config.scenario import Scenario
 from retrim.errors import MessageError, PlantError
-from retrim.live.manual_disturbance import KICK_S, KnobbedPlant, ManualDisturbance
+from retrim.live.operator.manual_disturbance import KICK_S, KnobbedPlant, ManualDisturbance
 from retrim.onboard.messages import pack_note
 from retrim.physics import Command, State
 from retrim.plants.plant import Measurement, Plant, as_numpy

@@ -12,9 +12,9 @@ from retrim.adapt.updates import PolicyUpdate, Rejection, pack_update, unpack_up
 from retrim.config.setup import Setup
 from retrim.io.trained import save_learner_state
 from retrim.learn.bptt import PolicyState
-from retrim.live.controllers import adaptive_source
-from retrim.live.learner_process import LearnerLoop, LearnerPlan
-from retrim.live.published_updates import active_update, keep
+from retrim.live.processes.controllers import adaptive_source
+from retrim.live.processes.learner import LearnerLoop, LearnerPlan
+from retrim.live.processes.published_updates import active_update, keep
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
 from retrim.onboard.topics import slot
 from retrim.transport.in_process import InProcessBus

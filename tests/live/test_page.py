@@ -13,10 +13,10 @@ import pytest
 
 from live_processes import DT, HOME, level
 from retrim.errors import ConfigError
-from retrim.live.manual_disturbance import ManualDisturbance
-from retrim.live.page import PagePlan, _Page, free_port
-from retrim.live.page_access import page_url
-from retrim.live.scene import quaternion
+from retrim.live.operator.manual_disturbance import ManualDisturbance
+from retrim.live.operator.page import PagePlan, _Page, free_port
+from retrim.live.operator.page_access import page_url
+from retrim.live.operator.scene import quaternion
 from retrim.live.spec import PageSpec
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import Sample, Setpoint, pack_note, unpack_note
@@ -72,7 +72,7 @@ def flight(tmp_path):
     port = free_port("127.0.0.1", 18080)
     paths = {"circle": HOME[None] + np.eye(3), "figure8": HOME[None] - np.eye(3)}
     spec = PageSpec("127.0.0.1", port, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19, paths)
-    process = launch("retrim.live.page:show", PagePlan(bus.folder, spec, os.getpid()), tmp_path / "page.log")
+    process = launch("retrim.live.operator.page:show", PagePlan(bus.folder, spec, os.getpid()), tmp_path / "page.log")
     try:
         yield bus, page_url("127.0.0.1", port, spec.token)
     finally:

@@ -10,9 +10,9 @@ import pytest
 
 from live_processes import HOME
 from retrim.errors import ConfigError, PlantError
-from retrim.live.page import PagePlan, free_port
-from retrim.live.page_access import only_for, page_url, refusal
-from retrim.live.page_opening import open_page
+from retrim.live.operator.page import PagePlan, free_port
+from retrim.live.operator.page_access import only_for, page_url, refusal
+from retrim.live.operator.page_opening import open_page
 from retrim.live.spec import PageSpec
 from retrim.onboard.launch import launch
 from retrim.transport.shared_memory import SharedMemoryBus
@@ -29,7 +29,7 @@ def page(tmp_path_factory):
     bus = SharedMemoryBus.create(dict.fromkeys(TOPICS, 65536))
     spec = PageSpec("127.0.0.1", free_port("127.0.0.1", 18280), "hover", HOME[None].repeat(2, 0), (), 0.06, 0.19)
     log = tmp_path_factory.mktemp("page") / "page.log"
-    process = launch("retrim.live.page:show", PagePlan(bus.folder, spec, os.getpid()), log)
+    process = launch("retrim.live.operator.page:show", PagePlan(bus.folder, spec, os.getpid()), log)
     try:
         assert _until(lambda: bus.latest("ready.page") is not None), log.read_text()
         yield spec.port, spec.token, f"viser-v{viser.__version__}"

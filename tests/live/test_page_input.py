@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from live_processes import HOME, level
-from retrim.live.manual_disturbance import ManualDisturbance
-from retrim.live.page import _Page, free_port
-from retrim.live.page_input import take_values_only
+from retrim.live.operator.manual_disturbance import ManualDisturbance
+from retrim.live.operator.page import _Page, free_port
+from retrim.live.operator.page_input import take_values_only
 from retrim.live.refused_notes import RefusedNotes
 from retrim.live.spec import PageSpec
 from retrim.onboard.messages import Sample, last_note, pack_note

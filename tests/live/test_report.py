@@ -11,7 +11,7 @@ from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.live.display import FIGURES, figures
 from retrim.live.events import LiveEvents
-from retrim.live.plant_process import CRASHED
+from retrim.live.processes.plant import CRASHED
 from retrim.live.report import flight_of, histograms, missing, results
 from retrim.live.session import LiveRequest
 from retrim.live.status import Status

@@ -13,7 +13,7 @@ from live_processes import DT, HOME, DrillPlan, level
 from retrim import ConfigError, PlantError, Scenario, load
 from retrim.evaluation import Fleet
 from retrim.live.events import LiveEvents
-from retrim.live.spec import MAINS, VEHICLE, LiveSpec
+from retrim.live.spec import VEHICLE, LiveSpec
 from retrim.live.status import Status
 from retrim.live.supervisor import Supervisor
 from retrim.onboard.guard import Mode
@@ -44,7 +44,7 @@ def spec(tmp_path, controller):
     return LiveSpec(
         controller, ("residual", "policy"), start, None, Scenario(plant="made_up_vehicle:point"), "small", level(HOME),
         HOME, plan(controller).limits, DT, 1, 150, SECONDS, 0, tmp_path,
-        mains=MAINS | {"plant": VEHICLE} | LEARNERS,
+        mains={"plant": VEHICLE} | LEARNERS,
     )  # fmt: skip
 
 

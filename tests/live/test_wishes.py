@@ -16,10 +16,10 @@ from retrim.config.setup import Setup
 from retrim.control.lora import LoraPolicy
 from retrim.io.trained import load_learner_state
 from retrim.learn.bptt import PolicyState
-from retrim.live import operator_requests as wishes
-from retrim.live.manual_disturbance import ManualDisturbance
-from retrim.live.operator_requests import OperatorRequests
-from retrim.live.published_updates import keep
+from retrim.live.operator import requests as wishes
+from retrim.live.operator.manual_disturbance import ManualDisturbance
+from retrim.live.operator.requests import OperatorRequests
+from retrim.live.processes.published_updates import keep
 from retrim.live.session import LiveRequest, live_spec
 from retrim.live.status import Status
 from retrim.live.supervisor import Supervisor

@@ -14,7 +14,7 @@ from live_helpers import TOPICS, Holds, holding, plan, setup
 from live_processes import DT, HOME, level, moved
 from retrim import PlantError
 from retrim.adapt.learner_state import LearnerState
-from retrim.live.controllers import adaptive_source, plain_source
+from retrim.live.processes.controllers import adaptive_source, plain_source
 from retrim.onboard.control import ControlLoop
 from retrim.onboard.guard import Mode
 from retrim.onboard.messages import (

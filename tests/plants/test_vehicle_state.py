@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from made_up_vehicle import PointVehicle
 from retrim.estimation.prediction import Prediction, Underway
-from retrim.live.vehicle_process import _sample
+from retrim.live.processes.vehicle import _sample
 from retrim.onboard.guard import Limits
 from retrim.physics import Command, CommandPath, State
 from retrim.physics.actuator_response import ActuatorState

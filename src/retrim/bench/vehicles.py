@@ -19,9 +19,9 @@ from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..learn.stacking import stack
-from ..live.fleet_process import FleetProcess
-from ..live.learner_process import LearnerPlan
-from ..live.plans import plan_of
+from ..live.processes.fleet import FleetProcess
+from ..live.processes.learner import LearnerPlan
+from ..live.roles import ROLES, RoleRequest
 from ..live.session import LAYERS, LiveRequest, live_spec
 from ..live.spec import LiveSpec
 from ..live.topics import topics
@@ -79,7 +79,7 @@ class Air:
     def plans(self) -> list[tuple[str, LearnerPlan]]:
         """Return the learner plans, one for each vehicle and layer."""
         return [
-            (layer, plan_of(layer, replace(self.spec, seed=i), self.spec.start, 0, bus.folder, frozenset(), 0))
+            (layer, ROLES[layer].plan(RoleRequest(replace(self.spec, seed=i), self.spec.start, bus.folder)))
             for i, bus in enumerate(self.buses)
             for layer in LAYERS
         ]
@@ -108,7 +108,7 @@ class Air:
 
     @staticmethod
     def _loop(spec: LiveSpec, bus: SharedMemoryBus) -> ControlLoop:
-        loop = ControlLoop(plan_of("control", spec, spec.start, 0, bus.folder, frozenset(), 0), bus)
+        loop = ControlLoop(ROLES["control"].plan(RoleRequest(spec, spec.start, bus.folder)), bus)
         loop.warm_up()
         return loop
 

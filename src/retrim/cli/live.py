@@ -19,8 +19,8 @@ from ..io.logs.viewers import check_recording
 from ..live.display import figures, live_line, live_rows
 from ..live.events import LiveEvents
 from ..live.flying import fly_live
-from ..live.page import page_address
-from ..live.page_opening import open_page
+from ..live.operator.page import page_address
+from ..live.operator.page_opening import open_page
 from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runkit.document import TableSection

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from ..runtime.events import Event
 from .events import LiveEvents
-from .operator_requests import OperatorRequests
+from .operator.requests import OperatorRequests
 from .status import Status
 from .supervisor import LANDING, Supervisor
 

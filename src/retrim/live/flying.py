@@ -27,8 +27,8 @@ from ..runtime.events import Event
 from ..tasks.transition import spliced
 from .child_processes import watched
 from .events import LiveEvents
-from .operator_requests import OperatorRequests
-from .page_access import page_url
+from .operator.page_access import page_url
+from .operator.requests import OperatorRequests
 from .report import complaints, flight_of, histograms, learnt_in, missing, results
 from .session import LiveRequest, live_spec
 from .status import Status

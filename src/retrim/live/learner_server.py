@@ -21,10 +21,10 @@ from ..transport.bridge import Bridge
 from ..transport.network import DISTRUST, FAREWELL
 from ..transport.remote import Address
 from ..transport.shared_memory import SharedMemoryBus
-from .fleet_process import FleetProcess, FleetSlot
 from .learner_mission import LearnerMission
-from .learner_process import LearnerPlan
-from .spec import MAINS
+from .processes.fleet import FleetProcess, FleetSlot
+from .processes.learner import LearnerPlan
+from .roles import ROLES
 
 IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before the flight
 BEAT_EVERY = TOLD_EVERY = 0.25  # [s]
@@ -178,7 +178,7 @@ class LearnerServer:
         if self._fleet is not None:
             self.processes[layer] = self._fleet.start(layer, plan, complaints)
         else:
-            self.processes[layer] = launch(MAINS[layer], plan, complaints)
+            self.processes[layer] = launch(ROLES[layer].main, plan, complaints)
 
     def _beat(self) -> str:
         """Report to the flight which learners are alive, restart dead ones, and return the status."""

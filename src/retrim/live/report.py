@@ -21,8 +21,8 @@ from ..runtime.events import Event
 from ..runtime.flight import Log, States
 from ..transport.bus import Bus
 from .events import LiveEvents
-from .plant_process import CRASHED
-from .published_updates import learnt_from
+from .processes.plant import CRASHED
+from .processes.published_updates import learnt_from
 from .session import LiveRequest
 from .status import Status
 

@@ -31,10 +31,10 @@ from ..runkit.flights import FlightSpec
 from ..runtime.pilot import ControllerPilot
 from ..transport.remote import Address
 from ..transport.shared_key import read_key
-from .controllers import adaptive_source, plain_source
 from .live_options import choices, paths
-from .page import free_port
-from .spec import MAINS, VEHICLE, LiveSpec, PageSpec
+from .operator.page import free_port
+from .processes.controllers import adaptive_source, plain_source
+from .spec import VEHICLE, LiveSpec, PageSpec
 from .states import vector_of
 
 LAYERS: tuple[Layer, ...] = ("residual", "policy")
@@ -162,7 +162,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         page=_page(request) if request.page is not None else None,
         learners=request.learners if learns else None,
         trust=python_names(preset),
-        mains=MAINS | {"plant": VEHICLE} if vehicle else MAINS,
+        mains={"plant": VEHICLE} if vehicle else {},
     )
 
 

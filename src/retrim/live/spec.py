@@ -14,23 +14,7 @@ from ..onboard.guard import Limits
 from ..onboard.pilot import ControllerSource
 from ..transport.remote import Address
 
-MAINS = {
-    "control": "retrim.onboard.control_process:fly",
-    "watchdog": "retrim.onboard.watchdog:watch",
-    "recorder": "retrim.onboard.recorder:record",
-    "plant": "retrim.live.plant_process:simulate",
-    "residual": "retrim.live.learner_process:learn",
-    "policy": "retrim.live.learner_process:learn",
-    "identifier": "retrim.live.identifier_process:identify",
-    "page": "retrim.live.page:show",
-    "bridge": "retrim.live.bridge_process:carry",
-}
-"""Main function of each process, by role."""
-UNHURRIED = ("residual", "policy", "identifier", "recorder", "page", "bridge")
-"""Roles that do not run on the core of the real-time processes."""
-RESTARTED = (*UNHURRIED, "watchdog")
-"""Roles that are restarted when their process dies or hangs."""
-VEHICLE = "retrim.live.vehicle_process:fly"
+VEHICLE = "retrim.live.processes.vehicle:fly"
 """Main function of the plant process if the plant is a vehicle."""
 
 
@@ -90,5 +74,5 @@ class LiveSpec:
     """Address of learners on another machine; None for learners on this machine."""
     trust: tuple[str, ...] = ()
     """Python names that ``start`` may contain. The user passed them to this process."""
-    mains: Mapping[str, str] = field(default_factory=lambda: MAINS)
-    """Main function of each process, by role. A flight of a vehicle uses a different main function for the plant."""
+    mains: Mapping[str, str] = field(default_factory=dict)
+    """Main functions that replace those of :data:`retrim.live.roles.ROLES`, by role."""

@@ -18,13 +18,12 @@ from ..onboard.note_fields import plain
 from ..onboard.pulses import SILENCE, Pulses
 from ..onboard.realtime import cores_of
 from ..onboard.recorder import Recorder
-from ..onboard.topics import VEHICLE
 from ..transport.message import describe
 from ..transport.shared_memory import SharedMemoryBus
-from .plans import plan_of
 from .refused_notes import RefusedNotes
 from .remote_learners import RemoteLearners
-from .spec import RESTARTED, UNHURRIED, LiveSpec
+from .roles import ROLES, RoleRequest
+from .spec import LiveSpec
 from .status import Status
 from .topics import topics
 
@@ -99,14 +98,9 @@ class Supervisor:
         began = time.monotonic()
         if self._remote is not None:
             self._remote.announce(self.start)
-        for role in ("control", "plant", *(self.spec.layers if self._remote is None else ("bridge",))):
-            self._start(role)
-        if VEHICLE in self.spec.controller.parameters:
-            self._start("identifier")
-        self._start("watchdog")
-        self._start("recorder")
-        if self.spec.page is not None:
-            self._start("page")
+        for name, role in ROLES.items():
+            if role.needed(self.spec):
+                self._start(name)
         while waiting := self._not_ready():
             self._check_alive()
             if time.monotonic() - began > READY_S:
@@ -115,8 +109,8 @@ class Supervisor:
             time.sleep(0.1)
         if failed := last_note(self.bus, "ready.recorder", "ready").get("failed"):
             raise PlantError(f"the flight cannot be written down: {failed}")
-        for role in ("control", "plant", "watchdog"):
-            self.refused[role] = last_note(self.bus, f"ready.{role}", "ready").get("refused", [])
+        for name in (name for name, role in ROLES.items() if role.priority):
+            self.refused[name] = last_note(self.bus, f"ready.{name}", "ready").get("refused", [])
         if last_note(self.bus, "ready.plant", "ready").get("stands"):
             yield from self._lift_off()
 
@@ -182,7 +176,7 @@ class Supervisor:
             self._end_hanging()
             for role, process in self.processes.items():
                 died = process.poll() not in (None, 0)  # a regular exit means that the flight is over
-                if role in RESTARTED and died and self.restarts.get(role, 0) < ATTEMPTS:
+                if ROLES[role].restarted and died and self.restarts.get(role, 0) < ATTEMPTS:
                     self._restart(role)
             if self.processes["plant"].poll() is not None:
                 ended = self._lost_plant()
@@ -288,8 +282,9 @@ class Supervisor:
         return result
 
     def _start(self, role: str) -> None:
-        cores = cores_of("learn" if role in UNHURRIED else "fly", self._cores)
-        self.processes[role] = launch(self.spec.mains[role], self._plan(role), self._complaints(role), cores)
+        cores = cores_of("fly" if ROLES[role].priority else "learn", self._cores)
+        main = self.spec.mains.get(role, ROLES[role].main)
+        self.processes[role] = launch(main, self._plan(role), self._complaints(role), cores)
 
     def _complaints(self, role: str) -> Path:
         return self.spec.folder / f"{role}.log"
@@ -297,4 +292,4 @@ class Supervisor:
     def _plan(self, role: str) -> Any:
         control = self.processes["control"].pid if "control" in self.processes else 0
         fly = frozenset(cores_of("fly", self._cores))
-        return plan_of(role, self.spec, self.start, self.floor, self.bus.folder, fly, control)
+        return ROLES[role].plan(RoleRequest(self.spec, self.start, self.bus.folder, self.floor, fly, control))

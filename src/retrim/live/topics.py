@@ -2,11 +2,11 @@
 
 from ..onboard.messages import COLUMNS
 from ..onboard.topics import LAYERS, REFERENCE, SLOTS, slot
+from .roles import ROLES
 from .spec import LiveSpec
 
 SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground",
          "airborne", "followed", "identified", "refusals.page", "refusals.network")  # fmt: skip
-ROLES = ("control", "plant", "watchdog", "recorder", "page", "bridge", "identifier", *LAYERS)
 
 
 def topics(spec: LiveSpec) -> dict[str, int]:
@@ -15,11 +15,12 @@ def topics(spec: LiveSpec) -> dict[str, int]:
     rows = 8 * len(COLUMNS) * spec.window + 10_000
     # Leave room for a policy with its optimiser's moments, even if the current method learns only a low-rank delta.
     learnt = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
+    beating = [name for name, role in ROLES.items() if role.restarted]
     return (
         dict.fromkeys(SMALL, 4096)
         | {"status": 65536, "stalls": 16384, "flight": rows, "fallback.flight": rows}
         | {f"ready.{role}": 8192 for role in ROLES}
-        | {f"beat.{role}": 1024 for role in ("supervisor", *ROLES) if role not in ("plant", "control")}
+        | {f"beat.{role}": 1024 for role in ("supervisor", *beating)}
         | {f"parameters.{name}": size + 100_000 for name, size in ({REFERENCE: 0} | half).items()}
         | {"mission": learnt}
         | {slot(layer, i): learnt for layer in LAYERS for i in range(SLOTS)}

@@ -6,18 +6,18 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from ..config.methods import learning_methods
-from ..errors import MessageError, RetrimError
-from ..io.trained import load_learner_state, save_learner_state
-from ..onboard.messages import unpack_note
-from ..onboard.note_fields import shown
-from ..runtime.events import Event
+from ...config.methods import learning_methods
+from ...errors import MessageError, RetrimError
+from ...io.trained import load_learner_state, save_learner_state
+from ...onboard.messages import unpack_note
+from ...onboard.note_fields import shown
+from ...runtime.events import Event
+from ..report import learnt_in
+from ..session import LiveRequest, learner_state
+from ..status import Status
+from ..supervisor import Supervisor
 from .manual_disturbance import ManualDisturbance
 from .reference_switcher import ReferenceSwitcher
-from .report import learnt_in
-from .session import LiveRequest, learner_state
-from .status import Status
-from .supervisor import Supervisor
 
 KNOBS, UNITS = ("push", "wind", "load", "rotor"), {"push": "m/s²", "wind": "m/s", "load": "kg", "kick": "m/s²"}
 SETTLED_S = 0.5  # [s] without a further change, after which the new knob positions become an event

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from ..onboard.heartbeat import Pacemaker
-from ..onboard.messages import pack_note
-from ..onboard.realtime import ParentWatch
-from ..onboard.topics import INTO, MOST, OUT, SLOWLY
-from ..transport.bridge import Bridge
-from ..transport.bus import Bus
-from ..transport.remote import Address
-from ..transport.shared_memory import SharedMemoryBus
-from .refused_notes import NETWORK
+from ...onboard.heartbeat import Pacemaker
+from ...onboard.messages import pack_note
+from ...onboard.realtime import ParentWatch
+from ...onboard.topics import INTO, MOST, OUT, SLOWLY
+from ...transport.bridge import Bridge
+from ...transport.bus import Bus
+from ...transport.remote import Address
+from ...transport.shared_memory import SharedMemoryBus
+from ..refused_notes import NETWORK
 
 IDLE = 0.002  # [s]
 SILENCE = 10.0  # [s] without a measurement, after which a flight without a supervisor is over; its autopilot may land

@@ -4,18 +4,18 @@ from concurrent.futures import Executor, Future
 
 import numpy as np
 
-from ..config.references import make_reference
-from ..errors import ConfigError, MessageError, RetrimError
-from ..onboard.messages import FlightRows, Parameters, pack_note
-from ..onboard.topics import REFERENCE
-from ..runtime.events import Event
-from ..tasks.reference import Reference
-from ..tasks.transition import BEFORE, transition_between
-from ..transport import wire
-from .live_options import choices
-from .session import LiveRequest
-from .status import Status
-from .supervisor import Supervisor
+from ...config.references import make_reference
+from ...errors import ConfigError, MessageError, RetrimError
+from ...onboard.messages import FlightRows, Parameters, pack_note
+from ...onboard.topics import REFERENCE
+from ...runtime.events import Event
+from ...tasks.reference import Reference
+from ...tasks.transition import BEFORE, transition_between
+from ...transport import wire
+from ..live_options import choices
+from ..session import LiveRequest
+from ..status import Status
+from ..supervisor import Supervisor
 
 LEAD = 0.8 * BEFORE  # [s] between the publication of a table and the start of its transition
 ATTEMPTS = 3

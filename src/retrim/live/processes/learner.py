@@ -15,30 +15,30 @@ import jax.numpy as jnp
 import numpy as np
 from jax import random
 
-from ..adapt.buffer import RollingBuffer
-from ..adapt.learner_state import LearnerState
-from ..adapt.updates import NOTHING, Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
-from ..adapt.worker import Worker
-from ..adapt.workers import make_worker
-from ..config.presets import Preset
-from ..config.setup import Setup
-from ..errors import MessageError
-from ..io.trained import load_learner_state
-from ..learn.window import Window
-from ..onboard.heartbeat import Pacemaker
-from ..onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
-from ..onboard.realtime import ParentWatch
-from ..onboard.topics import REFERENCE
-from ..physics.state import Command, State
-from ..runkit.compile_cache import enable_compile_cache
-from ..runkit.outlet import Outlet
-from ..runkit.outputs import write_state
-from ..transport import wire
-from ..transport.bus import Bus
-from ..transport.shared_memory import SharedMemoryBus
+from ...adapt.buffer import RollingBuffer
+from ...adapt.learner_state import LearnerState
+from ...adapt.updates import NOTHING, Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
+from ...adapt.worker import Worker
+from ...adapt.workers import make_worker
+from ...config.presets import Preset
+from ...config.setup import Setup
+from ...errors import MessageError
+from ...io.trained import load_learner_state
+from ...learn.window import Window
+from ...onboard.heartbeat import Pacemaker
+from ...onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
+from ...onboard.realtime import ParentWatch
+from ...onboard.topics import REFERENCE
+from ...physics.state import Command, State
+from ...runkit.compile_cache import enable_compile_cache
+from ...runkit.outlet import Outlet
+from ...runkit.outputs import write_state
+from ...transport import wire
+from ...transport.bus import Bus
+from ...transport.shared_memory import SharedMemoryBus
+from ..states import state_of
 from .controllers import parameter_groups
 from .published_updates import active_update, keep, learnt_from, newest_update
-from .states import state_of
 
 CHECK_EVERY = 0.005  # [s]
 LOOKING, COMPUTING = 5.0, 60.0  # [s], longest time to read the bus and to compute an update

@@ -8,17 +8,17 @@ from types import FrameType
 
 import numpy as np
 
-from ..errors import PlantError
-from ..onboard.guard import HOVER, Limits
-from ..onboard.messages import Sample, last_note, pack_note
-from ..onboard.realtime import ParentWatch, be_punctual
-from ..onboard.tick_budget import SHARE
-from ..plants.bridges.frames import heading_of
-from ..plants.bridges.vehicle_plant import VehiclePlant
-from ..plants.bridges.vehicle_state import VehicleState
-from ..transport.bus import Bus
-from ..transport.shared_memory import SharedMemoryBus
-from .plant_process import ALONE, PlantPlan, answer
+from ...errors import PlantError
+from ...onboard.guard import HOVER, Limits
+from ...onboard.messages import Sample, last_note, pack_note
+from ...onboard.realtime import ParentWatch, be_punctual
+from ...onboard.tick_budget import SHARE
+from ...plants.bridges.frames import heading_of
+from ...plants.bridges.vehicle_plant import VehiclePlant
+from ...plants.bridges.vehicle_state import VehicleState
+from ...transport.bus import Bus
+from ...transport.shared_memory import SharedMemoryBus
+from .plant import ALONE, PlantPlan, answer
 
 HOLD_S = 0.05  # [s] between two reads of the orders while the autopilot holds the vehicle
 

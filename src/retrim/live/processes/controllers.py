@@ -8,23 +8,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..adapt.learner_state import LearnerState
-from ..compile.trace import numpy_program, plain
-from ..config.families import make_family
-from ..config.setup import Setup
-from ..control.condition import Condition
-from ..control.controller import AbstractController
-from ..control.identified import vehicle_estimate
-from ..control.policy import AbstractPolicy
-from ..errors import ConfigError
-from ..estimation.command_path import PathEstimator
-from ..learn.bptt import PolicyState
-from ..learn.residuals.model import FittedResidual
-from ..onboard.pilot import ControllerSource
-from ..onboard.topics import REFERENCE, VEHICLE
-from ..physics.dynamics import f_a
-from ..physics.state import Command, State
-from ..transport import wire
+from ...adapt.learner_state import LearnerState
+from ...compile.trace import numpy_program, plain
+from ...config.families import make_family
+from ...config.setup import Setup
+from ...control.condition import Condition
+from ...control.controller import AbstractController
+from ...control.identified import vehicle_estimate
+from ...control.policy import AbstractPolicy
+from ...errors import ConfigError
+from ...estimation.command_path import PathEstimator
+from ...learn.bptt import PolicyState
+from ...learn.residuals.model import FittedResidual
+from ...onboard.pilot import ControllerSource
+from ...onboard.topics import REFERENCE, VEHICLE
+from ...physics.dynamics import f_a
+from ...physics.state import Command, State
+from ...transport import wire
 
 
 def parameter_groups(policy: AbstractPolicy, residual: Any) -> dict[str, Any]:

@@ -8,11 +8,11 @@ import contextlib
 from collections.abc import Callable
 from typing import Any
 
-from ..adapt.learner_state import LearnerState
-from ..adapt.updates import PolicyUpdate, ResidualUpdate, Update, pack_update, unpack_update
-from ..errors import MessageError
-from ..onboard.topics import LAYERS, SLOTS, slot
-from ..transport.bus import Bus, Message
+from ...adapt.learner_state import LearnerState
+from ...adapt.updates import PolicyUpdate, ResidualUpdate, Update, pack_update, unpack_update
+from ...errors import MessageError
+from ...onboard.topics import LAYERS, SLOTS, slot
+from ...transport.bus import Bus, Message
 
 PREFIX = 8  # [bytes], length of the version that precedes an update
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import MessageError, PlantError
-from ..onboard.messages import pack_note, unpack_note
-from ..onboard.note_fields import read_fields
-from ..physics.disturbance import Disturbance, HeldEffects, SumOfDisturbances
-from ..physics.effects import ExternalEffects
-from ..physics.state import Command
-from ..physics.vehicle import payload_inertia
-from ..plants.plant import Measurement, Plant
+from ...errors import MessageError, PlantError
+from ...onboard.messages import pack_note, unpack_note
+from ...onboard.note_fields import read_fields
+from ...physics.disturbance import Disturbance, HeldEffects, SumOfDisturbances
+from ...physics.effects import ExternalEffects
+from ...physics.state import Command
+from ...physics.vehicle import payload_inertia
+from ...plants.plant import Measurement, Plant
 
 PUSH, WIND, LOAD, WEAKEST = 4.0, 10.0, 5.0, 0.5  # [m/s^2], [m/s] per axis; [kg]; share of the thrust
 KICK_S = 0.2  # [s], duration of a kick

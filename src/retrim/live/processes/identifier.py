@@ -12,26 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..adapt.vehicles import PIECE
-from ..config.families import declared_vehicle, make_family
-from ..config.presets import Preset
-from ..control.identified import vehicle_estimate
-from ..control.vehicle_report import REPORTS, VehicleEstimate, VehicleReport
-from ..errors import ConfigError, MessageError
-from ..estimation.command_path import PathEstimator
-from ..estimation.command_path import PathState as EstimatorState
-from ..io.trained import load_learner_state
-from ..onboard.heartbeat import Pacemaker
-from ..onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
-from ..onboard.realtime import ParentWatch
-from ..onboard.topics import VEHICLE
-from ..physics.path_family import PathFamily
-from ..physics.state import Command, State
-from ..runkit.compile_cache import enable_compile_cache
-from ..transport import wire
-from ..transport.bus import Bus
-from ..transport.shared_memory import SharedMemoryBus
-from .states import state_of
+from ...adapt.vehicles import PIECE
+from ...config.families import declared_vehicle, make_family
+from ...config.presets import Preset
+from ...control.identified import vehicle_estimate
+from ...control.vehicle_report import REPORTS, VehicleEstimate, VehicleReport
+from ...errors import ConfigError, MessageError
+from ...estimation.command_path import PathEstimator
+from ...estimation.command_path import PathState as EstimatorState
+from ...io.trained import load_learner_state
+from ...onboard.heartbeat import Pacemaker
+from ...onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
+from ...onboard.realtime import ParentWatch
+from ...onboard.topics import VEHICLE
+from ...physics.path_family import PathFamily
+from ...physics.state import Command, State
+from ...runkit.compile_cache import enable_compile_cache
+from ...transport import wire
+from ...transport.bus import Bus
+from ...transport.shared_memory import SharedMemoryBus
+from ..states import state_of
 
 EVERY = 0.1  # [s] between two messages
 CHECK_EVERY = 0.005  # [s]

@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 import jax
 from jax import random
 
-from ..adapt.batched_workers import learn_base, learn_together, refused_by_all, room_for, shared_base
-from ..adapt.updates import Update
-from ..config.loading import dump
-from ..config.presets import Preset
-from ..config.setup import Setup
-from ..io.digests import tree_digest
-from ..learn.bptt import PolicyState
-from ..learn.window import Window
-from ..transport.bus import Bus
-from .learner_process import LearnerLoop, LearnerPlan
+from ...adapt.batched_workers import learn_base, learn_together, refused_by_all, room_for, shared_base
+from ...adapt.updates import Update
+from ...config.loading import dump
+from ...config.presets import Preset
+from ...config.setup import Setup
+from ...io.digests import tree_digest
+from ...learn.bptt import PolicyState
+from ...learn.window import Window
+from ...transport.bus import Bus
+from .learner import LearnerLoop, LearnerPlan
 
 AT_ONCE, MANY = 4, 1024  # vehicles per program on a CPU and on an accelerator
 

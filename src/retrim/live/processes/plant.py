@@ -10,20 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..config.scenario import Scenario
-from ..errors import MessageError, PlantError
-from ..onboard.commands import wait_for_take_off
-from ..onboard.messages import Sample, Setpoint, pack_note
-from ..onboard.realtime import ParentWatch, be_punctual, sleep_until
-from ..onboard.tick_budget import SHARE
-from ..physics.state import Command
-from ..plants.plant import Measurement, as_numpy
-from ..runkit.compile_cache import enable_compile_cache
-from ..runkit.flying import FLOOR
-from ..transport.bus import Bus
-from ..transport.shared_memory import SharedMemoryBus
-from .manual_disturbance import KnobbedPlant, ManualDisturbance
-from .states import state_of, vector_of
+from ...config.scenario import Scenario
+from ...errors import MessageError, PlantError
+from ...onboard.commands import wait_for_take_off
+from ...onboard.messages import Sample, Setpoint, pack_note
+from ...onboard.realtime import ParentWatch, be_punctual, sleep_until
+from ...onboard.tick_budget import SHARE
+from ...physics.state import Command
+from ...plants.plant import Measurement, as_numpy
+from ...runkit.compile_cache import enable_compile_cache
+from ...runkit.flying import FLOOR
+from ...transport.bus import Bus
+from ...transport.shared_memory import SharedMemoryBus
+from ..operator.manual_disturbance import KnobbedPlant, ManualDisturbance
+from ..states import state_of, vector_of
 
 ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
 CRASHED = "crashed"

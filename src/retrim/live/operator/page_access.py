@@ -14,7 +14,7 @@ from http import HTTPStatus
 from ipaddress import IPv6Address, ip_address
 from typing import Any
 
-from ..errors import PlantError
+from ...errors import PlantError
 
 EVERYWHERE = ("", "0.0.0.0", "::")
 """Addresses that stand for all addresses of this machine."""

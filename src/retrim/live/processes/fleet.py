@@ -12,15 +12,15 @@ from pathlib import Path
 
 import jax
 
-from ..errors import RetrimError
-from ..io.files import write_whole
-from ..onboard.launch import launch
-from ..onboard.messages import pack_note
-from ..onboard.realtime import ParentWatch
-from ..runkit.compile_cache import enable_compile_cache
-from ..transport.shared_memory import SharedMemoryBus
+from ...errors import RetrimError
+from ...io.files import write_whole
+from ...onboard.launch import launch
+from ...onboard.messages import pack_note
+from ...onboard.realtime import ParentWatch
+from ...runkit.compile_cache import enable_compile_cache
+from ...transport.shared_memory import SharedMemoryBus
 from .fleet_learner import FleetLearner
-from .learner_process import CHECK_EVERY, NICE, LearnerPlan
+from .learner import CHECK_EVERY, NICE, LearnerPlan
 
 FAILED = ".failed"
 LOOK_EVERY = 0.1  # [s] between two checks for vehicles that have joined or left
@@ -103,7 +103,7 @@ class FleetProcess:
 
     def _start(self, layer: str, plan: LearnerPlan, complaints: Path) -> "FleetSlot":
         if self.process is None or self.process.poll() is not None:
-            main, fleet = "retrim.live.fleet_process:learn_for_all", FleetPlan(self.folder, os.getpid())
+            main, fleet = "retrim.live.processes.fleet:learn_for_all", FleetPlan(self.folder, os.getpid())
             self.process = launch(main, fleet, self.folder / "learners.log", self.cores)
         self.count += 1
         path = self.folder / f"{self.count:06d}-{layer}.plan"

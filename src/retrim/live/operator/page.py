@@ -13,23 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from ..control.condition import describe_condition
-from ..errors import ConfigError, MessageError, excerpt
-from ..learn.screening import describe_counts
-from ..onboard.heartbeat import Heart
-from ..onboard.messages import Sample, last_note, last_sent, pack_note
-from ..onboard.note_fields import FIELDS, plain, read_fields, shown
-from ..onboard.realtime import ParentWatch
-from ..transport.bus import Bus
-from ..transport.remote import LOOPBACK
-from ..transport.shared_memory import SharedMemoryBus
+from ...control.condition import describe_condition
+from ...errors import ConfigError, MessageError, excerpt
+from ...learn.screening import describe_counts
+from ...onboard.heartbeat import Heart
+from ...onboard.messages import Sample, last_note, last_sent, pack_note
+from ...onboard.note_fields import FIELDS, plain, read_fields, shown
+from ...onboard.realtime import ParentWatch
+from ...transport.bus import Bus
+from ...transport.remote import LOOPBACK
+from ...transport.shared_memory import SharedMemoryBus
+from ..refused_notes import PAGE
+from ..spec import PageSpec
 from .manual_disturbance import ManualDisturbance
 from .page_access import only_for
 from .page_input import take_values_only
 from .panel import Panel
-from .refused_notes import PAGE
 from .scene import Scene
-from .spec import PageSpec
 
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # [refreshes]

@@ -1,0 +1,1 @@
+"""The operator's part of a live flight: page, requests and manual disturbance."""

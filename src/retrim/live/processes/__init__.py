@@ -1,0 +1,1 @@
+"""Processes of a live flight that use JAX: plant, learners, identifier and bridge."""

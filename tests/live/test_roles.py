@@ -1,0 +1,61 @@
+"""Roles of a live flight: which flights need which processes, and what each is started with."""
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from live_helpers import holding, plan
+from live_processes import DT, HOME, level
+from retrim import Scenario
+from retrim.live.operator.page import PagePlan
+from retrim.live.roles import ROLES, RoleRequest
+from retrim.live.spec import LiveSpec, PageSpec
+from retrim.onboard.topics import VEHICLE
+from retrim.transport.remote import Address
+
+ALWAYS = ["control", "plant", "watchdog", "recorder"]
+PAGE = PageSpec("localhost", 8080, "hover", np.zeros((1, 3)), (), 0.1, 0.7)
+
+
+@pytest.fixture(scope="module")
+def spec():
+    controller, place = holding(), Path("place")
+    return LiveSpec(
+        controller, (), place / "start", None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])), HOME,
+        plan(controller).limits, DT, 1, 150, 1.0, 0, place,
+    )  # fmt: skip
+
+
+def needed(spec):
+    return [name for name, role in ROLES.items() if role.needed(spec)]
+
+
+def test_a_flight_has_the_processes_that_it_needs(spec):
+    here = replace(spec, layers=("residual", "policy"))
+    remote = replace(here, learners=Address.of("zenoh:127.0.0.1:7447", None))
+    identifying = replace(spec, controller=replace(spec.controller, parameters={VEHICLE: {}}))
+    assert needed(spec) == ALWAYS
+    assert needed(here) == ["control", "plant", "residual", "policy", "watchdog", "recorder"]
+    assert needed(remote) == ["control", "plant", "bridge", "watchdog", "recorder"]
+    assert needed(identifying) == ["control", "plant", "identifier", "watchdog", "recorder"]
+    assert needed(replace(spec, page=PAGE)) == [*ALWAYS, "page"]
+
+
+@pytest.mark.parametrize("name", ROLES)
+def test_the_main_function_of_a_role_exists(name):
+    module, _, function = ROLES[name].main.partition(":")
+    assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_plans_carry_the_flight_and_the_priority_of_their_role(spec):
+    request = RoleRequest(spec, spec.start, Path("bus"), cores=frozenset({1}), control=7)
+    plans = {name: ROLES[name].plan(request) for name in (*ALWAYS, "residual", "policy", "identifier")}
+    assert {made.folder for made in plans.values()} == {Path("bus")}
+    assert {made.parent for made in plans.values()} == {request.parent}
+    assert plans["watchdog"].control == 7
+    assert plans["watchdog"].priority > plans["control"].priority > plans["plant"].priority > 0
+    assert (plans["residual"].layer, plans["policy"].layer) == ("residual", "policy")
+    assert isinstance(ROLES["page"].plan(replace(request, spec=replace(spec, page=PAGE))), PagePlan)
