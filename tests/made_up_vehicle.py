@@ -6,9 +6,9 @@ import numpy as np
 
 from live_processes import moved
 from retrim import PlantError
-from retrim.config.plants import PlantEntry
 from retrim.plants.bridges.vehicle_plant import VehiclePlant
 from retrim.plants.bridges.vehicle_state import VehicleState
+from retrim.plants.entry import PlantEntry
 
 HOVER = np.array([9.81, 0.0, 0.0, 0.0])
 

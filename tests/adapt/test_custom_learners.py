@@ -136,7 +136,7 @@ def test_names_that_do_not_fit():
         setup_of(learner="bttp")
     with pytest.raises(ConfigError, match="no optimiser 'frish'; did you mean 'fresh'"):
         setup_of(optimiser="frish")
-    with pytest.raises(ConfigError, match="learner 'math:pi' is a float, not a function that takes a LearnerRequest"):
+    with pytest.raises(ConfigError, match="learner 'math:pi' is a float, not a function of a LearnerRequest"):
         setup_of(learner="math:pi")
     with pytest.raises(ConfigError, match="optimiser 'math:pi' is a float, not an AbstractPolicyOptimiser"):
         setup_of(optimiser="math:pi")

@@ -9,9 +9,10 @@ from jax import random
 
 from retrim import ConfigError
 from retrim.config import PRESETS, Scenario, Setup, changed, read_vehicle, register_vehicle
-from retrim.config.baselines import BASELINES, slowness
+from retrim.config.baselines import baseline_request, slowness
 from retrim.config.command_paths import lag_of
 from retrim.config.vehicles import PUBLISHED, make_vehicle
+from retrim.control.baselines import BASELINES
 from retrim.physics.step_response import step_responses
 from retrim.runtime import fly
 
@@ -73,7 +74,7 @@ def test_classical_controllers_are_as_slow_as_the_vehicle(spec):
     n = slowness(slow)
     assert n == pytest.approx((0.02 + step_responses(slow.vehicle)[0].rise) / 0.053)
     for method in ("geometric-i", "indi"):
-        one, other = (BASELINES[method].controller(setup).gains for setup in (usual, slow))
+        one, other = (BASELINES[method].controller(baseline_request(setup)).gains for setup in (usual, slow))
         assert float(one.position) == pytest.approx(BASELINES[method].settings["position"])
         for part, power in (("position", 2), ("velocity", 1), ("attitude", 1), ("integral", 3)):
             assert float(getattr(one, part)) == pytest.approx(n**power * float(getattr(other, part)))

@@ -11,9 +11,10 @@ from helpers import brief_preset
 from made_up import flight
 from retrim.adapt.views import GravityView, RestView
 from retrim.config import Setup, TaskRequest, changed
-from retrim.config.baselines import BASELINES
+from retrim.config.baselines import baseline_request
 from retrim.config.learners import check_frame
 from retrim.config.methods import MethodRequest
+from retrim.control.baselines import BASELINES
 from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import PoseFrame
 from retrim.control.pose_filtered import PoseFilteredController
@@ -95,7 +96,7 @@ def seeing():
 
 
 def test_a_controller_receives_the_estimated_state(seeing, key):
-    controller = MethodRequest(seeing, None).by_state(BASELINES["geometric"].controller(seeing))
+    controller = MethodRequest(seeing, None).by_state(BASELINES["geometric"].controller(baseline_request(seeing)))
     assert isinstance(controller, PoseFilteredController)
     x = State(seeing.flight_task.home() + 0.2, jnp.eye(3), jnp.zeros(3))
     by_estimate, _ = controller(controller.init(x), jnp.array(0.0), x)
@@ -107,7 +108,7 @@ def test_a_controller_receives_the_estimated_state(seeing, key):
 
 def test_settings_and_methods_follow_from_the_observation(seeing, key):
     baseline = BASELINES["geometric"]
-    assert baseline.settings_for(seeing) is baseline.settings_from_keypoints
+    assert baseline.settings_for(seeing.flight_task) is baseline.settings_from_keypoints
     policy = seeing.new_policy(key)
     with pytest.raises(ConfigError, match="base-i"):
         seeing.pilot(policy, "base-i")
@@ -135,7 +136,9 @@ def test_the_frame_is_that_of_the_estimated_disturbance(seeing, key):
 
 def test_a_controller_refuses_an_observation_without_an_estimator(seeing, key):
     with pytest.raises(ValueError, match="must have a state_estimator, got Sonar"):
-        PoseFilteredController(Sonar(seeing.env.task.observation.state), BASELINES["geometric"].controller(seeing))
+        PoseFilteredController(
+            Sonar(seeing.env.task.observation.state), BASELINES["geometric"].controller(baseline_request(seeing))
+        )
     blind = PolicyController(Sonar(seeing.env.task.observation.state), seeing.new_policy(key))
     with pytest.raises(ValueError, match="must have a state_estimator, got Sonar"):
         PoseFrame(blind, jnp.array(6.0))

@@ -56,7 +56,7 @@ def test_a_file_in_a_family(lap):
         ("{}x.csv:once", r"x\.csv: No such file"),
         ("circel", "no reference 'circel'; .*circle.* or a CSV file"),
         ("math:cos", "reference math:cos: "),
-        ("math:pi", "reference math:pi: .*not callable"),
+        ("math:pi", "reference 'math:pi' is a float, not a function that gives a Reference"),
         ("builtins:dict", "is a dict, not a function that gives a Reference"),
     ],
 )

@@ -1,8 +1,11 @@
 """Names: what is registered, what is imported from one's own module, and what does not exist."""
 
+import math
+import subprocess
 import sys
 import textwrap
 import types
+from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -130,19 +133,49 @@ def mine(tmp_path, monkeypatch):
 
 def test_a_thing_is_registered_once():
     things = Registry("thing", example="module:name")
-    assert things.register("one", 1) == 1
-    assert things.find("one") == things["one"] == 1
+    assert things.register("one", abs) is abs
+    assert things.find("one") is things["one"] is abs
     with pytest.raises(ConfigError, match="there is a thing 'one' already"):
-        things.register("one", 2)
-    assert things.find("one") == 1
+        things.register("one", max)
+    with pytest.raises(ConfigError, match="there is a thing 'one' already"):
+        things.register_place("one", "builtins:max")
+    assert things.find("one") is abs
     assert list(things) == ["one"]
     assert len(things) == 1
+
+
+def test_a_place_is_imported_when_it_is_first_used(mine):
+    sys.path.append(str(Path.cwd()))
+    things = Registry("thing", example="module:name", expected="a plant")
+    things.register_place("late", f"{mine}:plant")
+    things.register("now", abs)
+    things.register_place("number", f"{mine}:NUMBER")
+    assert (list(things), len(things), "late" in things) == (["late", "now", "number"], 3, True)
+    assert mine not in sys.modules
+    assert things.find("late") is sys.modules[mine].plant is things["late"]
+    assert list(things) == ["late", "now", "number"]
+    with pytest.raises(ConfigError, match="thing 'number' is a int, not a plant"):
+        things.find("number")
+
+
+def test_no_link_is_imported_before_its_use():
+    code = "import sys; import retrim.config; print([m for m in sys.modules if m.startswith('retrim.plants.bridges.')])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("kind", REGISTRIES)
+def test_an_object_of_a_wrong_type_is_refused(kind):
+    with pytest.raises(ConfigError, match=rf"{kind} 'math:pi' is a float, not an? "):
+        REGISTRIES[kind].find("math:pi")
+    with pytest.raises(ConfigError, match=rf"{kind} 'pi' is a float, not an? "):
+        REGISTRIES[kind].register("pi", math.pi)
+    assert "pi" not in REGISTRIES[kind]
 
 
 @pytest.mark.parametrize("name", ["", "a:b", "a+b", "a=b", "a b", "a\n"])
 def test_names_that_cannot_be(name):
     with pytest.raises(ConfigError, match="must not be empty nor contain"):
-        Registry("thing", example="module:name").register(name, 1)
+        Registry("thing", example="module:name").register(name, abs)
 
 
 @pytest.mark.parametrize("kind", REGISTRIES)
@@ -164,10 +197,10 @@ def test_installed_packages_bring_names(monkeypatch):
 
     def entry_points(group):
         asked.append(group)
-        return [types.SimpleNamespace(name="theirs", load=lambda: "found")]
+        return [types.SimpleNamespace(name="theirs", load=lambda: abs)]
 
     monkeypatch.setattr(registry, "entry_points", entry_points)
-    assert VEHICLES.find("theirs") == "found"
+    assert VEHICLES.find("theirs") is abs
     assert asked == ["retrim.vehicles"]
 
 

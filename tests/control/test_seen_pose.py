@@ -9,8 +9,9 @@ from jax import lax, random
 
 from helpers import GOAL, first_order, random_state, replaced
 from retrim import ConfigError, Setup
-from retrim.config.baselines import BASELINES
+from retrim.config.baselines import baseline_request
 from retrim.config.methods import MethodRequest
+from retrim.control.baselines import BASELINES
 from retrim.control.pose_filtered import PoseFilteredController
 from retrim.physics import Command, PointMass, State, so3
 from retrim.physics.actuators import Lagged
@@ -29,7 +30,7 @@ def setup():
 
 def made(setup, name, **changed):
     """The baseline as tables fly it from keypoints."""
-    controller = MethodRequest(setup, None).by_state(BASELINES[name].controller(setup))
+    controller = MethodRequest(setup, None).by_state(BASELINES[name].controller(baseline_request(setup)))
     assert isinstance(controller, PoseFilteredController)
     return replaced(controller, observation=replaced(controller.observation, **changed))
 
@@ -94,4 +95,4 @@ def test_without_a_filter_there_is_no_state():
     with pytest.raises(
         ConfigError, match="'GeometricController' needs the state, and preset 'vision/ideal' shows keypoints"
     ):
-        MethodRequest(setup, None).by_state(BASELINES["geometric"].controller(setup))
+        MethodRequest(setup, None).by_state(BASELINES["geometric"].controller(baseline_request(setup)))

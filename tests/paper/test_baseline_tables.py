@@ -17,7 +17,7 @@ from commands import results, retrim
 from helpers import brief_preset, random_command, random_state, tiny_preset
 from retrim import ConfigError, PlantError, Setup
 from retrim.config import load, named_presets
-from retrim.config.baselines import BASELINES
+from retrim.control.baselines import BASELINES
 from retrim.evaluation import compute_cost as effort
 from retrim.runkit import Run, provenance
 from retrim.runkit.reporter import Silent
@@ -52,7 +52,7 @@ def test_settings_are_those_that_the_published_search_found(page, field):
 )
 def test_a_baseline_flies_with_the_settings_for_what_it_is_shown(preset, field):
     setup = Setup.from_preset(load(preset))
-    assert all(each.settings_for(setup) is getattr(each, field) for each in BASELINES.values())
+    assert all(each.settings_for(setup.flight_task) is getattr(each, field) for each in BASELINES.values())
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from ..config.disturbances import DISTURBANCES
 from ..config.faults import FAULTS, NO_FAULT
 from ..config.loading import changed, load_for, overlaid, with_vehicle
 from ..config.methods import METHODS
-from ..config.plants import DELAY, PLANTS, is_vehicle
+from ..config.plants import PLANTS, is_vehicle
 from ..config.presets import Family, Preset
 from ..config.references import REFERENCES
 from ..config.residuals import RESIDUALS
@@ -22,6 +22,7 @@ from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
 from ..io.trained import load_learner_state, load_policy
+from ..plants.entry import DELAY
 from .options import join_names, option
 
 

@@ -1,5 +1,7 @@
 """Configuration: presets, names and files, and the objects that they describe."""
 
+from ..plants.entry import PlantEntry as PlantEntry
+from ..plants.entry import PlantRequest as PlantRequest
 from .disturbances import disturbance as disturbance
 from .disturbances import register_disturbance as register_disturbance
 from .faults import register_fault as register_fault
@@ -16,8 +18,6 @@ from .networks import register_network as register_network
 from .online_learners import LearnerRequest as LearnerRequest
 from .online_learners import register_learner as register_learner
 from .online_learners import register_optimiser as register_optimiser
-from .plants import PlantEntry as PlantEntry
-from .plants import PlantRequest as PlantRequest
 from .plants import register_plant as register_plant
 from .presets import Preset as Preset
 from .references import register_reference as register_reference

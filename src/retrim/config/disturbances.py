@@ -21,7 +21,9 @@ DisturbanceFactory = Callable[[Key[Array, ""], float | None], Disturbance]
 GOAL_HEIGHT = 1.0  # [m], height of the default goal and of the built-in references
 SEED_TAG = 2**30 + 3  # folded into seeds, to keep disturbances from sharing keys with starts, learners or sensors
 
-DISTURBANCES: Registry[DisturbanceFactory] = Registry("disturbance", example="sums as wind+payload=0.1, or module:name")
+DISTURBANCES: Registry[DisturbanceFactory] = Registry(
+    "disturbance", example="sums as wind+payload=0.1, or module:name", expected="a function of a random key and a size"
+)
 register_disturbance = DISTURBANCES.register
 
 

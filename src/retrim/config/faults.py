@@ -28,7 +28,9 @@ NO_FAULT = "none"
 FaultFactory = Callable[[float | None], AbstractMeasurementFault | None]
 """Function that takes a size (or None for the default size) and returns a fault."""
 
-FAULTS: Registry[FaultFactory] = Registry("fault", example="module:name of a function of a size")
+FAULTS: Registry[FaultFactory] = Registry(
+    "fault", example="module:name of a function of a size", expected="a function of a size"
+)
 register_fault = FAULTS.register
 
 

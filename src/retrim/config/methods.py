@@ -10,6 +10,7 @@ from jax import random
 from jaxtyping import Array, Key
 
 from ..adapt.learner_state import LearnerState
+from ..control.baselines import BASELINES, Baseline
 from ..control.controller import AbstractController
 from ..control.integral import IntegralAction
 from ..control.lora import LoraPolicy
@@ -18,7 +19,7 @@ from ..control.pose_filtered import PoseFilteredController
 from ..errors import ConfigError
 from ..plants.plant import Plant
 from ..runtime.pilot import ControllerPilot, Pilot
-from .baselines import BASELINES, Baseline
+from .baselines import baseline_request
 from .families import identify_vehicle, policy_controller, track_actuators
 from .learners import check_frame, effective_gravity_frame
 from .registry import Registry
@@ -114,20 +115,14 @@ class MethodEntry:
         return plant if self.on_board is None else self.on_board(setup, plant)
 
 
-METHODS: Registry[MethodEntry] = Registry("method", example="module:name of a MethodEntry")
+METHODS: Registry[MethodEntry] = Registry(
+    "method",
+    example="module:name of a MethodEntry",
+    expected="a retrim.config.MethodEntry",
+    accepts=lambda thing: isinstance(thing, MethodEntry),
+)
 register_method = METHODS.register
-
-
-def find_method(name: str) -> MethodEntry:
-    """Return the entry of a method.
-
-    Raises:
-        ConfigError: There is no method with this name, or the registered object is not a :class:`MethodEntry`.
-    """
-    entry = METHODS.find(name)
-    if not isinstance(entry, MethodEntry):
-        raise ConfigError(f"method {name!r} is a {type(entry).__name__}, not a retrim.config.MethodEntry")
-    return entry
+find_method = METHODS.find
 
 
 def learning_method(label: str, learns: Prepare) -> MethodEntry:
@@ -173,7 +168,7 @@ def _identified(request: MethodRequest) -> Pilot:
 
 
 def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pilot:
-    return ControllerPilot(request.by_state(baseline.controller(request.setup, request.key), name))
+    return ControllerPilot(request.by_state(baseline.controller(baseline_request(request.setup, request.key)), name))
 
 
 def _full(request: MethodRequest) -> Pilot:

@@ -36,20 +36,10 @@ class NetworkRequest:
         return tuple(self.preset.pretrain.hidden_sizes)
 
 
-NETWORKS: Registry[Callable[[NetworkRequest], Any]] = Registry("network", example="module:name of a function")
+NETWORKS: Registry[Callable[[NetworkRequest], Any]] = Registry(
+    "network", example="module:name of a function", expected="a function of a NetworkRequest"
+)
 register_network = NETWORKS.register
-
-
-def find_network(name: str) -> Callable[[NetworkRequest], Any]:
-    """Return the function that builds a network.
-
-    Raises:
-        ConfigError: There is no network with this name, or the registered object is not a function.
-    """
-    make = NETWORKS.find(name)
-    if not callable(make):
-        raise ConfigError(f"network {name!r} is a {type(make).__name__}, not a function of a NetworkRequest")
-    return make
 
 
 def make_policy(request: NetworkRequest) -> AbstractPolicy:
@@ -61,7 +51,7 @@ def make_policy(request: NetworkRequest) -> AbstractPolicy:
         ConfigError: There is no such network, or the network does not map an observation to four numbers.
     """
     name = request.preset.pretrain.network
-    network = find_network(name)(request)
+    network = NETWORKS.find(name)(request)
     if isinstance(network, AbstractPolicy):
         return network
     if not (isinstance(network, eqx.Module) and callable(network)):

@@ -40,17 +40,16 @@ class LearnerRequest:
             ConfigError: The preset names an unknown optimiser, or contains settings that its task does not permit.
         """
         make = OPTIMISERS.find(self.preset.adapt.optimiser)
-        if not callable(make):
-            name = self.preset.adapt.optimiser
-            raise ConfigError(f"optimiser {name!r} is a {type(make).__name__}, not an AbstractPolicyOptimiser")
         result = learner_settings(self.preset, self.env, make)
         return kind(**{"env": self.env, "residual_model": self.model, **result, **settings})
 
 
-LEARNERS: Registry[Callable[[LearnerRequest], OnlineLearner]] = Registry("learner", example="module:name of a function")
+LEARNERS: Registry[Callable[[LearnerRequest], OnlineLearner]] = Registry(
+    "learner", example="module:name of a function", expected="a function of a LearnerRequest"
+)
 register_learner = LEARNERS.register
 OPTIMISERS: Registry[Callable[[Rate, Rate], AbstractPolicyOptimiser]] = Registry(
-    "optimiser", example="module:name of a class"
+    "optimiser", example="module:name of a class", expected="an AbstractPolicyOptimiser"
 )
 register_optimiser = OPTIMISERS.register
 
@@ -62,10 +61,7 @@ def make_learner(request: LearnerRequest) -> OnlineLearner:
         ConfigError: There is no such learner, or the function does not return an :class:`~retrim.OnlineLearner`.
     """
     name = request.preset.adapt.learner
-    make = LEARNERS.find(name)
-    if not callable(make):
-        raise ConfigError(f"learner {name!r} is a {type(make).__name__}, not a function that takes a LearnerRequest")
-    learner = make(request)
+    learner = LEARNERS.find(name)(request)
     if not isinstance(learner, OnlineLearner):
         raise ConfigError(f"learner {name!r} gives a {type(learner).__name__}, expected a retrim.OnlineLearner")
     return learner

@@ -20,7 +20,9 @@ from .presets import Track
 from .registry import Registry
 
 REFERENCES: Registry[Callable[[], Reference]] = Registry(
-    "reference", example="a CSV file of t, x, y, z, as my.csv or my.csv:once, or module:name"
+    "reference",
+    example="a CSV file of t, x, y, z, as my.csv or my.csv:once, or module:name",
+    expected="a function that gives a Reference",
 )
 for _name, _make in BUILT_IN.items():
     REFERENCES.register(_name, _make)

@@ -2,6 +2,7 @@
 
 A name is looked up among the registered objects, then among the entry points of installed packages. ``module:name`` is
 imported from the Python path or the current folder. Names from files and messages are first checked by :mod:`.trust`.
+Every object is checked when it is registered or found.
 """
 
 import importlib
@@ -9,7 +10,8 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -26,45 +28,73 @@ LIBRARIES = (
 """Path prefixes of files without user code."""
 
 
+@dataclass(frozen=True)
+class _Place:
+    """An object that has not been imported yet."""
+
+    name: str
+    """``module:name``."""
+
+    def load(self) -> Any:
+        module, _, attribute = self.name.partition(":")
+        return getattr(importlib.import_module(module), attribute)
+
+
 class Registry(Mapping[str, T], Generic[T]):
     """Objects of one kind, by name."""
 
-    def __init__(self, kind: str, *, example: str) -> None:
+    def __init__(
+        self, kind: str, *, example: str, expected: str = "a function", accepts: Callable[[Any], bool] = callable
+    ) -> None:
         """Build an empty registry.
 
         Args:
             kind: Kind of the objects, in the singular; the group of their entry points is ``retrim.<kind>s``.
             example: Example name of a custom object, for error messages.
+            expected: Type of the objects, for error messages.
+            accepts: Function that returns whether an object has this type.
         """
-        self._kind, self._example, self._known = kind, example, dict[str, T]()
+        self._kind, self._example, self._expected, self._accepts = kind, example, expected, accepts
+        self._known = dict[str, T | _Place]()
 
     def register(self, name: str, thing: T) -> T:
         """Add an object under a new name.
 
         Raises:
+            ConfigError: The name is already registered or contains forbidden characters, or the object is of a wrong
+                type.
+        """
+        self._check_name(name)
+        self._known[name] = self._checked(name, thing)
+        return thing
+
+    def register_place(self, name: str, place: str) -> None:
+        """Add an object that is imported when it is first used.
+
+        Args:
+            name: New name.
+            place: ``module:name`` of the object.
+
+        Raises:
             ConfigError: The name is already registered, or contains forbidden characters.
         """
-        if not name or any(sign in name for sign in ":+= \t\n"):
-            raise ConfigError(f"{self._kind} name {name!r} must not be empty nor contain ':', '+', '=' or spaces")
-        if name in self._known:
-            raise ConfigError(f"there is a {self._kind} {name!r} already")
-        self._known[name] = thing
-        return thing
+        self._check_name(name)
+        self._known[name] = _Place(place)
 
     def find(self, name: str) -> T:
         """Return the object with this name.
 
         Raises:
-            ConfigError: The name is unknown (the message suggests known names), or ``module:name`` cannot be imported.
+            ConfigError: The name is unknown (the message suggests known names), ``module:name`` cannot be imported, or
+                the object is of a wrong type.
         """
-        if name in self._known:
-            return self._known[name]
+        if name in self:
+            return self[name]
         if ":" in name:
-            return self._imported(name)
+            return self._checked(name, self._imported(name))
         for entry in self._entries():
             if entry.name == name:
-                result: T = entry.load()
-                return result
+                return self._checked(name, entry.load())
         known = (*self, *self.plugins())
         raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, known)}, or {self._example}")
 
@@ -75,7 +105,19 @@ class Registry(Mapping[str, T], Generic[T]):
     def _entries(self) -> Iterator[Any]:
         yield from entry_points(group=f"retrim.{self._kind}s")
 
-    def _imported(self, name: str) -> T:
+    def _check_name(self, name: str) -> None:
+        if not name or any(sign in name for sign in ":+= \t\n"):
+            raise ConfigError(f"{self._kind} name {name!r} must not be empty nor contain ':', '+', '=' or spaces")
+        if name in self:
+            raise ConfigError(f"there is a {self._kind} {name!r} already")
+
+    def _checked(self, name: str, thing: Any) -> T:
+        if not self._accepts(thing):
+            raise ConfigError(f"{self._kind} {name!r} is a {type(thing).__name__}, not {self._expected}")
+        result: T = thing
+        return result
+
+    def _imported(self, name: str) -> Any:
         module, _, attribute = name.partition(":")
         if not (all(part.isidentifier() for part in module.split(".")) and attribute.isidentifier()):
             raise ConfigError(f"no {self._kind} {excerpt(name)}; a Python name is as module:name")
@@ -83,17 +125,23 @@ class Registry(Mapping[str, T], Generic[T]):
         if here not in sys.path:
             sys.path.append(here)
         try:
-            result: T = getattr(importlib.import_module(module), attribute)
+            return getattr(importlib.import_module(module), attribute)
         except Exception as error:  # a user's module can raise any exception
             raise ConfigError(f"{self._kind} {name!r} cannot be imported: {type(error).__name__}: {error}") from error
-        return result
 
     def __getitem__(self, name: str) -> T:
         """Return the object that is registered under ``name``."""
-        return self._known[name]
+        thing = self._known[name]
+        if isinstance(thing, _Place):
+            thing = self._known[name] = self._checked(name, thing.load())
+        return thing
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a registered object with this name; nothing is imported."""
+        return name in self._known
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the registered names."""
+        """Iterate over the registered names; nothing is imported."""
         return iter(self._known)
 
     def __len__(self) -> int:

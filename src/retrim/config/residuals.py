@@ -26,7 +26,12 @@ class ResidualRequest:
     vehicle: Vehicle
 
 
-RESIDUALS: Registry[Callable[[ResidualRequest], ResidualModel]] = Registry("residual", example="module:name")
+RESIDUALS: Registry[Callable[[ResidualRequest], ResidualModel]] = Registry(
+    "residual",
+    example="module:name",
+    expected="a function of a ResidualRequest",
+    accepts=lambda thing: callable(thing) or isinstance(thing, ResidualModel),
+)
 register_residual = RESIDUALS.register
 
 

@@ -1,16 +1,16 @@
 """The scenario of a flight: plant, vehicle, sensors and disturbances."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 from ..errors import ConfigError, RetrimError
 from ..physics.command_path import LONGEST_DELAY
 from ..physics.disturbance import Disturbance, for_vehicle
 from ..physics.vehicle import Vehicle
+from ..plants.entry import DELAY, PlantEntry, PlantRequest
 from ..plants.plant import Plant
 from .disturbances import disturbance
 from .faults import NO_FAULT, measurement_fault
-from .plants import DELAY, PlantEntry, PlantRequest, find_plant
+from .plants import find_plant
 from .sensors import SENSORS
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle, name_of, vehicle_from
@@ -83,19 +83,7 @@ class Scenario:
     @property
     def entry(self) -> PlantEntry:
         """Registry entry of the plant."""
-        entry: Any = find_plant(self.plant)[0]
-        if isinstance(entry, PlantEntry):
-            return entry
-        if not callable(entry):
-            raise ConfigError(f"plant {self.plant!r} is a {type(entry).__name__}, not a function of a PlantRequest")
-        return PlantEntry(
-            entry,
-            about=(entry.__doc__ or self.plant).strip().splitlines()[0],
-            has_sensors=True,
-            has_faults=True,
-            has_thrust_error=True,
-            has_delay=True,
-        )
+        return find_plant(self.plant)[0]
 
     def without_numbers(self) -> tuple["Scenario", tuple[str, ...]]:
         """Return the scenario without the numbers that leave the program unchanged: vehicle, delay and thrust error.

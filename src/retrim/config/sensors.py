@@ -5,7 +5,9 @@ from collections.abc import Callable
 from ..plants.sensors import SensorModel
 from .registry import Registry
 
-SENSORS: Registry[Callable[[], SensorModel | None]] = Registry("sensor", example="module:name")
+SENSORS: Registry[Callable[[], SensorModel | None]] = Registry(
+    "sensor", example="module:name", expected="a function that returns a SensorModel"
+)
 SENSORS.register("ideal", lambda: None)
 SENSORS.register(
     "mocap",

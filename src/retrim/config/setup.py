@@ -41,7 +41,7 @@ from .families import identify_vehicle, make_family, policy_controller, track_ac
 from .initialisers import flight_starts, low_rank
 from .learners import effective_gravity_frame, nominal_model, pretraining_optimiser
 from .loading import load
-from .networks import NetworkRequest, find_network, make_policy
+from .networks import NETWORKS, NetworkRequest, make_policy
 from .online_learners import LearnerRequest, make_learner
 from .presets import Preset
 from .presets import Track as TrackTable
@@ -97,7 +97,7 @@ class Setup:
         preset, entry = delayed(preset), find_task(preset.task)
         if reference is not None and not entry.has_reference:
             raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows none")
-        find_network(preset.pretrain.network)
+        NETWORKS.find(preset.pretrain.network)
         vehicle = make_vehicle(preset.vehicle)
         table = preset.track or TrackTable()
         trained_on = make_training_reference(table) if entry.has_reference else None

@@ -113,7 +113,12 @@ class TaskEntry:
     """Whether the task tracks a reference."""
 
 
-TASKS: Registry[TaskEntry] = Registry("task", example="module:name of a TaskEntry")
+TASKS: Registry[TaskEntry] = Registry(
+    "task",
+    example="module:name of a TaskEntry",
+    expected="a function of a TaskRequest",
+    accepts=lambda thing: callable(thing) or isinstance(thing, TaskEntry),
+)
 register_task = TASKS.register
 
 
@@ -124,11 +129,7 @@ def find_task(name: str) -> TaskEntry:
         ConfigError: The task does not exist, or ``module:name`` is neither an entry nor a function.
     """
     entry: Any = TASKS.find(name)
-    if isinstance(entry, TaskEntry):
-        return entry
-    if not callable(entry):
-        raise ConfigError(f"task {name!r} is a {type(entry).__name__}, not a function of a TaskRequest")
-    return TaskEntry(entry)
+    return entry if isinstance(entry, TaskEntry) else TaskEntry(entry)
 
 
 def make_task(request: TaskRequest) -> AbstractTask:

@@ -9,7 +9,9 @@ from .registry import Registry
 from .vehicle_file import VehicleSpec, check_flyable, read_vehicle
 
 VEHICLES: Registry[Callable[[], Vehicle]] = Registry(
-    "vehicle", example="a vehicle file, as my_quad.toml, or module:name"
+    "vehicle",
+    example="a vehicle file, as my_quad.toml, or module:name",
+    expected="a function that returns a Vehicle",
 )
 PUBLISHED = {"small": small, "large": large, "kingfisher": kingfisher}
 for _name, _make in PUBLISHED.items():

@@ -13,8 +13,9 @@ import numpy as np
 from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY
+from .entry import PlantEntry
 from .external import ExternalPlant, Pose, thrust_limits, whole_steps
-from .extras import import_extra
+from .extras import check_extra, import_extra
 
 DRONE = "cf21B_500"
 FREQUENCY = 500  # [Hz], rate of the dynamics and of the rate loop
@@ -133,3 +134,11 @@ def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffe
 
     thrusts = sim.load_dynamics_params(dynamics, drone)
     return data, fly, np.array([thrusts["thrust_min"], thrusts["thrust_max"]], dtype=np.float64)
+
+
+entry = PlantEntry(
+    lambda request: CrazyflowPlant(request.disturbance, dt=request.dt),
+    "crazyflow's identified Crazyflie, one tick of command delay",
+    own_vehicle=DRONE,
+    needs=lambda: check_extra("crazyflow", "crazyflow"),
+)

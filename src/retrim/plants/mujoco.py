@@ -10,8 +10,9 @@ from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.substep import SIGNS
 from ..physics.vehicle import Vehicle
+from .entry import PlantEntry
 from .external import ExternalPlant, Pose, whole_steps
-from .extras import import_extra
+from .extras import check_extra, import_extra
 from .plant import as_numpy
 
 STEP = 2e-3  # [s]
@@ -120,3 +121,10 @@ class MujocoPlant(ExternalPlant):
 
 def _numbers(values: np.ndarray) -> str:
     return " ".join(repr(float(v)) for v in values)
+
+
+entry = PlantEntry(
+    lambda request: MujocoPlant(request.vehicle, request.disturbance, dt=request.dt),
+    "a body in MuJoCo's medium, one tick of command delay",
+    needs=lambda: check_extra("mujoco", "mujoco"),
+)

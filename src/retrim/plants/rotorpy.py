@@ -8,8 +8,9 @@ from ..errors import PlantError
 from ..physics.disturbance import Disturbance
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY
+from .entry import PlantEntry
 from .external import ExternalPlant, Pose, thrust_limits
-from .extras import import_extra
+from .extras import check_extra, import_extra
 
 RATE_GAIN = 20.0  # [1/s]; with rotorpy's own default, 1 1/s, the rates lag by a second
 STEPS = 2  # rotorpy's rate loop runs once per integrator step: at 100 Hz, as in its own simulations
@@ -47,3 +48,11 @@ class RotorpyPlant(ExternalPlant):
             self._state = quad.step(self._state, command, self.dt / STEPS)
         attitude = self._rotation.from_quat(self._state["q"]).as_matrix()
         return Pose(self._state["x"], attitude, self._state["v"], self._state["w"])
+
+
+entry = PlantEntry(
+    lambda request: RotorpyPlant(request.disturbance, dt=request.dt),
+    "rotorpy's aerodynamics, motors and rate loop, one tick of command delay",
+    own_vehicle="hummingbird",
+    needs=lambda: check_extra("rotorpy", "rotorpy"),
+)

@@ -2,9 +2,10 @@
 
 import jax.numpy as jnp
 
-from retrim.config.baselines import L1_POLE, prediction_of
+from retrim.config.baselines import prediction_of
 from retrim.config.methods import MethodEntry, MethodRequest
 from retrim.config.setup import Setup
+from retrim.control.baselines import L1_POLE
 from retrim.errors import ConfigError
 from retrim.estimation.l1 import L1Estimator
 from retrim.runtime.pilot import ControllerPilot, Pilot

@@ -6,8 +6,9 @@ from typing import Any
 
 from jax import random
 
-from retrim.config.baselines import BASELINES
+from retrim.config.baselines import baseline_request
 from retrim.config.setup import Setup
+from retrim.control.baselines import BASELINES
 from retrim.errors import ConfigError
 from retrim.evaluation.compute_cost import decision_s, updates
 from retrim.evaluation.study import table_presets
@@ -81,7 +82,7 @@ def efficiency(
         if run.interrupted:
             break
         with run.interruptible():
-            rows.append({"method": name, "decision_s": decision_s(setup, baseline.controller(setup, random.key(0)))})
+            rows.append({"method": name, "decision_s": decision_s(setup, baseline.controller(baseline_request(setup)))})
     if not run.interrupted:
         watch = Stopwatch()
         with tempfile.TemporaryDirectory() as folder:  # always trained anew, even if the run's folder has the network

@@ -7,12 +7,12 @@ from typing import Any
 
 from jax import random
 
-from retrim.config.baselines import BASELINES
 from retrim.config.loading import dump
 from retrim.config.methods import find_method
 from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
+from retrim.control.baselines import BASELINES
 from retrim.evaluation.figures import picture
 from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.metrics import cell, metres, rows

@@ -7,11 +7,12 @@ from typing import Any, Literal
 import numpy as np
 from jax import random
 
-from retrim.config.baselines import BASELINES, Baseline, Settings
+from retrim.config.baselines import baseline_request
 from retrim.config.loading import load
 from retrim.config.methods import MethodRequest
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
+from retrim.control.baselines import BASELINES, Baseline, Settings
 from retrim.errors import ConfigError
 from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.plants.sim import SimPlant
@@ -97,7 +98,10 @@ def tuning(
         if run.interrupted:
             break
         baseline = BASELINES[name]
-        tried = [dict(baseline.settings_for(setups[0])), *_drawn(baseline, -(-candidates // baseline.cost), seed)]
+        tried = [
+            dict(baseline.settings_for(setups[0].flight_task)),
+            *_drawn(baseline, -(-candidates // baseline.cost), seed),
+        ]
         with contextlib.suppress(FlightStopped), run.interruptible(), reporter.progress(name) as advance:
             scores = np.zeros(len(tried))
             for i, (setup, (_, disturbed, sensors, reference)) in enumerate(zip(setups, conditions, strict=True)):
@@ -138,7 +142,9 @@ def _flown(
     if len(plants) < len(made):
         raise ConfigError(f"plant {scenario.plant!r}: candidates are flown as one batch, which bem and simple can be")
     pilots = [
-        ControllerPilot(MethodRequest(setup, None).by_state(baseline.make(setup, settings, spec.key())))
+        ControllerPilot(
+            MethodRequest(setup, None).by_state(baseline.make(baseline_request(setup, spec.key()), settings))
+        )
         for settings in tried
         for spec in specs
     ]

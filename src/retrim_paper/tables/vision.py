@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from retrim.config.baselines import BASELINES
 from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
+from retrim.control.baselines import BASELINES
 from retrim.errors import ConfigError
 from retrim.evaluation.study import table_presets
 from retrim.runkit.document import Document

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...errors import PlantError
+from ...errors import ConfigError, PlantError
 from ...physics.bem import BemQuadrotor
 from ...physics.disturbance import Disturbance
 from ...physics.so3 import rotz
 from ...physics.state import STANDARD_GRAVITY, State
+from ..entry import PlantEntry, PlantRequest
 from .betaflight_firmware import Firmware, find_firmware
 from .betaflight_wire import IDLE, throttle_of
 from .betaflight_world import World
@@ -121,3 +122,24 @@ class BetaflightPlant(VehiclePlant):
     def _throttle(self, c: float) -> float:
         """Return the throttle for the thrust per mass ``c``, from the thrust map that the companion assumes."""
         return max(1e-3, throttle_of(float(self._motor(jnp.asarray(max(c, 0.0))))))
+
+
+def _make(request: PlantRequest) -> BetaflightPlant:
+    model = BemQuadrotor.of(request.vehicle, request.dt, thrust_error=request.thrust_error)
+    return BetaflightPlant(model, request.disturbance, *request.limits)
+
+
+def _check_address(address: str) -> None:
+    if address:
+        raise ConfigError(f"plant 'betaflight' has no address, and {address!r} is one too many")
+
+
+entry = PlantEntry(
+    _make,
+    "Betaflight's firmware as the rate controller of blade-element rotors, in real time",
+    has_thrust_error=True,
+    is_vehicle=True,
+    has_world=True,
+    check_address=_check_address,
+    needs=find_firmware,
+)

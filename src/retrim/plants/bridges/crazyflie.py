@@ -6,6 +6,7 @@ import time
 import numpy as np
 
 from ...errors import ConfigError, PlantError
+from ..entry import PlantEntry
 from . import crtp
 from .crazyflie_link import CrazyflieLink
 from .endpoint import UdpEndpoint, address_of, address_towards
@@ -196,3 +197,11 @@ def check_address(address: str) -> str:
     if address_of(address or ADDRESS)[0] != "udp":
         raise ConfigError(f"address {address!r}: a Crazyflie is reached by udp:HOST:PORT, as {ADDRESS}")
     return address or ADDRESS
+
+
+entry = PlantEntry(
+    lambda request: CrazyfliePlant(request.address, request.dt, *request.limits),
+    "a Crazyflie, or a simulated one, by CRTP over UDP",
+    is_vehicle=True,
+    check_address=check_address,
+)

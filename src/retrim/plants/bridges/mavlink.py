@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...errors import ConfigError, PlantError
+from ..entry import PlantEntry
+from ..extras import check_extra
 from .endpoint import address_of, open_endpoint
 from .frames import heading_of
 from .linked_plant import LinkedPlant, ThrustScale
@@ -181,3 +183,12 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
     def notes(self) -> Sequence[str]:
         """Kinds of ignored messages from the vehicle."""
         return () if self._link is None else tuple(self._link.notes)
+
+
+entry = PlantEntry(
+    lambda request: MavlinkPlant(request.address, request.dt, *request.limits),
+    "a vehicle, or a simulation, that PX4 flies",
+    is_vehicle=True,
+    check_address=lambda address: address_of(address or ADDRESS),
+    needs=lambda: check_extra("pymavlink", "mavlink", package="pymavlink"),
+)

@@ -7,6 +7,8 @@ import time
 import numpy as np
 
 from ...errors import ConfigError, PlantError
+from ...rospy_node import system_module
+from ..entry import PlantEntry, PlantRequest
 from .frames import heading_of
 from .linked_plant import LinkedPlant
 from .polling import KeepOn
@@ -115,3 +117,17 @@ def parts_of(address: str) -> tuple[str, str]:
     if result is None or not 0 < int(result["master"].rpartition(":")[2]) < 65_536:
         raise ConfigError(f"address {address!r}: expected HOST:PORT of a rosmaster, with /NAMESPACE or without")
     return result["master"], result["namespace"] or NAMESPACE
+
+
+def _make(request: PlantRequest) -> RosPlant:
+    vehicle = request.vehicle
+    return RosPlant(request.address, request.dt, *request.limits, float(vehicle.thrust_max / vehicle.mass))
+
+
+entry = PlantEntry(
+    _make,
+    "a vehicle behind ROS 1: odometry or poses in, attitude targets out, as mavros has them",
+    is_vehicle=True,
+    check_address=parts_of,
+    needs=lambda: system_module("rospy"),
+)
