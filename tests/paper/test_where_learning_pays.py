@@ -6,6 +6,8 @@ import pytest
 from retrim.config.methods import find_method
 from retrim.errors import ConfigError
 from retrim.evaluation.study import refuse_misfits
+from retrim.runkit import Run
+from retrim.runkit.reporter import Silent
 from retrim_paper.tables.where_learning_pays import OPPONENTS, _cell, _methods, decide, regimes, where_learning_pays
 
 NONE_LOST = dict.fromkeys((*OPPONENTS, "adapted"), 0)
@@ -58,6 +60,6 @@ def test_every_regime_can_be_flown(row):
 
 
 @pytest.mark.parametrize("options", [{"only": ("S99",)}, {"columns": ("PID",)}])
-def test_wrong_names_are_refused_before_training(options):
+def test_wrong_names_are_refused_before_training(tmp_path, options):
     with pytest.raises(ConfigError, match="there are"):
-        where_learning_pays(None, None, **options)
+        where_learning_pays(Run("reproduce", tmp_path), Silent(), **options)
