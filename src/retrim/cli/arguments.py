@@ -80,6 +80,7 @@ FAULT = (
     f"Fault of the measurements, unknown to the policy (bem, simple, second-order): {join_names(FAULTS)}. A size may "
     "follow, as in late=3. Or module:name."
 )
+MEMORY = "Folder of a place, with the map (--residual place) of each vehicle for its next flight at this place."
 METHOD = (
     f"Method of the flight: none, {join_names(f'{name} ({METHODS[name].label})' for name in METHODS)}; "
     f"{join_names(METHODS.plugins())} of installed packages; or module:name."
@@ -99,6 +100,7 @@ class FlightArguments:
     thrust_error: Annotated[float, option(THRUST)] = THRUST_ERROR
     delay: Annotated[float, option(LATE)] = DELAY
     fault: Annotated[str, option(FAULT)] = NO_FAULT
+    memory: Annotated[Path | None, option(MEMORY, optional=True)] = None
 
     @property
     def is_vehicle(self) -> bool:

@@ -17,6 +17,7 @@ from ..evaluation.fleet import Fleet
 from ..evaluation.flight_table import figure_cells, figure_columns
 from ..evaluation.metrics import notes, rows
 from ..runkit.document import TableSection
+from ..runkit.flight_memory import FlightMemory, recall_flight
 from ..runkit.flights import Flight
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
@@ -80,19 +81,22 @@ def fly(
             preset = same_policy(preset, overlaid(preset, config, trust=trust), config)
         preset = with_residual(preset, residual, state)
         scenario = flight.scenario(preset)
+        setup, say = Setup.from_preset(preset, scenario.reference), RichReporter().say
+        memory, state = recall_flight(flight.memory, setup, scenario, weights, state, adapt, seed, say)
         methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)
         fleet = Fleet(
             preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,
             state=state,
         )  # fmt: skip
-        run, setup = started(Run("fly", out, stop=stop)), fleet.setups[scenario.reference]
+        run = started(Run("fly", out, stop=stop))
         _warn(setup, scenario)
-        return _fly(fleet, setup, scenario, run, save_vehicle)
+        return _fly(fleet, scenario, run, save_vehicle, memory)
 
     return ordered
 
 
-def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file: Path | None) -> int:
+def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, memory: FlightMemory | None) -> int:
+    setup = fleet.setups[scenario.reference]
     flights = list[Flight]()  # a Ctrl-C may come before the first flight ends
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
@@ -105,6 +109,7 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file:
         outlet.write_flights(flights, preset)
         drawn = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []
         results = outlet.write_results(run, result, seeds=list(fleet.policies), preset=preset.name)
+        memories = memory.write(flights, setup) if memory else []
     n, steady = result[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
     title = f"{preset.task} error, last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
     title += f", plant {scenario.plant}, sensors {scenario.sensors}"
@@ -113,7 +118,7 @@ def _fly(fleet: Fleet, setup: Setup, scenario: Scenario, run: Run, vehicle_file:
     for note in notes(flights, preset):
         console.print(note, markup=False, soft_wrap=True)
     saved, code = save_flight_vehicle(flights[-1], setup, vehicle_file)
-    show_paths([*drawn, *([] if results is None else [results]), *saved])
+    show_paths([*drawn, *([] if results is None else [results]), *saved, *memories])
     return run.exit_code or max((code, *(refuse(fault) for fault in outlet.faults)))
 
 

@@ -24,6 +24,7 @@ from ..live.operator.page_opening import open_page
 from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runkit.document import TableSection
+from ..runkit.flight_memory import FlightMemory, recall_flight
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import train
@@ -110,17 +111,18 @@ def live(
             if run.interrupted:
                 console.print(f"interrupted while pretraining, after {len(losses)} steps; nothing has flown")
                 return INTERRUPTED
+        memory, state = recall_flight(flight.memory, setup, scenario, weights, state, adapt, seed, RichReporter().say)
         request = LiveRequest(
             setup, weights, scenario, "base" if adapt == "none" else adapt, seconds or LONGEST, seed, fence, run.folder,
             state, address, ground, policy_age=policy_age or float("inf"), record=record, until_stopped=seconds is None,
         )  # fmt: skip
         with interrupts_only_set(run.stop):  # a Ctrl-C must land the vehicle, not end the processes
-            return _fly(request, run, save_vehicle)
+            return _fly(request, run, save_vehicle, memory)
 
     return ordered
 
 
-def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None) -> int:
+def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None, memory: FlightMemory | None) -> int:
     """Run one flight and show its results."""
     done = fly_live(request, run, RichReporter(), _display, lambda url: _open_page(url, run.folder))
     if done is None:
@@ -129,7 +131,7 @@ def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None) -> int:
     drawn = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     saved, code = save_flight_vehicle(done.flight, setup, vehicle_file)
-    show_paths([*(drawn or [])[:1], *done.paths, *saved])
+    show_paths([*(drawn or [])[:1], *done.paths, *saved, *(memory.write(flights, setup) if memory else [])])
     codes = [refuse(fault) for fault in done.outlet.faults]
     return run.exit_code or max(codes, default=int(not done.landed)) or code
 

@@ -19,7 +19,9 @@ class ResidualModel(Protocol):
     the bias and lag of the body rates has a method ``turning``, which maps its state to a
     :class:`~retrim.learn.residuals.rates.RateFit`. A model that quantifies its uncertainty has a method ``spread``,
     which takes the arguments of ``predict`` and returns one standard deviation per axis [m/s^2]. A model with a part
-    that depends on position has a method ``at_place``, which maps its state and a position [m] to this part [m/s^2].
+    that depends on position has a method ``at_place``, which maps its state and a position [m] to this part [m/s^2]. A
+    model that remembers over flights has a method ``recall``, which maps the state at the end of a flight to the state
+    at the start of the next one.
     """
 
     def init(self, key: Key[Array, ""]) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import lax, random
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ...physics.state import Command, State, where
@@ -23,6 +23,7 @@ CENTRES = 192  # number of bumps; the least recently visited one is replaced
 SPACING = 0.7  # distance between centres along the path [lengths]
 WANDER = 0.3  # [m/s^2], random walk of the part that does not depend on position, in one second
 EVIDENCE = 20.0  # [m^2/s^4], sum over rows of the squared prediction, after which the evidence for the map is 1/e
+RECALLED = 2.0  # [m^2/s^4], evidence for the map of an earlier flight
 DOUBT = 1.0  # [m^2/s^4], prior evidence against the map
 
 
@@ -151,6 +152,18 @@ class PlaceModel(eqx.Module):
             p: Position, world [m].
         """
         return state.share * (self._bumps(state.map, p[None])[0] @ state.map.weights[:-1])
+
+    def recall(self, state: PlaceState) -> PlaceState:
+        """Return the state for the start of a flight, given the state at the end of an earlier one.
+
+        The map remains, with little evidence for it, since the place may have changed: a few rows of flight decide
+        whether it is used. The model with the short memory starts anew.
+
+        Args:
+            state: State at the end of the earlier flight.
+        """
+        evidence = jnp.where(state.share > 0.5, RECALLED, 0.0).astype(state.agreement.dtype)
+        return dataclasses.replace(state, first=self.first.init(random.key(0)), agreement=evidence, prediction=evidence)
 
     def turning(self, state: PlaceState) -> RateFit | None:
         """Return the bias and lag of the body rates, if the first model identifies them."""

@@ -1,0 +1,149 @@
+"""Memory between flights: the map of earlier flights of the same vehicle, in a folder that stands for a place.
+
+A file contains only the state of the residual model, which is data. The policy of the next flight is the one that its
+command names, since a policy that was adapted to other conditions may be worse than the pretrained one.
+"""
+
+import dataclasses
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import random
+from jaxtyping import Array, Key
+
+from ..adapt.learner_state import LearnerState
+from ..config.methods import find_method
+from ..config.scenario import Scenario
+from ..config.setup import Setup
+from ..control.policy import AbstractPolicy
+from ..errors import CheckpointError, ConfigError, MessageError
+from ..io.files import read_bounded, write_whole
+from ..io.releases import this_release
+from ..io.sanity import check_size
+from ..transport import wire
+from .flights import Flight
+
+KIND = "memory"
+MOST = 1e12  # largest number in a file
+MEMORY_TAG = 2**30 + 7  # folded into the seed of a flight for the parts of the state that are not remembered
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightMemory:
+    """The memory of one vehicle at one place."""
+
+    folder: Path
+    """Folder of the place."""
+    vehicle: str
+    """Name of the vehicle."""
+
+    def path(self, setup: Setup) -> Path:
+        """Return the file for a set-up: one for each vehicle, residual model and control period."""
+        preset = setup.preset
+        name = f"{self.vehicle}_{preset.adapt.residual}_{1000 * preset.dt:g}ms"
+        return self.folder / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name)}.safetensors"
+
+    def state(self, setup: Setup, policy: AbstractPolicy, method: str, seed: int) -> LearnerState | None:
+        """Return the learner state at the start of the next flight; None if there is no earlier flight.
+
+        Args:
+            setup: Set-up of the flight.
+            policy: Policy of the flight.
+            method: Method of the flight, which must learn.
+            seed: Seed of the flight.
+
+        Raises:
+            ConfigError: The method does not learn, or the residual model remembers nothing beyond a flight.
+            CheckpointError: The file is damaged, or belongs to a different model.
+        """
+        recall = _recall(setup)
+        learns = find_method(method).learns
+        if learns is None:
+            raise ConfigError(f"a memory needs a method that learns, such as full; {method!r} does not")
+        if not (path := self.path(setup)).exists():
+            return None
+        key: Key[Array, ""] = random.fold_in(random.key(seed), MEMORY_TAG)
+        like = jax.eval_shape(setup.learner.residual_model.init, key)
+        try:
+            residual: Any = wire.unpack(read_bounded(path, "a flight writes it"), like, kind=KIND, source=str(path))
+        except MessageError as error:
+            raise CheckpointError(f"{error}; remove the file to fly without it") from error
+        check_size(residual, source=str(path), largest=MOST)
+        fresh = setup.learner.init(learns(setup, policy, key), key)
+        return dataclasses.replace(fresh, residual=recall(residual))
+
+    def describe(self, setup: Setup) -> str:
+        """Return one line about the memory and its age."""
+        path = self.path(setup)
+        if not path.exists():
+            return f"memory: no earlier flight of {self.vehicle} in {self.folder}"
+        hours = (time.time() - path.stat().st_mtime) / 3600.0
+        return f"memory: {path}, written {hours:.1f} h ago"
+
+    def write(self, flights: Sequence[Flight], setup: Setup) -> list[Path]:
+        """Write the memory after the first flight that learned and was not terminated; return the file, if any.
+
+        Args:
+            flights: Flights of one set-up.
+            setup: Set-up of the flights.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        state = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
+        if state is None:
+            return []
+        about = {"vehicle": self.vehicle, "residual": setup.preset.adapt.residual, "version": this_release()}
+        path = self.path(setup)
+        write_whole(path, wire.pack(state.residual, kind=KIND, about=about))
+        return [path]
+
+
+def recall_flight(
+    folder: Path | None,
+    setup: Setup,
+    scenario: Scenario,
+    policy: AbstractPolicy,
+    state: LearnerState | None,
+    method: str,
+    seed: int,
+    say: Callable[[str], None],
+) -> tuple[FlightMemory | None, LearnerState | None]:
+    """Return the memory of a place, and the learner state at the start of the flight.
+
+    Args:
+        folder: Folder of the place; None for a flight without memory.
+        setup: Set-up of the flight.
+        scenario: Scenario of the flight, with its vehicle.
+        policy: Policy of the flight.
+        state: Learner state from which the flight resumes; None for an untrained one.
+        method: Method of the flight.
+        seed: Seed of the flight.
+        say: Function that receives a line about the memory and its age.
+
+    Raises:
+        ConfigError: The flight resumes a learner state, or learns nothing that can be remembered.
+        CheckpointError: The memory is damaged.
+    """
+    if folder is None:
+        return None, state
+    if state is not None:
+        raise ConfigError("--memory and --resume: choose one, since each has a residual model of its own")
+    memory = FlightMemory(folder, scenario.vehicle_name(setup.preset.vehicle))
+    state = memory.state(setup, policy, method, seed)
+    say(memory.describe(setup))
+    return memory, state
+
+
+def _recall(setup: Setup) -> Callable[[Any], Any]:
+    recall: Callable[[Any], Any] | None = getattr(setup.learner.residual_model, "recall", None)
+    if recall is None:
+        raise ConfigError(
+            f"residual {setup.preset.adapt.residual!r} has a memory of seconds, and nothing to keep for the next "
+            "flight; use --residual place"
+        )
+    return recall

@@ -1,0 +1,120 @@
+"""Memory between flights: the next flight starts with the map, and a wrong or damaged memory is harmless."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+
+from helpers import tiny_preset
+from retrim.config.scenario import Scenario
+from retrim.config.setup import Setup
+from retrim.errors import CheckpointError, ConfigError
+from retrim.runkit.flight_memory import FlightMemory
+from retrim.runkit.flights import Flight, FlightSpec
+from retrim.runtime.flight import Log, States
+
+GOAL = (0.0, 0.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return Setup.from_preset(tiny_preset(adapt={"residual": "place"}))
+
+
+@pytest.fixture(scope="module")
+def policy(setup):
+    return setup.new_policy(random.key(0))
+
+
+@pytest.fixture(scope="module")
+def state(setup, policy):
+    """A learner state whose map has one bump at the goal."""
+    fresh = setup.learner.init(policy, random.key(1))
+    place_map, dtype = fresh.residual.map, fresh.residual.agreement.dtype
+    learned = dataclasses.replace(
+        place_map,
+        centres=place_map.centres.at[0].set(jnp.array(GOAL)),
+        visited=place_map.visited.at[0].set(3),
+        weights=place_map.weights.at[0].set(jnp.array([0.0, 0.0, -2.0])),
+    )
+    evidence = jnp.array(15.0, dtype=dtype)
+    residual = dataclasses.replace(fresh.residual, map=learned, agreement=evidence, prediction=evidence)
+    return dataclasses.replace(fresh, residual=residual)
+
+
+def flight(learnt, terminated=False):
+    """A flight of two rows with a learner state at its end."""
+    states = States(np.zeros((2, 3)), np.stack([np.eye(3)] * 2), np.zeros((2, 3)))
+    log = Log(np.array([0.0, 0.02]), states, states, np.zeros((2, 4)), 0.02, terminated)
+    return Flight(FlightSpec(Scenario(), "full", 0), "small", log, np.zeros(2), "error", 0.02, learnt=learnt)
+
+
+def at_goal(setup, state):
+    return np.asarray(setup.learner.residual_model.at_place(state.residual, jnp.array(GOAL)))
+
+
+def test_the_next_flight_starts_with_the_map(tmp_path, setup, policy, state):
+    memory = FlightMemory(tmp_path / "hall", "small")
+    assert memory.state(setup, policy, "full", 0) is None
+    assert "no earlier flight" in memory.describe(setup)
+    (file,) = memory.write([flight(state)], setup)
+    assert file.parent == tmp_path / "hall"
+    assert "0.0 h ago" in memory.describe(setup)
+    start = memory.state(setup, policy, "full", 0)
+    before, after = at_goal(setup, state)[2], at_goal(setup, start)[2]
+    assert before < after < 0.5 * before  # a part of the force, until rows of the new flight agree
+    jax.tree.map(np.testing.assert_array_equal, start.residual.map, state.residual.map)
+
+
+@pytest.mark.parametrize("method", ["full", "lora"])
+def test_the_state_has_the_shapes_of_a_new_one(tmp_path, setup, policy, state, method):
+    memory = FlightMemory(tmp_path, "small")
+    memory.write([flight(state)], setup)
+    recalled = memory.state(setup, policy, method, 0)
+    pilot = setup.pilot(policy, method, random.key(1))
+    assert jax.tree.map(jnp.shape, recalled) == jax.tree.map(jnp.shape, pilot.state)
+
+
+def test_each_vehicle_has_its_own_memory(tmp_path, setup, policy, state):
+    FlightMemory(tmp_path, "small").write([flight(state)], setup)
+    assert FlightMemory(tmp_path, "large").state(setup, policy, "full", 0) is None
+
+
+def test_a_map_without_evidence_remains_unused(setup, state):
+    model = setup.learner.residual_model
+    doubtful = dataclasses.replace(state.residual, agreement=jnp.zeros_like(state.residual.agreement))
+    assert float(model.recall(doubtful).share) == 0.0
+
+
+def test_lost_flights_leave_no_memory(tmp_path, setup, state):
+    memory = FlightMemory(tmp_path, "small")
+    assert memory.write([flight(state, terminated=True), flight(None)], setup) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-9], lambda data: b"MZ" + data[2:], lambda data: b""])
+def test_a_damaged_memory_is_refused_in_one_line(tmp_path, setup, policy, state, damage):
+    memory = FlightMemory(tmp_path, "small")
+    (file,) = memory.write([flight(state)], setup)
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(CheckpointError) as error:
+        memory.state(setup, policy, "full", 0)
+    assert "\n" not in str(error.value)
+
+
+def test_a_model_with_a_short_memory_is_refused(tmp_path, policy):
+    setup = Setup.from_preset(tiny_preset(adapt={"residual": "regression"}))
+    with pytest.raises(ConfigError, match="--residual place"):
+        FlightMemory(tmp_path, "small").state(setup, policy, "full", 0)
+
+
+def test_a_method_that_does_not_learn_is_refused(tmp_path, setup, policy):
+    with pytest.raises(ConfigError, match="'base' does not"):
+        FlightMemory(tmp_path, "small").state(setup, policy, "base", 0)
+
+
+def test_names_of_vehicles_cannot_leave_the_folder(tmp_path, setup):
+    assert FlightMemory(tmp_path, "../../other").path(setup).parent == tmp_path
