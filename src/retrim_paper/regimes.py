@@ -14,7 +14,7 @@ from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.runkit.flights import Flight
 
-from .slow_vehicle import slow_quadrotor
+from .vehicles import DELAY, slow_quadrotor
 
 PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
 LAST, TAIL = 2.0, 10.0  # [s], scored intervals at the end of hover flights and of tracking flights
@@ -97,7 +97,7 @@ def regimes() -> tuple[Regime, ...]:
         Regime(
             "S2 slow rate loop",
             "body rates lag by 100 ms (vehicle file: 15 ms); a push",
-            any_hover, (Scenario(PUSH, plant="second-order", vehicle=slow, delay=0.03),), 10.0, at_rest,
+            any_hover, (Scenario(PUSH, plant="second-order", vehicle=slow, delay=DELAY),), 10.0, at_rest,
             adapted="base-id", published="INDI acceptable below 40 ms (arXiv 2605.05483)",
         ),
         Regime(

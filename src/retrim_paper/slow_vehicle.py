@@ -11,11 +11,9 @@ from retrim.config.methods import find_method
 from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
-from retrim.config.vehicle_file import VehicleSpec
 from retrim.evaluation.figures import picture
 from retrim.evaluation.metrics import metres, rows
 from retrim.evaluation.study import Study, fly_all
-from retrim.physics.vehicle import small
 from retrim.runkit.document import TableSection
 from retrim.runkit.flights import Flight
 from retrim.runkit.reporter import Reporter
@@ -23,32 +21,13 @@ from retrim.runkit.run import Run
 from retrim.runkit.training import train
 
 from .tables.hidden import PUSHED
+from .vehicles import DELAY, slow_quadrotor
 
 UPDATES = 200  # a fifth of the preset's training: less agile, and trained in ten seconds
 SECONDS = 10.0
 PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
-DELAY = 0.03  # [s]
 FIGURE = "One quadrotor with a rate loop of 100 ms, which no method knows"
 LABELS = {"base": "policy for a faster vehicle", "indi": "INDI", "base-id": "policy for many vehicles"}
-
-
-def slow_quadrotor() -> VehicleSpec:
-    """Return a quadrotor like the small one, but with body rates that lag by 100 ms (yaw: 200 ms)."""
-    like = small()
-    inertia, rates, drag = (tuple(np.asarray(each).tolist()) for each in (like.inertia, like.omega_max, like.drag_area))
-    return VehicleSpec(
-        name="slow rate loop",
-        mass=float(like.mass),
-        inertia=(inertia[0], inertia[1], inertia[2]),
-        arm=(float(like.arm[0]), float(like.arm[1])),
-        thrust_max=float(like.thrust_max),
-        rates_max=(rates[0], rates[1], rates[2]),
-        motor_tau=float(like.motor_tau),
-        drag_area=(drag[0], drag[1], drag[2]),
-        rate_lag=(0.1, 0.1, 0.2),
-        rate_damping=(0.8, 0.8, 0.8),
-        command_delay=DELAY,
-    )
 
 
 class Entrant(NamedTuple):

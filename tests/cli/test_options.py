@@ -37,7 +37,7 @@ def test_an_option_without_a_default_shows_none(command, tmp_path):
 def test_methods_of_installed_packages_are_listed_and_suggested(tmp_path):
     assert {"datt", "raptor"} <= set(METHODS.plugins())
     shown = "".join(retrim("fly", "--help", cwd=tmp_path).replace("│", " ").split())
-    assert "datt,raptorofinstalledpackages" in shown
+    assert "datt,indi-double,indi-half,raptorofinstalledpackages" in shown
     with pytest.raises(ConfigError, match="no method 'rapto'; did you mean 'raptor'"):
         find_method("rapto")
 

@@ -34,11 +34,14 @@ def state(setup, policy):
     """A learner state whose map has one bump at the goal."""
     fresh = setup.learner.init(policy, random.key(1))
     place_map, dtype = fresh.residual.map, fresh.residual.agreement.dtype
+    weight, information = jnp.array([0.0, 0.0, -2.0]), 1000.0
     learned = dataclasses.replace(
         place_map,
         centres=place_map.centres.at[0].set(jnp.array(GOAL)),
         visited=place_map.visited.at[0].set(3),
-        weights=place_map.weights.at[0].set(jnp.array([0.0, 0.0, -2.0])),
+        precision=place_map.precision.at[0, 0].set(information),
+        moment=place_map.moment.at[0].set(information * weight / setup.learner.residual_model.prior),
+        weights=place_map.weights.at[0].set(weight),
     )
     evidence = jnp.array(15.0, dtype=dtype)
     residual = dataclasses.replace(fresh.residual, map=learned, agreement=evidence, prediction=evidence)
@@ -66,7 +69,7 @@ def test_the_next_flight_starts_with_the_map(tmp_path, setup, policy, state):
     start = memory.state(setup, policy, "full", 0)
     before, after = at_goal(setup, state)[2], at_goal(setup, start)[2]
     assert before < after < 0.5 * before  # a part of the force, until rows of the new flight agree
-    jax.tree.map(np.testing.assert_array_equal, start.residual.map, state.residual.map)
+    np.testing.assert_allclose(start.residual.map.weights, state.residual.map.weights, rtol=0.02)
 
 
 @pytest.mark.parametrize("method", ["full", "lora"])

@@ -24,6 +24,7 @@ SPACING = 0.7  # distance between centres along the path [lengths]
 WANDER = 0.3  # [m/s^2], random walk of the part that does not depend on position, in one second
 EVIDENCE = 20.0  # [m^2/s^4], sum over rows of the squared prediction, after which the evidence for the map is 1/e
 RECALLED = 2.0  # [m^2/s^4], evidence for the map of an earlier flight
+FAINT = 0.1  # share of the information of an earlier flight that remains
 DOUBT = 1.0  # [m^2/s^4], prior evidence against the map
 
 
@@ -156,14 +157,21 @@ class PlaceModel(eqx.Module):
     def recall(self, state: PlaceState) -> PlaceState:
         """Return the state for the start of a flight, given the state at the end of an earlier one.
 
-        The map remains, with little evidence for it, since the place may have changed: a few rows of flight decide
-        whether it is used. The model with the short memory starts anew.
+        The map remains, with little evidence for it and little weight, since the place may have changed: a few rows of
+        flight decide whether it is used, and one pass replaces it. The model with the short memory starts anew.
 
         Args:
             state: State at the end of the earlier flight.
         """
         evidence = jnp.where(state.share > 0.5, RECALLED, 0.0).astype(state.agreement.dtype)
-        return dataclasses.replace(state, first=self.first.init(random.key(0)), agreement=evidence, prediction=evidence)
+        before, eye = state.map, jnp.eye(CENTRES + 1, dtype=state.agreement.dtype)
+        precision, moment = FAINT * before.precision + (1.0 - FAINT) * eye, FAINT * before.moment
+        faint = dataclasses.replace(
+            before, precision=precision, moment=moment, weights=self._weights(precision, moment)
+        )
+        return dataclasses.replace(
+            state, first=self.first.init(random.key(0)), map=faint, agreement=evidence, prediction=evidence
+        )
 
     def turning(self, state: PlaceState) -> RateFit | None:
         """Return the bias and lag of the body rates, if the first model identifies them."""
@@ -218,9 +226,11 @@ class PlaceModel(eqx.Module):
         weight = new.astype(p.dtype)[:, None] / self.noise**2
         precision = precision + bumps.T @ (weight * bumps)
         moment = moment + bumps.T @ (weight * target)
-        factor = jax.scipy.linalg.cho_factor(precision)
-        weights = self.prior * jax.scipy.linalg.cho_solve(factor, moment)
-        return PlaceMap(placed.centres, placed.visited, precision, moment, weights)
+        return PlaceMap(placed.centres, placed.visited, precision, moment, self._weights(precision, moment))
+
+    def _weights(self, precision: Float[Array, "n n"], moment: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        weights: Array = self.prior * jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(precision), moment)
+        return weights
 
     def _place_centres(
         self, before: PlaceMap, p: Float[Array, "rows 3"], new: Bool[Array, " rows"], fits: Int[Array, ""]
