@@ -16,7 +16,7 @@ from retrim import Reference, Scenario, Setup, changed, fly, from_csv, load
 from retrim.tasks import smooth_start
 
 QUICK = {
-    "track": {"reference": "circle", "felt_copies": 0},
+    "track": {"reference": "circle", "gravity_copies": 0},
     "pretrain": {"num_updates": 20, "num_envs": 4, "horizon": 40, "hidden_sizes": [32, 32]},
     "adapt": {"window": 50, "num_updates": 2, "num_envs": 3},
 }

@@ -50,7 +50,7 @@ OFF: dict[str, tuple[Lever, ...]] = {
     "track": (
         *LAYERS_OFF,
         Lever("no ensemble on what the regression leaves", {"adapt": {"residual": "regression"}}),
-        Lever("references as they are only", {"track": {"felt_copies": 0}}),
+        Lever("references as they are only", {"track": {"gravity_copies": 0}}),
         Lever("no acceleration and jerk seen", {"track": {"observation": "preview"}}),
         Lever("no tip in the reward", {"reward": "l2"}),
         Lever("no cost of jumps", {"jump_cost": 0.0}),

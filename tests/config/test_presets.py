@@ -205,7 +205,7 @@ OURS = {
 OURS["track/retrim"] = OURS["track/preview"] | {
     "reward": "sharp",
     "jump_cost": 0.1,
-    "track": {"reference": "circle+figure8+star", "observation": "flat", "felt_copies": 7, "felt_push": 4.0},
+    "track": {"reference": "circle+figure8+star", "observation": "flat", "gravity_copies": 7, "gravity_push": 4.0},
     "pretrain": OURS["track/preview"]["pretrain"]
     | {"num_updates": 1200, "learning_rate": 5e-3, "adam_b2": 0.95, "hidden_sizes": (128, 128)},
     "adapt": OURS["hover/retrim"]["adapt"]

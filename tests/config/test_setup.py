@@ -374,7 +374,7 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
 
 def test_training_follows_references_as_they_are_felt():
     """Every member of the family is a built-in reference, level or tilted and scaled; flight follows the plain one."""
-    made = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "felt_copies": 2}))
+    made = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "gravity_copies": 2}))
     trained, flown = made.env.task.reference, made.flight_task.reference
     assert trained.joins.shape[0] == 2 * (1 + 2)
     assert flown.joins.shape[0] == 2

@@ -339,7 +339,7 @@ def test_baselines_fly_without_a_trained_policy(tmp_path, monkeypatch):
 def test_a_table_of_fast_flight_flies_a_file_too(tmp_path, monkeypatch):
     """The race line that comes with the examples uses what the kingfisher can do, and no more."""
     line = Path(__file__).parents[2] / "examples" / "race.csv"
-    preset = brief_preset("track/fast", track={"reference": "circle=8", "felt_copies": 0})
+    preset = brief_preset("track/fast", track={"reference": "circle=8", "gravity_copies": 0})
     setup = Setup.from_preset(preset, str(line))
     assert setup.limits_exceeded() is None
     speeds = np.linalg.norm(at(setup.flight_task.reference, np.linspace(3.0, 10.0, 50)).v, axis=1)

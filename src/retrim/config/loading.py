@@ -15,6 +15,7 @@ from ..errors import ConfigError
 from .named_presets import PRESETS
 from .names import plain_from
 from .presets import BUILT_IN_TASKS, Preset
+from .renamed_keys import text_with_new_keys, with_new_keys
 from .trust import check_trust
 from .validation import read_toml, suggestion, validated
 from .vehicle_file import VehicleSpec, read_vehicle
@@ -65,7 +66,7 @@ def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> P
         ConfigError: The file cannot be read, is not TOML, or has an invalid key or value, or an untrusted
             Python name.
     """
-    above = beside(read_toml(overlay), overlay.parent)
+    above = with_new_keys(beside(read_toml(overlay), overlay.parent), source=str(overlay))
     whole = validated(Preset, merged(values(preset), above), source=str(overlay))
     check_trust(above, trust, source=str(overlay))
     return whole
@@ -112,7 +113,7 @@ def parse(text: str | bytes, *, source: str) -> Preset:
     Raises:
         ConfigError: The text is not a valid preset.
     """
-    return validated(Preset, text, source=source)
+    return validated(Preset, text_with_new_keys(text, source=source), source=source)
 
 
 def missing_defaults(preset: Preset, text: str | bytes) -> dict[str, Any]:
@@ -122,7 +123,7 @@ def missing_defaults(preset: Preset, text: str | bytes) -> dict[str, Any]:
         preset: Result of :func:`parse` for the text.
         text: JSON of the preset.
     """
-    return dict(_absent(values(preset), json.loads(text), ""))
+    return dict(_absent(values(preset), json.loads(text_with_new_keys(text, source="preset")), ""))
 
 
 def _absent(whole: dict[str, Any], given: Any, before: str) -> Iterator[tuple[str, Any]]:

@@ -66,7 +66,7 @@ ANY = dataclasses.replace(
     adapt=dataclasses.replace(RETRIM.adapt, window=150, trim="free"),  # in flight, each tick shifts the output
 )
 
-FELT = Track(reference="circle+figure8+star", observation="flat", felt_copies=7)
+FELT = Track(reference="circle+figure8+star", observation="flat", gravity_copies=7)
 TRACK_RETRIM = dataclasses.replace(
     TRACK,
     name="track/retrim",

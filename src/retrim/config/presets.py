@@ -118,9 +118,9 @@ class Track:
     preview plus acceleration and jerk."""
     start_spread: Positive = 1.0
     """Largest distance of a start from the reference, per axis [m]."""
-    felt_copies: int = Field(default=0, ge=0, le=100, strict=True)
+    gravity_copies: int = Field(default=0, ge=0, le=100, strict=True)
     """Number of extra training copies of each reference, each in the effective gravity of a constant push."""
-    felt_push: Positive = 4.0
+    gravity_push: Positive = 4.0
     """Largest push in these copies [m/s^2]."""
 
     @property

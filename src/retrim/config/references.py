@@ -56,7 +56,7 @@ def make_training_reference(table: Track) -> Reference:
     Raises:
         ConfigError: As for :func:`make_reference`.
     """
-    return _made(table.reference, table.felt_copies, table.felt_push)
+    return _made(table.reference, table.gravity_copies, table.gravity_push)
 
 
 def _made(names: str, copies: int, push: float) -> Reference:

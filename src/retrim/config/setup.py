@@ -101,7 +101,7 @@ class Setup:
         vehicle = make_vehicle(preset.vehicle)
         table = preset.track or TrackTable()
         trained_on = make_training_reference(table) if entry.has_reference else None
-        if table.felt_copies and reference is None:
+        if table.gravity_copies and reference is None:
             reference = table.reference
         try:
             task = make_task(TaskRequest(preset, vehicle, trained_on))
