@@ -45,10 +45,10 @@ def main(*, quick: bool = False) -> None:
     print(f"base policy:            {error(setup.pilot(policy)):.3f} m off")
     print(f"adapted, low rank:      {error(pilot):.3f} m off")
 
-    learnt = pilot.state.policy.policy  # the LoraPolicy that flies now; save_delta keeps its thin part alone
-    merged = learnt.merged()  # an ordinary Policy, for save_policy
-    print(f"merged, from the start: {error(setup.pilot(merged)):.3f} m off")
-    print(f"base weights moved by {change(policy, learnt.base)}, merged ones by up to {change(policy, merged):.4f}")
+    active = pilot.state.policy.policy  # the LoraPolicy that flies now; save_delta keeps its thin part alone
+    plain = active.merged()  # an ordinary Policy, for save_policy
+    print(f"merged, from the start: {error(setup.pilot(plain)):.3f} m off")
+    print(f"base weights moved by {change(policy, active.base)}, merged ones by up to {change(policy, plain):.4f}")
 
 
 if __name__ == "__main__":

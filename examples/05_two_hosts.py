@@ -36,10 +36,10 @@ def main(quick: bool = False) -> None:
     words = [sys.executable, __file__, address, "2"]
     more = ["quick"] if quick else []
     hosts = [subprocess.Popen([*words, str(i), *more], stdout=subprocess.PIPE, text=True) for i in (0, 1)]
-    said = [host.communicate()[0] for host in hosts]
+    outputs = [host.communicate()[0] for host in hosts]
     if any(host.returncode for host in hosts):
         raise SystemExit("a host has failed")
-    print(said[0], end="")
+    print(outputs[0], end="")
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ NULL = 0xF3  # port 15, channel 3: somebody asks who is there
 def main(uri: str, port: int = 19850) -> None:
     """Carry packets until Ctrl-C, or until the radio is lost."""
     cflib.crtp.init_drivers()
-    lost: queue.Queue[str] = queue.Queue()
-    link = cflib.crtp.get_link_driver(uri, None, lost.put)
+    errors: queue.Queue[str] = queue.Queue()
+    link = cflib.crtp.get_link_driver(uri, None, errors.put)
     if link is None:
         sys.exit(f"{uri}: no link; expected one like radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://HOST:PORT")
     server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -37,7 +37,7 @@ def main(uri: str, port: int = 19850) -> None:
     threading.Thread(target=down, daemon=True).start()
     print(f"{uri} is at udp:127.0.0.1:{port}; Ctrl-C ends it", flush=True)
     try:
-        while lost.empty():
+        while errors.empty():
             try:
                 data, client = server.recvfrom(64)
             except TimeoutError:
@@ -47,7 +47,7 @@ def main(uri: str, port: int = 19850) -> None:
             elif data:
                 packet = CRTPPacket(data[0], data[1:])
                 link.send_packet(packet)
-        sys.exit(f"{uri}: lost: {lost.get()}")
+        sys.exit(f"{uri}: lost: {errors.get()}")
     except KeyboardInterrupt:
         link.close()
 

@@ -44,13 +44,13 @@ def two_ends(backend, topics):
         return
     if backend == "shared memory":
         bus = SharedMemoryBus.create(topics)
-        found = Ends(bus, SharedMemoryBus(bus.folder))
+        result = Ends(bus, SharedMemoryBus(bus.folder))
     else:
         where = network(backend)
-        found = Ends(where.join(topics, listen=True), where.join(topics, listen=False))
-    yield found
-    found.reader.close()
-    found.writer.remove() if backend == "shared memory" else found.writer.close()
+        result = Ends(where.join(topics, listen=True), where.join(topics, listen=False))
+    yield result
+    result.reader.close()
+    result.writer.remove() if backend == "shared memory" else result.writer.close()
 
 
 def network(backend):
@@ -62,12 +62,12 @@ def network(backend):
     return Address("zenoh", "127.0.0.1", free_port(), shared=shared)
 
 
-def arrived(bus, topic, after=0, data=None, patience=10.0):
+def await_message(bus, topic, after=0, data=None, patience=10.0):
     """Return the message of a topic once it is there."""
     until = time.monotonic() + patience
     while time.monotonic() < until:
-        found = bus.latest(topic, after)
-        if found is not None and data in (None, found.data):
-            return found
+        result = bus.latest(topic, after)
+        if result is not None and data in (None, result.data):
+            return result
         time.sleep(1e-3)
     raise AssertionError(f"nothing came on {topic!r} within {patience} s")

@@ -50,15 +50,15 @@ def retrim(*words, cwd, code=0):
     """Run a command here; return what it printed."""
     out = io.StringIO()
     before, console.width = sys.argv, 160
-    ended = None
+    end_note = None
     with contextlib.chdir(cwd), contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         try:
             main([str(word) for word in words])
         except SystemExit as end:
-            ended = end.code
+            end_note = end.code
         finally:
             sys.argv = before
-    assert ended == code, out.getvalue()
+    assert end_note == code, out.getvalue()
     return out.getvalue()
 
 
@@ -66,7 +66,7 @@ def results(folder, name="results.json"):
     return json.loads((folder / name).read_text())
 
 
-def started(words, cwd, setup=""):
+def start_process(words, cwd, setup=""):
     """Start a command in a process of its own, whose Ctrl-C works whoever runs the tests."""
     listening = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     listening += "; signal.signal(signal.SIGHUP, signal.SIG_DFL)"
@@ -80,17 +80,17 @@ def started(words, cwd, setup=""):
     )
 
 
-def interrupted(words, cwd, *, after, setup="", by=signal.SIGINT):
+def run_interrupted(words, cwd, *, after, setup="", by=signal.SIGINT):
     """Run, send a signal once the output shows ``after`` or that file is there; return exit code and output."""
-    process, seen = started(words, cwd, setup), b""
+    process, observation = start_process(words, cwd, setup), b""
     deadline = time.monotonic() + 180
     while time.monotonic() < deadline and process.poll() is None:
         if isinstance(after, bytes):
-            seen += process.stdout.read1(4096)
+            observation += process.stdout.read1(4096)
         else:
             time.sleep(0.005)
-        if after in seen if isinstance(after, bytes) else after.exists():
+        if after in observation if isinstance(after, bytes) else after.exists():
             break
     process.send_signal(by)
     rest, _ = process.communicate(timeout=120)
-    return process.returncode, (seen + rest).decode()
+    return process.returncode, (observation + rest).decode()

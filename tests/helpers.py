@@ -129,14 +129,14 @@ _thousand = eqx.filter_jit(lambda reference, times: jax.vmap(reference)(times))
 def at(reference, times):
     """The reference at many times, by one compiled program."""
     times = np.asarray(times, dtype=float)
-    padded = np.append(times, np.zeros(-len(times) % 1000)).reshape(-1, 1000)
-    found = [_thousand(reference, jnp.asarray(part)) for part in padded]
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(times)], *found)
+    padding = np.append(times, np.zeros(-len(times) % 1000)).reshape(-1, 1000)
+    result = [_thousand(reference, jnp.asarray(part)) for part in padding]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(times)], *result)
 
 
-def stacked(trees):
+def stack_trees(trees):
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)
 
 
-def replaced(module, **fields):
+def replace_fields(module, **fields):
     return dataclasses.replace(module, **fields)

@@ -22,8 +22,8 @@ import scipy.interpolate
 import scipy.optimize  # noqa: F401
 from jax import random
 
+from fake_log import MAP, columns, fly_once, write_csv
 from helpers import tiny_preset
-from made_up_log import MAP, columns, flown, write_csv
 from retrim import Setup, load_learner_state, load_policy
 from retrim.adapt.updates import PolicyUpdate, ResidualUpdate, Skip, pack_update, unpack_update
 from retrim.config import changed, load, overlaid, read_vehicle
@@ -165,9 +165,9 @@ def without_none(tables: dict) -> dict:
 
 def variants(tables: dict, *, toml: bool, free=()) -> Iterator[tuple[str, Callable[[], str], bool]]:
     """Name, what writes the text, whether it may be fine: each place with each value, and keys that nobody knows."""
-    written = toml_of if toml else json.dumps
+    paths = toml_of if toml else json.dumps
     for path, value in places(tables):
-        whole = written(with_mark(tables, path))
+        whole = paths(with_mark(tables, path))
         for name, text in texts_and_numbers(toml=toml):
             plain = isinstance(value, str) and name in TEXTS and (path[-1] in free or _plain(path, name))
             plain = plain or (path[-1] == "name" and name == "text")
@@ -175,11 +175,11 @@ def variants(tables: dict, *, toml: bool, free=()) -> Iterator[tuple[str, Callab
             yield f"{'.'.join(map(str, path))}: {name}", partial(whole.replace, json.dumps(MARK), text), fine
     for name, text in TEXTS.items():
         key = json.dumps(text)
-        whole = written({"zzz": 1, **tables})
-        marked, put = ("zzz =", f"{key} =") if toml else ('"zzz"', key)
-        yield f"key {name}", partial(whole.replace, marked, put, 1), False
+        whole = paths({"zzz": 1, **tables})
+        marks, put = ("zzz =", f"{key} =") if toml else ('"zzz"', key)
+        yield f"key {name}", partial(whole.replace, marks, put, 1), False
     many = "\n".join(f"k{i} = 1" for i in range(60_000)) if toml else ",".join(f'"k{i}":1' for i in range(90_000))
-    whole = written({"zzz": 1, **tables})
+    whole = paths({"zzz": 1, **tables})
     yield "many keys", partial(whole.replace, "zzz = 1" if toml else '"zzz": 1', many, 1), False
 
 
@@ -187,7 +187,7 @@ def _plain(path, name) -> bool:
     return path[-1] == "name" and PLAIN.fullmatch(TEXTS[name]) is not None
 
 
-def written(about: dict) -> dict[str, str]:
+def write(about: dict) -> dict[str, str]:
     """A header whose texts are written now."""
     return {name: text if isinstance(text, str) else text() for name, text in about.items()}
 
@@ -196,7 +196,7 @@ class Maker:
     """Makes cases in a folder."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.n, self.written = folder, 0, list[Path]()
+        self.folder, self.n, self.paths = folder, 0, list[Path]()
         self.preset = changed(tiny_preset(), pretrain={"hidden_sizes": (12, 12)}, adapt={"residual": "linear"})
         self.setup = Setup.from_preset(self.preset)
         with jax.numpy_dtype_promotion("standard"):
@@ -208,15 +208,15 @@ class Maker:
         """Write a file."""
         self.n += 1
         path = self.folder / f"{self.n}{suffix}"
-        self.written.append(path)
+        self.paths.append(path)
         path.write_bytes(data.encode("utf-8", "surrogatepass") if isinstance(data, str) else data)
         return path
 
     def clear(self) -> None:
         """Remove the files that were written."""
-        for path in self.written:
+        for path in self.paths:
             path.unlink(missing_ok=True)
-        self.written.clear()
+        self.paths.clear()
 
     def cases(self) -> Iterator[Case]:
         """All kinds."""
@@ -238,7 +238,7 @@ class Maker:
 
         def case(name, policy, about, fine=False):
             def read():
-                return load_policy(self.file(wire.pack(policy, kind="policy", about=written(about)), ".safetensors"))
+                return load_policy(self.file(wire.pack(policy, kind="policy", about=write(about)), ".safetensors"))
 
             return Case(name, read, fine)
 
@@ -275,7 +275,7 @@ class Maker:
         def case(name, state, about, fine=False):
             def read():
                 return load_learner_state(
-                    self.file(wire.pack(state, kind="learnt", about=written(about)), ".safetensors")
+                    self.file(wire.pack(state, kind="learnt", about=write(about)), ".safetensors")
                 )
 
             return Case(name, read, fine)
@@ -332,8 +332,8 @@ class Maker:
             "propeller": "5 inch", "propeller_diameter": 5.1, "drag_area": [0.01, 0.01, 0.02],
         }  # fmt: skip
         for name, text, fine in variants(tables, toml=True):
-            unbounded = fine or re.search("3e38|2.63|googol|10.400", name) is not None
-            yield Case(name, lambda text=text: read_vehicle(self.file(text(), ".toml")).build(), unbounded)
+            is_unbounded = fine or re.search("3e38|2.63|googol|10.400", name) is not None
+            yield Case(name, lambda text=text: read_vehicle(self.file(text(), ".toml")).build(), is_unbounded)
 
     def sweeps(self) -> Iterator[Case]:
         """Sweep files. One whose names are looked up later is made into scenarios."""
@@ -368,12 +368,12 @@ class Maker:
         }  # fmt: skip
         assert {each.name for each in dataclasses.fields(LogMap)} >= tables.keys()
         for name, text, fine in variants(tables, toml=True):
-            named = "fields" in name or "field:" in name or "hover" in name or "age:" in name or "part" in name
-            yield Case(name, lambda text=text: read_map(self.file(text(), ".toml")), fine or named)
+            names = "fields" in name or "field:" in name or "hover" in name or "age:" in name or "part" in name
+            yield Case(name, lambda text=text: read_map(self.file(text(), ".toml")), fine or names)
 
     def csv_logs(self) -> Iterator[Case]:
         """CSV logs: hostile cells, headers and times."""
-        table, path = columns(flown(1.0)), self.folder / "plain.csv"
+        table, path = columns(fly_once(1.0)), self.folder / "plain.csv"
         lines = write_csv(path, table).read_text().splitlines()
         log_map = read_map(self.file(MAP, ".toml"))
         cells = [*TEXTS.values(), *(pair[0] for pair in NUMBERS.values()), "1e308", "-1e308", "1e18", "\ud800", "0x10"]
@@ -443,7 +443,7 @@ class Maker:
         def case(name, text, start=start, fine=False):
             def read():
                 file = start if isinstance(start, bytes) else start()
-                about = written({"fields": text, "bytes": str(len(file))})
+                about = write({"fields": text, "bytes": str(len(file))})
                 data = pack_arrays({"start": np.frombuffer(file, np.uint8)}, kind="mission", about=about)
                 mission = LearnerMission.unpack(data)
                 mission.check(())
@@ -455,10 +455,10 @@ class Maker:
             yield case(name, text, fine=not (name.startswith("reference") and PYTHON.search(name)))
         for name, text, _ in self.presets():  # what has no such name is refused by who builds it
 
-            def learnt(text=text):
+            def make_learner_state(text=text):
                 return wire.pack(self.state, kind="learnt", about={"preset": text()})
 
-            yield case(name, json.dumps(fields), learnt, not PYTHON.search(name))
+            yield case(name, json.dumps(fields), make_learner_state, not PYTHON.search(name))
         yield case("no file", json.dumps(fields), b"")
 
     def messages(self) -> Iterator[Case]:
@@ -488,17 +488,17 @@ class Maker:
                     field != "base" and name in (*MAY_BE_FINE, "3e38", "2^63", "googol", "10^400", "digits"),
                 )
         plain = PolicyUpdate(1.0, 0.5, 0.4, self.state.policy)
-        fitted, skipped = ResidualUpdate(1.0, 0.1, self.state.residual), Skip(1.0, "policy")
-        for update, kind in ((plain, "policy"), (fitted, "residual"), (skipped, "skipped")):
+        fit_result, skip = ResidualUpdate(1.0, 0.1, self.state.residual), Skip(1.0, "policy")
+        for update, kind in ((plain, "policy"), (fit_result, "residual"), (skip, "skipped")):
             data = pack_update(update)
-            said = wire.kind_of(data, source="x")
-            header = wire.describe(data, kind=said, source="x")
+            message = wire.kind_of(data, source="x")
+            header = wire.describe(data, kind=message, source="x")
             for name, text, fine in variants(json.loads(header["update"]), toml=False):
                 may = fine or any(word in name for word in ("3e38", "2^63", "googol", "10^400", "inf", "nan", "1e400"))
 
-                def read(text=text, update=update, kind=said):
-                    forged = wire.pack(getattr(update, "state", ()), kind=kind, about={"update": text()})
-                    return unpack_update(forged, self.state, source="x")
+                def read(text=text, update=update, kind=message):
+                    forgery = wire.pack(getattr(update, "state", ()), kind=kind, about={"update": text()})
+                    return unpack_update(forgery, self.state, source="x")
 
                 yield Case(f"{kind} {name}", read, may)
 
@@ -547,18 +547,18 @@ class Watch:
     CHANGES = ("os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.chmod", "os.link", "os.symlink")
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.on, self.seen = str(folder), False, list[str]()
+        self.folder, self.on, self.events = str(folder), False, list[str]()
         sys.addaudithook(self)
 
     def __call__(self, event: str, args: tuple) -> None:
         """Take note; Python calls this for ever after, which costs nothing while it is off."""
         if not self.on:
             return
-        written = event == "open" and isinstance(args[1], str) and set(args[1]) & set("wax+")
+        paths = event == "open" and isinstance(args[1], str) and set(args[1]) & set("wax+")
         inside = bool(args) and str(args[0]).startswith(self.folder)
         if event == "compile" and args[1] == "<unknown>":
             return  # ast.literal_eval, which runs nothing: NumPy reads the heads of arrays with it
         if event in ("compile", "exec") and any("/jaxtyping/" in name for name in callers()):
             return  # our tests check shapes
-        if event in self.EVENTS or event.startswith(self.RUNS) or ((written or event in self.CHANGES) and not inside):
-            self.seen.append(f"{event} {str(args)[:200]}")
+        if event in self.EVENTS or event.startswith(self.RUNS) or ((paths or event in self.CHANGES) and not inside):
+            self.events.append(f"{event} {str(args)[:200]}")

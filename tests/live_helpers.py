@@ -48,14 +48,14 @@ def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, secon
     return ControlPlan(folder, controller, box, DT, delay_ticks, window, seconds, frozenset({0}), 20, parent)
 
 
-def holding(gains=(4.0, 3.5), *, fitted=False):
-    """The controller as programs; ``fitted``: with a half that is fitted, which does nothing."""
-    if not fitted:
+def holding(gains=(4.0, 3.5), *, fit_result=False):
+    """The controller as programs; ``fit_result``: with a half that is fitted, which does nothing."""
+    if not fit_result:
         return plain_source(setup(), Holds(jnp.array(gains)))
     arrays, fixed = eqx.partition(Holds(jnp.array(gains)), eqx.is_array)
     parameters = {"policy": arrays, "residual": {"fit": jnp.array(0.0)}}
 
-    def predicted(parameters, inputs):
+    def predict(parameters, inputs):
         return f_a(*inputs, jnp.zeros(3)).v + 0.0 * parameters["residual"]["fit"]
 
-    return _source(setup(), lambda found: eqx.combine(found["policy"], fixed), predicted, parameters)
+    return _source(setup(), lambda result: eqx.combine(result["policy"], fixed), predict, parameters)

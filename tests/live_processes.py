@@ -34,13 +34,13 @@ def rotation(vector):
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
-def moved(x, u, push=(0.0, 0.0, 0.0)):
+def move(x, u, push=(0.0, 0.0, 0.0)):
     """One tick of a point mass, in steps of a millisecond."""
     p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
-    turned = rotation(1e-3 * np.asarray(u[1:]))
+    turn = rotation(1e-3 * np.asarray(u[1:]))
     for _ in range(20):
         a = u[0] * R[:, 2] - G * UP + np.asarray(push)
-        p, v, R = p + 1e-3 * v, v + 1e-3 * a, R @ turned
+        p, v, R = p + 1e-3 * v, v + 1e-3 * a, R @ turn
     return np.concatenate([p, R.ravel(), v])
 
 
@@ -62,21 +62,21 @@ def plant(plan: DrillPlan) -> None:
     if (epoch := wait_for_take_off(bus, parent)) is None:
         return
     x, tick, acting = plan.x0, 0, np.array([G, 0.0, 0.0, 0.0])
-    accepted = acting
+    accepted_command = acting
     while True:
         sleep_until(epoch + tick * DT)
-        bus.publish("sample", Sample(tick, tick * DT, time.monotonic(), 0.0, x, x, accepted).pack())
+        bus.publish("sample", Sample(tick, tick * DT, time.monotonic(), 0.0, x, x, accepted_command).pack())
         while time.monotonic() < epoch + (tick + 0.6) * DT:
-            found = [Setpoint.unpack(m.data) for m in map(bus.latest, ("setpoint", "fallback")) if m is not None]
-            now = [each for each in found if each.tick == tick or each.landed]
+            result = [Setpoint.unpack(m.data) for m in map(bus.latest, ("setpoint", "fallback")) if m is not None]
+            now = [each for each in result if each.tick == tick or each.is_final]
             if now:
-                accepted = now[0].u
-                if now[0].landed:
+                accepted_command = now[0].u
+                if now[0].is_final:
                     bus.publish("ended", pack_note("ended", reason=now[0].ending(x[2])))
                     return
                 break
             time.sleep(5e-4)
-        x, acting, tick = moved(x, acting), accepted, tick + 1
+        x, acting, tick = move(x, acting), accepted_command, tick + 1
 
 
 def learner(plan: DrillPlan) -> None:
@@ -84,7 +84,7 @@ def learner(plan: DrillPlan) -> None:
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     bus.publish(f"ready.{plan.role}", pack_note("ready", base=plan.base))
     topic, rng, heart = "parameters.policy", np.random.default_rng(), Heart(bus, plan.role)
-    while not parent.gone(0.1) and bus.latest("ended") is None:
+    while not parent.has_ended(0.1) and bus.latest("ended") is None:
         heart.beat()
         before = bus.latest(topic)
         version = 1 if before is None else before.version + 1

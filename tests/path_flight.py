@@ -73,18 +73,18 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
     p = rng.normal(size=(n, 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     R, v, w, wd, f = np.tile(np.eye(3), (n, 1, 1)), 0 * p, 0 * p, 0 * p, np.full(n, G)
-    given = np.tile([G, 0.0, 0.0, 0.0], (n, ticks + 8, 1))
+    argument = np.tile([G, 0.0, 0.0, 0.0], (n, ticks + 8, 1))
     slow = np.clip(0.09 / (vehicles.delay + vehicles.rate_lag + 0.03), 0.35, 1.0)[:, None]
-    pushed, a_mean, half, last, rows = 0 * p, 0 * p, None, None, []
+    with_push, a_mean, half, last, rows = 0 * p, 0 * p, None, None, []
 
     def sample(before):
         tilt = Rotation.from_rotvec(sensors.attitude * rng.normal(size=(n, 3))).as_matrix()
         new = (p + sensors.position * rng.normal(size=(n, 3)), R @ tilt, v + sensors.velocity * rng.normal(size=(n, 3)))
         if before is None:
             return new
-        lost = rng.random(n) < sensors.dropout
+        gap = rng.random(n) < sensors.dropout
         return tuple(
-            np.where(lost.reshape((n,) + (1,) * (x.ndim - 1)), old, x) for old, x in zip(before, new, strict=True)
+            np.where(gap.reshape((n,) + (1,) * (x.ndim - 1)), old, x) for old, x in zip(before, new, strict=True)
         )
 
     for k in range(ticks):
@@ -94,21 +94,21 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
         last = half if sensors.late and half is not None else sample(last)
         omega, a = w + sensors.gyro * rng.normal(size=(n, 3)), a_mean + sensors.accelerometer * rng.normal(size=(n, 3))
         if rows:
-            pushed += 0.08 * (a - (rows[-1][5][:, :1] * last[1][:, :, 2] - [0, 0, G]) - pushed)
-        u = _pd(last, pushed, slow)
+            with_push += 0.08 * (a - (rows[-1][5][:, :1] * last[1][:, :, 2] - [0, 0, G]) - with_push)
+        u = _pd(last, with_push, slow)
         if excitation is not None:
             u = u + excitation(k * DT)
         rows.append((*last, omega, a, u))
-        given[:, 8 + k] = u
+        argument[:, 8 + k] = u
         a_mean = 0.0
         for i in range(PER):
             at = np.maximum((k * PER + i - late) // PER, -8) + 8
-            told = given[np.arange(n), at]
+            message = argument[np.arange(n), at]
             before = w
-            error = np.stack([w - told[:, 1:], wd], axis=2)
-            moved = np.einsum("anij,naj->nai", loops, error)
-            w, wd = moved[:, :, 0] + told[:, 1:], moved[:, :, 1]
-            f_new = f + (vehicles.thrust_gain * told[:, 0] - f) * (1.0 - np.exp(-H / vehicles.thrust_lag))
+            error = np.stack([w - message[:, 1:], wd], axis=2)
+            shift = np.einsum("anij,naj->nai", loops, error)
+            w, wd = shift[:, :, 0] + message[:, 1:], shift[:, :, 1]
+            f_new = f + (vehicles.thrust_gain * message[:, 0] - f) * (1.0 - np.exp(-H / vehicles.thrust_lag))
             acceleration = 0.5 * (f + f_new)[:, None] * R[:, :, 2] - 0.3 * v - [0, 0, G]
             R = R @ Rotation.from_rotvec(0.5 * H * (before + w)).as_matrix()
             p, v, f = p + H * v + 0.5 * H**2 * acceleration, v + H * acceleration, f_new
@@ -119,18 +119,18 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
     return Flights(p, R, v, omega, a, u, 0.5 * DT if sensors.late else 0.0)
 
 
-def _pd(x, pushed, slow):
+def _pd(x, with_push, slow):
     p, R, v = x
-    force = np.clip(-3.0 * slow**2 * p - 3.2 * slow * v, -4.0, 4.0) - pushed + [0, 0, G]
+    force = np.clip(-3.0 * slow**2 * p - 3.2 * slow * v, -4.0, 4.0) - with_push + [0, 0, G]
     c = np.einsum("ni,ni->n", force, R[:, :, 2])
-    wanted = np.einsum("nji,nj->ni", R, force / np.linalg.norm(force, axis=1, keepdims=True))
-    turn = 6.0 * slow * np.stack([-wanted[:, 1], wanted[:, 0], -0.25 * R[:, 1, 0]], axis=1)
+    expected = np.einsum("nji,nj->ni", R, force / np.linalg.norm(force, axis=1, keepdims=True))
+    turn = 6.0 * slow * np.stack([-expected[:, 1], expected[:, 0], -0.25 * R[:, 1, 0]], axis=1)
     return np.concatenate([np.clip(c, 3.0, 18.0)[:, None], np.clip(turn, -6.0, 6.0)], axis=1)
 
 
 def _loops(vehicles):
     """Return the exact transition of (omega - omega_cmd, its derivative) over a step, (axes, n, 2, 2)."""
-    found = []
+    result = []
     for lag in (vehicles.rate_lag, vehicles.rate_lag, vehicles.yaw_lag):
         natural = 2.0 * vehicles.rate_damping / lag
         A = np.zeros((len(lag), 2, 2))
@@ -139,8 +139,8 @@ def _loops(vehicles):
         for k in range(1, 30):
             term = term @ A * H / k
             total = total + term
-        found.append(total)
-    return np.stack(found)
+        result.append(total)
+    return np.stack(result)
 
 
 def doublets(t):

@@ -6,7 +6,7 @@ import sys
 
 
 @contextlib.contextmanager
-def started(*command):
+def start_process(*command):
     """A process, once it has said that it is there; ended by the signal that Ctrl-C is to it."""
     process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True)
     try:
@@ -20,4 +20,4 @@ def started(*command):
 
 def peer(speaks, *words):
     """A peer of ours that speaks the language of an autopilot."""
-    return started(sys.executable, "-m", f"retrim.testing.{speaks}_peer", *words)
+    return start_process(sys.executable, "-m", f"retrim.testing.{speaks}_peer", *words)

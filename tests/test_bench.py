@@ -18,10 +18,10 @@ def test_a_time_is_told_in_units_of_its_moment(monkeypatch):
     units, took = iter([0.1, 0.1, 1.0, 1.0, 1.0]), iter([0.3, 1.65, 3.0, 3.0])
     monkeypatch.setattr(timing, "unit", lambda: lambda: next(units))
     monkeypatch.setattr(timing, "seconds", lambda run: next(took))
-    found = timing.timed(2.0, lambda: None, 4)
-    assert found["units"] == pytest.approx(3.0)
-    assert found["run_s"] == pytest.approx((1.65 + 3.0) / 2)
-    assert (found["compile_s"], found["remarks"]) == (2.0, "0.3 to 3 s in 4 runs")
+    result = timing.time_runs(2.0, lambda: None, 4)
+    assert result["units"] == pytest.approx(3.0)
+    assert result["run_s"] == pytest.approx((1.65 + 3.0) / 2)
+    assert (result["compile_s"], result["remarks"]) == (2.0, "0.3 to 3 s in 4 runs")
 
 
 @pytest.mark.skipif("one" not in measure.CORES, reason="the system does not let a process choose its core")
@@ -32,10 +32,10 @@ def test_one_core_is_one():
 
 def test_a_row_has_both_and_the_share_of_the_limit(tmp_path, monkeypatch):
     """An update that takes four units for the products of one is at 25 % of the limit; one core goes first."""
-    asked = []
+    calls = []
 
     def process(name, cores, environment):
-        asked.append((name, cores))
+        calls.append((name, cores))
         if name == "machine":
             return {"product": 100.0, "rows": 50.0, "copy": 9.0}
         units = 4.0 if cores == "one" else 2.5
@@ -45,7 +45,7 @@ def test_a_row_has_both_and_the_share_of_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(measure, "_process", process)
     monkeypatch.setattr(measure, "CORES", ("one", "all"))
     assert measure.bench(Run("test", tmp_path), Silent(), works=["update-retrim", "update-lora"])
-    assert asked == [
+    assert calls == [
         *(("machine", "one"), ("machine", "all")),
         *(("update-retrim", "all"), ("update-retrim", "one"), ("update-lora", "all")),
     ]

@@ -32,11 +32,11 @@ def test_a_long_line_keeps_its_beginning_and_its_end():
 
 
 def test_nothing_that_is_shown_steers_a_terminal():
-    with console.capture() as shown:
+    with console.capture() as display:
         refuse("a\x1b]0;owned\x07")
         RichReporter().say("b\x1b[2J\nc")
         with RichReporter().progress("d") as advance:
             advance(1.0, "e\x1b[2J")
-    assert "\x1b[2J" not in shown.get()
-    assert "\x07" not in shown.get()
+    assert "\x1b[2J" not in display.get()
+    assert "\x07" not in display.get()
     assert printable("a\tb\nc\x9b") == "a\\tb\nc\\x9b"

@@ -22,9 +22,9 @@ def test_an_example_runs(path, capsys, monkeypatch, tmp_path):
     spec.loader.exec_module(example)
     example.main(quick=True)
     out = capsys.readouterr().out
-    found = [float(word) for word in NUMBER.findall(out)]
-    assert len(found) >= 2, out
-    assert all(map(math.isfinite, found)), out
+    result = [float(word) for word in NUMBER.findall(out)]
+    assert len(result) >= 2, out
+    assert all(map(math.isfinite, result)), out
     assert not list(tmp_path.iterdir())
 
 

@@ -28,14 +28,14 @@ def test_batched_products_are_right_as_users_compile_them():
 
 
 @pytest.mark.parametrize("imports", ["import jax; from retrim import State", "from retrim import State; import jax"])
-@pytest.mark.parametrize(("asked", "taken"), [(None, "float32"), ("tensorfloat32", "tensorfloat32")])
-def test_products_are_of_whole_single_precision_unless_asked(asked, taken, imports):
+@pytest.mark.parametrize(("calls", "extract"), [(None, "float32"), ("tensorfloat32", "tensorfloat32")])
+def test_products_are_of_whole_single_precision_unless_asked(calls, extract, imports):
     """On a GPU, too, whose default is less; a user's choice stands, and the order of imports does not matter."""
     environment = {name: value for name, value in os.environ.items() if name != "JAX_DEFAULT_MATMUL_PRECISION"}
-    environment |= {} if asked is None else {"JAX_DEFAULT_MATMUL_PRECISION": asked}
+    environment |= {} if calls is None else {"JAX_DEFAULT_MATMUL_PRECISION": calls}
     code = f"{imports}; print(jax.config.jax_default_matmul_precision)"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == taken, done.stderr
+    assert done.stdout.strip() == extract, done.stderr
 
 
 def test_the_excluded_version_is_not_installed_and_cannot_be():

@@ -36,12 +36,12 @@ def test_a_terminal_shows_a_bar_on_the_standard_error():
     )
     out, _ = process.communicate(timeout=60)
     os.close(writer)
-    shown = os.read(reader, 65536).decode()
+    display = os.read(reader, 65536).decode()
     os.close(reader)
     assert out == "over\n"
-    assert "flying" in shown
-    assert "[red] 5 of 10 s" in shown
-    assert "10 of 10 s" in shown
+    assert "flying" in display
+    assert "[red] 5 of 10 s" in display
+    assert "10 of 10 s" in display
 
 
 class Display:
@@ -70,13 +70,13 @@ def cell(monkeypatch):
 
 
 def test_a_notebook_shows_a_bar_and_removes_it_at_the_end(cell):
-    def interrupted():
+    def run_interrupted():
         with show_progress("flying") as advance:
             advance(0.25, "<b>")
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        interrupted()
+        run_interrupted()
     assert 'value="0.250"' in cell.texts[1]
     assert "25 %, &lt;b&gt;" in cell.texts[1]
     assert cell.texts[-1] == ""
@@ -105,9 +105,9 @@ def test_other_threads_and_no_progress_show_nothing(cell):
 
 
 def test_a_lost_terminal_does_not_end_the_work(cell, monkeypatch):
-    def lost(text):
+    def lose(text):
         raise OSError(5, "Input/output error")
 
     with show_progress("flying") as advance, monkeypatch.context() as patch:
-        patch.setattr(cell, "update", lost)
+        patch.setattr(cell, "update", lose)
         advance(0.5, "half")

@@ -10,28 +10,28 @@ import time
 
 import pytest
 
-from retrim.signals import handled_by, stopped_by
+from retrim.signals import handle_signals, stop_on_signal
 
 WORK = """
 import signal, sys, threading, time
 from pathlib import Path
-from retrim.signals import handled_by, stopped_by
+from retrim.signals import handle_signals, stop_on_signal
 
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # whoever runs the tests may ignore them
     signal.signal(number, signal.SIG_DFL)
 stop, out = threading.Event(), Path(sys.argv[1])
-with stopped_by(stop):
+with stop_on_signal(stop):
     try:
         out.with_suffix(".begun").touch()
         time.sleep(60.0)
     except KeyboardInterrupt:
-        with handled_by(lambda *_: stop.set()):
+        with handle_signals(lambda *_: stop.set()):
             print("what is said now may have nobody to hear it", flush=True)
             out.write_text(f"kept, {stop.is_set()}")
 """
 
 
-def begun(path):
+def begin(path):
     until = time.monotonic() + 60.0
     while not path.with_suffix(".begun").exists() and time.monotonic() < until:
         time.sleep(0.01)
@@ -41,7 +41,7 @@ def begun(path):
 def test_each_signal_stops_and_raises(number):
     before, stop = signal.signal(number, signal.SIG_DFL), threading.Event()
     try:
-        with pytest.raises(KeyboardInterrupt), stopped_by(stop):
+        with pytest.raises(KeyboardInterrupt), stop_on_signal(stop):
             signal.raise_signal(number)
         assert signal.getsignal(number) is signal.SIG_DFL
     finally:
@@ -54,7 +54,7 @@ def test_what_a_closed_terminal_interrupts_is_kept(tmp_path):
     words = [sys.executable, "-c", WORK, str(out)]
     process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
     os.close(theirs)
-    begun(out)
+    begin(out)
     os.close(ours)  # what is written there is an error from now on
     process.send_signal(signal.SIGHUP)
     assert process.wait(60.0) == 0
@@ -64,7 +64,7 @@ def test_what_a_closed_terminal_interrupts_is_kept(tmp_path):
 def test_a_hangup_that_nohup_ignores_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with handled_by(lambda *_: pytest.fail("it was answered")):
+        with handle_signals(lambda *_: pytest.fail("it was answered")):
             signal.raise_signal(signal.SIGHUP)
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:

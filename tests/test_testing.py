@@ -22,7 +22,7 @@ def test_plants_conform(plant):
     testing.check_plant(Scenario(plant=plant).make)
 
 
-class Wrapped(Plant):
+class FaultyPlant(Plant):
     """A plant with one fault."""
 
     def __init__(self, fault):
@@ -39,12 +39,12 @@ class Wrapped(Plant):
             u = Command(jnp.nan_to_num(u.c), jnp.nan_to_num(u.omega, posinf=0.0))
         if self._fault == "thrust":
             u = Command(9.81 + 0.1 * (u.c - 9.81), u.omega)
-        measurement, accepted = self._inner.step(u)
+        measurement, accepted_command = self._inner.step(u)
         if self._fault == "time":
             measurement = measurement._replace(t=2 * measurement.t)
         if self._fault == "degrees":
             measurement = measurement._replace(omega=jnp.rad2deg(measurement.omega))
-        return measurement, accepted
+        return measurement, accepted_command
 
     def stop(self):
         if self._fault != "stop":
@@ -64,7 +64,7 @@ class Wrapped(Plant):
 )
 def test_a_faulty_plant_breaks_a_law_by_name(fault, law):
     with pytest.raises(AssertionError, match=law):
-        testing.check_plant(lambda: Wrapped(fault))
+        testing.check_plant(lambda: FaultyPlant(fault))
 
 
 @pytest.mark.parametrize("preset", ["hover/fast", "track/preview", "vision/occluded"])

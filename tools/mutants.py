@@ -198,10 +198,10 @@ def mutants(path: Path) -> Iterator[Mutant]:
     stated = {node for each in tree.body if isinstance(each, ast.Assign) for node in ast.walk(each)}
     for statement, node in list(_sites(tree, 0)):
         for what, change in _changes(node, numbers=node not in stated):
-            planted = copy.deepcopy(tree)
-            twin = next(n for a, n in zip(ast.walk(tree), ast.walk(planted), strict=True) if a is node)
+            plants = copy.deepcopy(tree)
+            twin = next(n for a, n in zip(ast.walk(tree), ast.walk(plants), strict=True) if a is node)
             change(twin)
-            yield Mutant(path, statement, getattr(node, "lineno", 0), what, ast.unparse(planted))
+            yield Mutant(path, statement, getattr(node, "lineno", 0), what, ast.unparse(plants))
 
 
 def _sites(node: ast.AST, statement: int) -> Iterator[tuple[int, ast.AST]]:

@@ -13,8 +13,8 @@ class Evolution(retrim.OnlineLearner):
         weights, tree = ravel_pytree(state.policy.params)
         noise = 0.01 * jax.random.normal(key, (self.num_updates, 8, weights.size), weights.dtype)
 
-        def update(w, given):
-            x0, noise = given
+        def update(w, gradient):
+            x0, noise = gradient
             cost = lambda w: retrim.policy_loss(state.policy.with_params(tree(w)).merged(), env, x0)
             uphill = jax.vmap(lambda e: cost(w + e) - cost(w - e))(noise) @ noise
             return w - self.length * uphill / (1e-9 + jax.numpy.linalg.norm(uphill)), None

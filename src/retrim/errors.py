@@ -43,8 +43,8 @@ def excerpt(value: object, most: int = 60, *, quotes: bool = True) -> str:
         quotes: Whether to put a text in quotation marks.
     """
     text = value[: 4 * most] if isinstance(value, str) else value
-    shown = repr(text) if quotes or not isinstance(text, str) else text
-    return one_line(shown, most)
+    quote = repr(text) if quotes or not isinstance(text, str) else text
+    return one_line(quote, most)
 
 
 class ConfigError(RetrimError, ValueError):

@@ -21,7 +21,7 @@ def ending_signals() -> list[signal.Signals]:
 
 
 @contextlib.contextmanager
-def handled_by(handler: Handler) -> Iterator[None]:
+def handle_signals(handler: Handler) -> Iterator[None]:
     """Call a function on each signal that ends a command; outside the main thread, do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -40,20 +40,20 @@ def handled_by(handler: Handler) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stopped_by(stop: threading.Event) -> Iterator[None]:
+def stop_on_signal(stop: threading.Event) -> Iterator[None]:
     """Make ending signals set ``stop`` and raise KeyboardInterrupt; ``stop`` stays set if JAX swallows the error."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
         raise KeyboardInterrupt
 
-    def swallowed(error: "sys.UnraisableHookArgs") -> None:
+    def report_signal(error: "sys.UnraisableHookArgs") -> None:
         if not isinstance(error.exc_value, KeyboardInterrupt):
             sys.__unraisablehook__(error)
 
-    hook, sys.unraisablehook = sys.unraisablehook, swallowed
+    hook, sys.unraisablehook = sys.unraisablehook, report_signal
     try:
-        with handled_by(handle):
+        with handle_signals(handle):
             yield
     finally:
         sys.unraisablehook = hook

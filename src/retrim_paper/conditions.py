@@ -25,15 +25,19 @@ def conditions(preset: Preset, sensors: str = "ideal") -> dict[str, Scenario]:
     result = _at_hover() if preset.track is None else _on_references(preset, preset.track.reference.split("+"))
     if sensors == "ideal":
         return result
-    measured = {name: flown for name, flown in result.items() if flown.sensors == "ideal" and flown.entry.has_sensors}
-    return {name: replace(flown, sensors=sensors) for name, flown in measured.items()}
+    ideal_scenarios = {
+        name: scenario
+        for name, scenario in result.items()
+        if scenario.sensors == "ideal" and scenario.entry.has_sensors
+    }
+    return {name: replace(scenario, sensors=sensors) for name, scenario in ideal_scenarios.items()}
 
 
 def _on_references(preset: Preset, references: Sequence[str]) -> dict[str, Scenario]:
     result = {
         f"{reference}/{name}": Scenario(disturbance, sensors=sensors, reference=reference)
         for reference in references
-        for name, (disturbance, sensors) in FLOWN.items()
+        for name, (disturbance, sensors) in WEATHERS.items()
     }
     first, own = references[0], make_vehicle(preset.vehicle)
     others = {"slow-motors": _like(own, "slow-motors", motor_tau=2.0)}
@@ -48,7 +52,7 @@ def _on_references(preset: Preset, references: Sequence[str]) -> dict[str, Scena
     return result
 
 
-FLOWN = {
+WEATHERS = {
     "none": ("none", "ideal"),
     "large": ("large", "ideal"),
     "step": ("step", "ideal"),

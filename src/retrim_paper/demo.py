@@ -13,7 +13,7 @@ from retrim.evaluation.metrics import rows
 from retrim.evaluation.study import Study, fly_all
 from retrim.runkit.document import TableSection
 from retrim.runkit.interrupts import interrupts_only_set
-from retrim.runkit.outputs import write_events, write_trained
+from retrim.runkit.outputs import write_events, write_trained_policy
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 from retrim.runkit.training import nominal_error, train
@@ -22,7 +22,7 @@ from .slow_vehicle import UPDATES, fly_slow_vehicle
 from .tables.hover import PAPER
 from .tables.levels import LEVELS, level_table
 
-SHOWN = ("base", "full")
+REPORT_METHODS = ("base", "full")
 MOST = 4  # largest number of starts for the second quadrotor
 WHY = {
     "hover/retrim": "an observer answers within milliseconds; a closed-form residual and short updates follow",
@@ -74,14 +74,14 @@ def demonstrate(
     reporter.say(f"{scenario.vehicle_name(preset.vehicle)} quadrotor on plant {plant}: {scenario.entry.about}")
     policy, losses = train(setup, seed, reporter=reporter, stop=run.stop)
     if losses:
-        write_trained(run, setup, policy, losses, seed=seed)
+        write_trained_policy(run, setup, policy, losses, seed=seed)
     if run.interrupted:
         reporter.say(f"interrupted while pretraining, after {len(losses)} steps")
         return None
     study = Study(preset, {seed: policy}, (nominal_error(setup, policy),))
     reporter.say(f"hover error in its own model: {1000 * study.errors[0]:.1f} mm")
     scenarios = [replace(scenario, disturbance=level) for level in LEVELS]
-    flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds, keep=False).flown
+    flights = fly_all(study, scenarios, run, reporter, starts=starts, seconds=seconds, keep=False).flights
     result: list[dict[str, Any]] = list(rows(flights))
     second = None
     if slow and not run.interrupted:
@@ -92,8 +92,8 @@ def demonstrate(
         run.write_results(result, seeds=[seed], preset=preset.name, losses=losses)
         write_events(flights, run.folder)
     title = f"hover error [m]: mean ± std over {starts} starts, last 2 s of {seconds:g} s; in brackets the paper's"
-    table = level_table(result, SHOWN, {method: PAPER[method] for method in SHOWN}, title)
-    drawn = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
+    table = level_table(result, REPORT_METHODS, {method: PAPER[method] for method in REPORT_METHODS}, title)
+    pictures = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
     tables = [table] if second is None else [table, second.table]
-    drawn += [] if second is None else second.pictures
-    return Shown(tables, [path for path in drawn if path.suffix == ".png"], run.folder / "hover_large.png")
+    pictures += [] if second is None else second.pictures
+    return Shown(tables, [path for path in pictures if path.suffix == ".png"], run.folder / "hover_large.png")

@@ -59,7 +59,7 @@ CHOICES = {
 }
 
 
-class Trained(NamedTuple):
+class Retraining(NamedTuple):
     """Training result for one choice."""
 
     policy: AbstractPolicy
@@ -70,7 +70,7 @@ class Trained(NamedTuple):
     """Root mean square error of the residual fit [m/s^2]."""
 
 
-def flown(setup: Setup, policy: AbstractPolicy, n: int, seconds: float, seed: int) -> list[Log]:
+def fly_batch_of_policy(setup: Setup, policy: AbstractPolicy, n: int, seconds: float, seed: int) -> list[Log]:
     """Fly a policy from random starts without learning, on the study's plant, as one batch."""
     plants = [Scenario(PUSH, PLANT).make(setup.preset.vehicle, dt=setup.preset.dt) for _ in range(n)]
     controller = PolicyController(setup.flight_task.observation_in_flight, policy)
@@ -97,8 +97,8 @@ def design_dynamics(setup: Setup, residual: Any, choice: Choice) -> AbstractDyna
     return StraightThrough(forward, Hybrid(simple, residual, backprop=True) if choice.backprop else simple)
 
 
-def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Key[Array, ""], choice: Choice, *,
-              fit_epochs: int = FIT_EPOCHS, epochs: int = POLICY_EPOCHS, envs: int = ENVS) -> Trained:  # fmt: skip
+def retrain(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Key[Array, ""], choice: Choice, *,
+              fit_epochs: int = FIT_EPOCHS, epochs: int = POLICY_EPOCHS, envs: int = ENVS) -> Retraining:  # fmt: skip
     """Fit one residual network to flights and re-train the policy with it.
 
     Args:
@@ -118,8 +118,8 @@ def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Ke
     adapt = setup.preset.adapt
     adam = _adam(adapt.fit_learning_rate)
     residual = EnsembleResidual.of(setup.flight_task.home(), setup.vehicle.omega_max, key=k_fit, members=1)
-    fitted, errors = _fitted(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
-    dynamics = design_dynamics(setup, fitted.residual, choice)
+    new_residual, errors = _fit(EnsembleState.of(residual, adam), rows, adam, fit_epochs)
+    dynamics = design_dynamics(setup, new_residual.residual, choice)
     env = Env(dynamics, setup.env.task, setup.env.delay, longest_delay=setup.env.longest_delay)
     optimiser = _of_policy(adapt.learning_rate, adapt.max_grad_norm or math.inf, epochs)
     state = PolicyState(policy, optimiser.init(policy.params))
@@ -130,7 +130,7 @@ def retrained(setup: Setup, policy: AbstractPolicy, logs: Sequence[Log], key: Ke
         times.append(time.perf_counter() - began)
         state = after if len(times) > 1 else state
     run = float(np.median(times[1:]))
-    return Trained(state.policy.merged(), times[0] - run, [t / CHUNK for t in times[1:]], float(errors[-1]) ** 0.5)
+    return Retraining(state.policy.merged(), times[0] - run, [t / CHUNK for t in times[1:]], float(errors[-1]) ** 0.5)
 
 
 def _nominal(setup: Setup, choice: Choice) -> AbstractDynamics[Any]:
@@ -162,7 +162,7 @@ def _rows(windows: Window, nominal: AbstractDynamics[Any], delay_ticks: int) -> 
 
 
 @eqx.filter_jit
-def _fitted(
+def _fit(
     state: EnsembleState, rows: Targets, optimiser: optax.GradientTransformation, steps: int
 ) -> tuple[EnsembleState, Array]:
     return fit_ensemble(state, rows, optimiser=optimiser, steps=steps, spectral_weight=1e-3)

@@ -29,7 +29,7 @@ JOINED = 0.5  # [s], time in which both ends find each other
 LONGEST, ANSWERS = 60.0, 20.0  # [s], time limits for all messages of a size, and for a rosmaster's answer
 
 
-def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
+def measure_latencies(bus: Bus, words: Sequence[str], size: int) -> list[float]:
     """Return the message latencies [s], measured by the monotonic clock that both processes share.
 
     Args:
@@ -37,19 +37,19 @@ def measured(bus: Bus, words: Sequence[str], size: int) -> list[float]:
         words: Command that starts the other process, without the size.
         size: Size of a message [bytes].
     """
-    known = getattr(bus.latest("message"), "version", 0)
+    version = getattr(bus.latest("message"), "version", 0)
     writer = subprocess.Popen([*words, str(size)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     took: dict[int, float] = {}
     until = time.monotonic() + LONGEST
     while time.monotonic() < until and writer.poll() is None and FIRST + COUNT - 1 not in took:
-        message = bus.latest("message", known)
+        message = bus.latest("message", version)
         if message is None:
             time.sleep(5e-5)
             continue
-        known, now = message.version, time.monotonic_ns()
+        version, now = message.version, time.monotonic_ns()
         if len(message.data) == size:
-            number, sent = (int.from_bytes(message.data[i : i + 8], "little") for i in (0, 8))
-            took[number] = 1e-9 * (now - sent)
+            number, send_ns = (int.from_bytes(message.data[i : i + 8], "little") for i in (0, 8))
+            took[number] = 1e-9 * (now - send_ns)
     writer.kill()
     writer.wait()
     return [seconds for number, seconds in took.items() if number >= FIRST]
@@ -113,11 +113,11 @@ def two_machines() -> Iterator[tuple[str, Sequence[str]] | None]:
         f"ip netns exec {name} ip link set {there} up",
         f"ip netns exec {name} ip link set lo up",
     )
-    made = shutil.which("ip") is not None and all(
+    is_available = shutil.which("ip") is not None and all(
         subprocess.run(step.split(), capture_output=True, check=False).returncode == 0 for step in steps
     )
     try:
-        yield ("10.213.7.1", inside) if made else None
+        yield ("10.213.7.1", inside) if is_available else None
     finally:
         if shutil.which("ip") is not None:
             subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)

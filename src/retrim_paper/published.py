@@ -17,13 +17,13 @@ GOLDEN_HOVER = (
 )  # rad/s, N: Agilicious
 
 
-def published() -> list[dict[str, Any]]:
+def compare_published() -> list[dict[str, Any]]:
     """Return our figures next to the published ones."""
     big, little = five_inch(), three_inch()
-    still = Settled(big, 1109.15, 0.0, 0.0)
-    low = Settled(little, 1548.8, 0.0, 0.0)
-    side = Settled(big, 1109.15, 3.0, 0.0)
-    up, down = Settled(big, 1109.15, 0.0, -0.5), Settled(big, 1109.15, 0.0, 0.0)
+    still = SteadyRotor(big, 1109.15, 0.0, 0.0)
+    low = SteadyRotor(little, 1548.8, 0.0, 0.0)
+    side = SteadyRotor(big, 1109.15, 3.0, 0.0)
+    up, down = SteadyRotor(big, 1109.15, 0.0, -0.5), SteadyRotor(big, 1109.15, 0.0, 0.0)
     damping = FRAME_FACTOR * 4 * (down.thrust - up.thrust) / 0.5 / 0.752
     return [
         _row("thrust coefficient, 5.1 in, hover [1e-6 N s^2]", 1e6 * still.thrust / 1109.15**2, 1.5625, "thrust map"),
@@ -39,13 +39,13 @@ def published() -> list[dict[str, Any]]:
         ),
         _row("axial damping, kingfisher, climbing [1/s]", damping, 0.37, "recomputed"),
         *(
-            _row(f"thrust, {int(w)} rad/s [N]", Settled(big, w, 0.0, 0.0).thrust, T, "Agilicious")
+            _row(f"thrust, {int(w)} rad/s [N]", SteadyRotor(big, w, 0.0, 0.0).thrust, T, "Agilicious")
             for w, T in GOLDEN_HOVER
         ),
     ]
 
 
-class Settled:
+class SteadyRotor:
     """Forces and induced velocity of one rotor in steady air."""
 
     def __init__(self, prop: Propeller, omega: float, v_hor: float, v_ver: float) -> None:

@@ -48,12 +48,12 @@ class SlowVehicle(NamedTuple):
 
 
 def fly_slow_vehicle(
-    known: Study, family: Preset, run: Run, reporter: Reporter, *, starts: int, seed: int
+    known_study: Study, family: Preset, run: Run, reporter: Reporter, *, starts: int, seed: int
 ) -> SlowVehicle | None:
     """Fly a quadrotor with a slow rate loop by a policy for a different vehicle, INDI, and a policy for many vehicles.
 
     Args:
-        known: Policy for one vehicle.
+        known_study: Policy for one vehicle.
         family: Preset for a policy for many vehicles, which is trained here.
         run: Run whose folder receives the picture.
         reporter: Receives lines and progress.
@@ -70,11 +70,11 @@ def fly_slow_vehicle(
     if run.interrupted:
         return None
     many = Study(family, {seed: policy}, ())
-    told = replace(known, preset=replace(known.preset, vehicle=slow_quadrotor()))
+    informed_study = replace(known_study, preset=replace(known_study.preset, vehicle=slow_quadrotor()))
     entrants = (
-        Entrant(known, "base", "not known"),
-        Entrant(known, "indi", "not known"),
-        Entrant(told, "indi", "known"),
+        Entrant(known_study, "base", "not known"),
+        Entrant(known_study, "indi", "not known"),
+        Entrant(informed_study, "indi", "known"),
         Entrant(many, "base-id", "identified in flight"),
     )
     flights = [_fly(each, scenario, run, reporter, starts) for each in entrants]
@@ -83,20 +83,22 @@ def fly_slow_vehicle(
     lines = [_line(each, own) for each, own in zip(entrants, flights, strict=True)]
     columns = ("method", "vehicle", "lost", "error, last 2 s [m]", "peak after the push [m]")
     title = f"One quadrotor with a rate loop of 100 ms, a push of 2 m/s² per axis at 4 s, {starts} starts"
-    shown = [flight for each, own in zip(entrants, flights, strict=True) if each.vehicle != "known" for flight in own]
-    drawn = picture(shown, setup, scenario, run.folder, stem="slow_vehicle", title=FIGURE, labels=LABELS)
+    shown_flights = [
+        flight for each, own in zip(entrants, flights, strict=True) if each.vehicle != "known" for flight in own
+    ]
+    pictures = picture(shown_flights, setup, scenario, run.folder, stem="slow_vehicle", title=FIGURE, labels=LABELS)
     result = [
         row | {"preset": each.study.preset.name, "vehicle_known": each.vehicle}
         for each, own in zip(entrants, flights, strict=True)
         for row in rows(own)
     ]
-    return SlowVehicle(TableSection(columns, tuple(lines), title), result, drawn)
+    return SlowVehicle(TableSection(columns, tuple(lines), title), result, pictures)
 
 
 def _fly(each: Entrant, scenario: Scenario, run: Run, reporter: Reporter, starts: int) -> list[Flight]:
     return fly_all(
         each.study, [scenario], run, reporter, methods=(each.method,), starts=starts, seconds=SECONDS, keep=False
-    ).flown
+    ).flights
 
 
 def _line(each: Entrant, flights: Sequence[Flight]) -> tuple[str, ...]:

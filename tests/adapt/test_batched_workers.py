@@ -34,8 +34,8 @@ def fleet():
         workers = []
         for i, window in enumerate(windows):
             state = learner.init(low_rank, random.key(i))
-            fitted, _ = learner.fit_residual(state.residual, window)
-            workers.append(PolicyWorker(learner, type(state)(state.policy, fitted), random.key(i)))
+            fit_result, _ = learner.fit_residual(state.residual, window)
+            workers.append(PolicyWorker(learner, type(state)(state.policy, fit_result), random.key(i)))
         return learner, workers, windows
 
 
@@ -49,9 +49,9 @@ def test_a_base_serves_a_vehicle_that_has_learnt_nothing(fleet):
     first = base = shared_base(workers[0])
     for i in range(40):
         base = learn_base(workers, windows, base, random.key(i))
-    corrected = learner.view(learner.env, FittedResidual(learner.residual_model, workers[0].state.residual))
+    correction = learner.view(learner.env, FittedResidual(learner.residual_model, workers[0].state.residual))
     starts = draw_starts(learner.env.task, random.key(9), 32)
-    before, after = (float(policy_loss(each.policy, corrected, starts)) for each in (first, base))
+    before, after = (float(policy_loss(each.policy, correction, starts)) for each in (first, base))
     assert after < before - 0.01 * abs(before)
 
 
@@ -61,8 +61,8 @@ def test_a_step_that_is_not_finite_changes_nothing(fleet):
     state = workers[0].state
     sick = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), state.policy.policy.params)
     policy = PolicyState(state.policy.policy.with_params(sick), state.policy.optimiser)
-    broken = PolicyWorker(learner, type(state)(policy, state.residual), random.key(0))
-    after = learn_base([broken, workers[1]], windows, base, random.key(0))
+    bad = PolicyWorker(learner, type(state)(policy, state.residual), random.key(0))
+    after = learn_base([bad, workers[1]], windows, base, random.key(0))
     np.testing.assert_array_equal(weights(after), weights(base))
 
 
@@ -70,10 +70,10 @@ def test_deltas_go_on_from_the_shared_base(fleet):
     _, workers, windows = fleet
     base = learn_base(workers, windows, shared_base(workers[0]), random.key(0))
     updates = learn_together(workers, windows, base)
-    taken = [update.state.policy.base for update in updates if isinstance(update, PolicyUpdate)]
-    for each in taken:
+    extract = [update.state.policy.base for update in updates if isinstance(update, PolicyUpdate)]
+    for each in extract:
         np.testing.assert_array_equal(each.layers[0].weight, base.policy.layers[0].weight)
-    assert taken
+    assert extract
 
 
 def test_a_fit_of_many_is_each_ones_own(fleet):
@@ -88,7 +88,7 @@ def test_a_fit_of_many_is_each_ones_own(fleet):
             np.testing.assert_allclose(a, b, atol=1e-9)
 
 
-class Doubled(ResidualWorker):
+class DoubleLinear(ResidualWorker):
     """Computes something else than the class from which it inherits."""
 
     def learn(self, window):
@@ -101,10 +101,10 @@ class Renamed(PolicyWorker):
 
 def test_a_worker_with_its_own_computation_is_not_stacked(fleet):
     learner, workers, windows = fleet
-    assert [each.stackable for each in (Worker, ResidualWorker, PolicyWorker, Doubled, Renamed)] == [
+    assert [each.stackable for each in (Worker, ResidualWorker, PolicyWorker, DoubleLinear, Renamed)] == [
         False, True, True, False, True
     ]  # fmt: skip
-    doubled = [Doubled(learner, worker.state) for worker in workers]
+    doubled = [DoubleLinear(learner, worker.state) for worker in workers]
     assert [update.reason for update in learn_together(doubled, windows)] == ["doubled"] * 2
     with pytest.raises(ValueError, match="low-rank"):
         shared_base(doubled[0])

@@ -38,14 +38,14 @@ class Refuses(Worker):
     layer = "policy"
 
     def __init__(self):
-        self.windows, self.received = 0, []
+        self.windows, self.updates = 0, []
 
     def learn(self, window):
         self.windows += 1
         return Rejection(float(window.t[-1]), "policy", f"window {self.windows}")
 
     def receive(self, update):
-        self.received.append(update)
+        self.updates.append(update)
 
 
 class WithWorker(OnlineLearner):
@@ -73,8 +73,8 @@ def names():
     register_method("mine", learning_method("mine", lambda setup, policy, key: policy))
     yield
     for name in ("doubling", "refusing", "nothing"):
-        del LEARNERS._known[name]
-    del OPTIMISERS._known["sgd"], METHODS._known["mine"]
+        del LEARNERS._objects[name]
+    del OPTIMISERS._objects["sgd"], METHODS._objects["mine"]
 
 
 def setup_of(**adapt):
@@ -90,10 +90,10 @@ def test_a_learner_replaces_the_training_and_nothing_else():
     updates = [event for event in log.events if event.kind in ("policy", "rejected")]
     assert updates
     assert any(event.kind == "residual" for event in log.events)
-    trained = pilots[0].state.policy.policy
-    accepted = sum(event.kind == "policy" for event in updates)
-    for new, old in zip(jax.tree.leaves(trained.params), jax.tree.leaves(policy.params), strict=True):
-        np.testing.assert_allclose(new, old + accepted * Doubling.amount, atol=1e-6)
+    trained_policy = pilots[0].state.policy.policy
+    accepted_command = sum(event.kind == "policy" for event in updates)
+    for new, old in zip(jax.tree.leaves(trained_policy.params), jax.tree.leaves(policy.params), strict=True):
+        np.testing.assert_allclose(new, old + accepted_command * Doubling.amount, atol=1e-6)
     assert Plan.of(pilots[1]) is not None  # batches use the same functions
 
 
@@ -108,7 +108,7 @@ def test_a_worker_of_one_s_own_flies_alone_and_in_a_fleet():
     notes = [event.note for event in log.events if event.kind == "rejected"]
     assert notes == [f"window {i + 1}" for i in range(len(notes))]
     assert len(notes) >= 1
-    assert worker.received
+    assert worker.updates
     window = pilot._buffer.window()
     updates = learn_together([Refuses(), Refuses()], [window, window])
     assert [type(update) for update in updates] == [Rejection, Rejection]

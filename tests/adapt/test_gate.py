@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
 @pytest.fixture(scope="module")
-def trained():
+def train_gate_case():
     """The environment of a preset, a fresh policy and one that hovers better."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset())
@@ -25,28 +25,28 @@ def verdict(candidate, incumbent, env):
     return judge(candidate, incumbent, env, draw_starts(env.task, random.key(5), 4))
 
 
-def broken(policy):
+def break_policy(policy):
     return eqx.tree_at(lambda p: p.layers[1].bias, policy, policy.layers[1].bias.at[3].set(jnp.nan))
 
 
-def test_gate_admits_the_better_and_refuses_the_worse(trained):
-    env, fresh, better = trained
-    found = verdict(better, fresh, env)
-    assert bool(found.admitted)
-    assert float(found.candidate) < float(found.incumbent)
-    found = verdict(fresh, better, env)
-    assert not bool(found.admitted)
-    assert "worse than the incumbent" in found.reason()
+def test_gate_admits_the_better_and_refuses_the_worse(train_gate_case):
+    env, fresh, better = train_gate_case
+    result = verdict(better, fresh, env)
+    assert bool(result.admitted)
+    assert float(result.candidate) < float(result.incumbent)
+    result = verdict(fresh, better, env)
+    assert not bool(result.admitted)
+    assert "worse than the incumbent" in result.reason()
 
 
-def test_gate_refuses_nan_by_name(trained):
-    env, fresh, _ = trained
-    found = verdict(broken(fresh), fresh, env)
-    assert not bool(found.admitted)
-    assert found.reason() == "a weight is not finite"
+def test_gate_refuses_nan_by_name(train_gate_case):
+    env, fresh, _ = train_gate_case
+    result = verdict(break_policy(fresh), fresh, env)
+    assert not bool(result.admitted)
+    assert result.reason() == "a weight is not finite"
 
 
-def test_gate_admits_an_equal_and_replaces_a_broken_incumbent(trained):
-    env, fresh, _ = trained
+def test_gate_admits_an_equal_and_replaces_a_broken_incumbent(train_gate_case):
+    env, fresh, _ = train_gate_case
     assert bool(verdict(fresh, fresh, env).admitted)
-    assert bool(verdict(fresh, broken(fresh), env).admitted)
+    assert bool(verdict(fresh, break_policy(fresh), env).admitted)

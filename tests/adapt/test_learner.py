@@ -10,7 +10,7 @@ import optax
 import pytest
 from jax import random
 
-from helpers import random_starts, replaced, tiny_preset
+from helpers import random_starts, replace_fields, tiny_preset
 from retrim.adapt import OnlineLearner, RollingBuffer, Verdict
 from retrim.adapt import learner as module
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
@@ -54,7 +54,7 @@ def test_impossible_sizes_are_refused_at_construction(setup, field, value):
 
 def test_a_residual_fit_without_steps_is_refused(setup):
     with pytest.raises(ValueError, match=r"EnsembleModel\.steps = 0"):
-        replaced(setup.learner.residual_model, steps=0)
+        replace_fields(setup.learner.residual_model, steps=0)
 
 
 def test_a_fresh_residual_predicts_nothing(setup, fresh):
@@ -71,8 +71,8 @@ def test_a_fit_finds_the_push_and_goes_on_from_where_it_ended(setup, fresh, wind
         assert bool(report.accepted)
         errors.append(float(report.rms_error))
     assert errors[-1] < 0.5 * errors[0]
-    found = learner.residual_model.predict(residual, jax.tree.map(lambda leaf: leaf[20], window.x), Command.hover())
-    np.testing.assert_allclose(found, [0.5, 0.0, 0.0], atol=0.1)
+    result = learner.residual_model.predict(residual, jax.tree.map(lambda leaf: leaf[20], window.x), Command.hover())
+    np.testing.assert_allclose(result, [0.5, 0.0, 0.0], atol=0.1)
 
 
 def test_a_fit_that_is_not_finite_is_dropped(setup, fresh):
@@ -80,18 +80,18 @@ def test_a_fit_that_is_not_finite_is_dropped(setup, fresh):
     buffer = RollingBuffer(40)
     for i in range(10):
         buffer.push(0.02 * i, State.at(jnp.array([0.0, 0.0, 1.0 + float("nan") * (i == 5)])), Command.hover())
-    kept, report = learner.fit_residual(state.residual, buffer.window())
+    rest, report = learner.fit_residual(state.residual, buffer.window())
     assert not bool(report.accepted)
-    jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
+    jax.tree.map(np.testing.assert_array_equal, rest, state.residual)
 
 
 def test_a_window_without_a_whole_row_is_dropped(setup, fresh):
     learner, state = setup.learner, fresh
     buffer = RollingBuffer(40)
     buffer.push(0.0, State.at(jnp.array([0.0, 0.0, 1.0])), Command.hover())
-    kept, report = learner.fit_residual(state.residual, buffer.window())
+    rest, report = learner.fit_residual(state.residual, buffer.window())
     assert not bool(report.accepted)
-    jax.tree.map(np.testing.assert_array_equal, kept, state.residual)
+    jax.tree.map(np.testing.assert_array_equal, rest, state.residual)
 
 
 def test_the_rate_falls_along_a_cosine():
@@ -110,7 +110,7 @@ def test_the_rate_falls_along_a_cosine():
 def test_a_gradient_is_clipped_by_its_norm(kind):
     """A huge gradient after small ones moves Adam no farther than one at the limit."""
 
-    def moved(huge):
+    def move(huge):
         optimiser = kind(jnp.array(1e-3), jnp.array(0.5)).transformation(3)
         params = jnp.zeros(4)
         memory = optimiser.init(params)
@@ -118,10 +118,10 @@ def test_a_gradient_is_clipped_by_its_norm(kind):
             change, memory = optimiser.update(jnp.full(4, gradient), memory, params)
         return change
 
-    moved = jax.jit(moved)
+    move = jax.jit(move)
 
-    np.testing.assert_allclose(moved(1e6), moved(0.25))  # four of 0.25 have the norm 0.5
-    assert not np.allclose(moved(0.1), moved(0.25))
+    np.testing.assert_allclose(move(1e6), move(0.25))  # four of 0.25 have the norm 0.5
+    assert not np.allclose(move(0.1), move(0.25))
 
 
 @pytest.mark.usefixtures("optax_promotion")
@@ -164,8 +164,8 @@ def test_every_update_of_a_carried_adam_moves_as_far_as_the_first(setup):
     for _ in range(4):
         state, far = begin(state), []
         for _ in range(num):
-            state, moved = step(state)
-            far.append(float(moved))
+            state, shift = step(state)
+            far.append(float(shift))
         steps.append(far)
     np.testing.assert_allclose(steps, np.tile(0.01 * (1.0 - 0.9 ** np.arange(1, num + 1)), (4, 1)), rtol=1e-4)
 
@@ -173,7 +173,7 @@ def test_every_update_of_a_carried_adam_moves_as_far_as_the_first(setup):
 def test_the_papers_update_is_untouched_by_the_levers(setup, fresh, window):
     """Written out by hand: task starts, a fresh Adam along a cosine, the world as it is."""
     learner, state = setup.learner, fresh
-    trained, _ = learner.update_policy(state.policy, state.residual, window, random.key(8))
+    trained_policy, _ = learner.update_policy(state.policy, state.residual, window, random.key(8))
 
     @eqx.filter_jit
     def by_hand(policy, residual):
@@ -188,8 +188,8 @@ def test_the_papers_update_is_untouched_by_the_levers(setup, fresh, window):
         return bptt(PolicyState(policy, adam.init(policy.params)), env, x0, optimiser=adam)[0]
 
     expected = by_hand(state.policy.policy, state.residual)
-    for found, wanted in zip(trained.policy.layers, expected.policy.layers, strict=True):
-        np.testing.assert_allclose(found.weight, wanted.weight, rtol=1e-9, atol=1e-12)
+    for result, target in zip(trained_policy.policy.layers, expected.policy.layers, strict=True):
+        np.testing.assert_allclose(result.weight, target.weight, rtol=1e-9, atol=1e-12)
 
 
 def test_each_update_starts_a_fresh_optimiser(setup, fresh, window):
@@ -205,23 +205,23 @@ def test_each_update_starts_a_fresh_optimiser(setup, fresh, window):
 def test_an_update_trains_in_the_corrected_model(setup, fresh, window):
     """With a residual that was fitted to a push, the same update gives another policy than without."""
     learner, state = setup.learner, fresh
-    fitted, _ = learner.fit_residual(state.residual, window)
+    fit_result, _ = learner.fit_residual(state.residual, window)
     plain, before = learner.update_policy(state.policy, state.residual, window, random.key(1))
-    pushed, after = learner.update_policy(state.policy, fitted, window, random.key(1))
+    with_push, after = learner.update_policy(state.policy, fit_result, window, random.key(1))
     assert float(after.incumbent) > float(before.incumbent)  # it is pushed away from the goal
-    assert not np.array_equal(plain.policy.layers[0].weight, pushed.policy.layers[0].weight)
+    assert not np.array_equal(plain.policy.layers[0].weight, with_push.policy.layers[0].weight)
 
 
 def test_the_gate_flies_other_starts_than_training(setup, fresh, window, monkeypatch):
     """Four of the task that no step trained on, and four states of the window's valid ticks."""
-    trained_on, judged_on = [], []
+    training_starts, gate_starts = [], []
 
     def training(state, env, x0, *, optimiser):
-        trained_on.append(x0)
+        training_starts.append(x0)
         return state, jnp.zeros(3)
 
     def judging(candidate, incumbent, env, x0):
-        judged_on.append(x0)
+        gate_starts.append(x0)
         return Verdict(jnp.array(True), jnp.array(True), jnp.array(0.0), jnp.array(0.0))
 
     monkeypatch.setattr(module, "bptt", training)
@@ -231,15 +231,15 @@ def test_the_gate_flies_other_starts_than_training(setup, fresh, window, monkeyp
     @eqx.filter_jit
     def starts_of(state, window):
         OnlineLearner.update_policy.__wrapped__(learner, state.policy, state.residual, window, random.key(1))
-        return trained_on, judged_on
+        return training_starts, gate_starts
 
     half = eqx.tree_at(lambda w: w.valid, window, jnp.arange(40) >= 30)
     (starts,), (gate,) = jax.tree.map(np.asarray, starts_of(state, half))
     assert starts.x.p.shape == (3, 4, 3)
     assert gate.x.p.shape == (8, 3)
-    seen = starts.x.p.reshape(-1, 3)
+    observation = starts.x.p.reshape(-1, 3)
     for p in gate.x.p[:4]:
-        assert np.linalg.norm(seen - p, axis=1).min() > 1e-6
+        assert np.linalg.norm(observation - p, axis=1).min() > 1e-6
     for t, p in zip(gate.t[4:], gate.x.p[4:], strict=True):
         row = round(float(t) / 0.02)
         assert row >= 30
@@ -267,8 +267,8 @@ def test_low_rank_updates_leave_the_base(low_rank):
 def test_a_low_rank_delta_has_a_learning_rate_of_its_own(low_rank):
     """Adam's first step is as long as the rate; all weights keep theirs, as the paper's update shows."""
     policy, after = low_rank
-    moved = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), after.policy.delta, policy.delta)
-    assert max(jax.tree.leaves(moved)) == pytest.approx(0.04, rel=1e-3)
+    shift = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), after.policy.delta, policy.delta)
+    assert max(jax.tree.leaves(shift)) == pytest.approx(0.04, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["ensemble", "regression", "layered", "linear", "place"])
@@ -276,7 +276,7 @@ def test_what_was_learnt_has_the_types_of_nothing_learnt(window, name, key):
     """Weak types, too: a program that took the first state must not be compiled again for the second, in flight."""
     learner = Setup.from_preset(tiny_preset(adapt={"residual": name, "fit_steps": 2})).learner
     fresh = jax.eval_shape(learner.residual_model.init, key)
-    fitted, _ = eqx.filter_eval_shape(type(learner).fit_residual, learner, fresh, window)
+    fit_result, _ = eqx.filter_eval_shape(type(learner).fit_residual, learner, fresh, window)
     types = lambda tree: [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(tree)]  # noqa: E731
-    assert types(fitted) == types(fresh)
+    assert types(fit_result) == types(fresh)
     assert not any(weak for _, _, weak in types(fresh))

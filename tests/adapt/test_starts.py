@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import hover_task, random_starts, random_state, replaced
-from retrim.adapt.starts import FlownStarts, TaskStarts
+from helpers import hover_task, random_starts, random_state, replace_fields
+from retrim.adapt.starts import TaskStarts, WindowStarts
 from retrim.learn import Window
 
-drawn = eqx.filter_jit(lambda starts, *more: starts(*more))
+pictures = eqx.filter_jit(lambda starts, *more: starts(*more))
 
 
 @pytest.fixture
@@ -20,22 +20,22 @@ def window(key):
     x = jax.vmap(random_state)(random.split(key, 20))
     p = 7.0 + 0.01 * jnp.arange(20.0)[:, None] + jnp.zeros((1, 3))
     u = jnp.zeros((20, 3))
-    made = Window.of(0.02 * jnp.arange(20.0), p.at[:5].set(100.0), x.R, x.v, jnp.full(20, 9.81), u)
-    return Window(made.t, made.x, made.u, jnp.arange(20) >= 5)
+    setup = Window.of(0.02 * jnp.arange(20.0), p.at[:5].set(100.0), x.R, x.v, jnp.full(20, 9.81), u)
+    return Window(setup.t, setup.x, setup.u, jnp.arange(20) >= 5)
 
 
 def test_the_papers_starts_are_those_of_training(window, key):
-    found = drawn(TaskStarts(), hover_task(), window, key, 3, 4)
-    jax.tree.map(np.testing.assert_array_equal, found, random_starts(hover_task(), key, 3, 4))
+    result = pictures(TaskStarts(), hover_task(), window, key, 3, 4)
+    jax.tree.map(np.testing.assert_array_equal, result, random_starts(hover_task(), key, 3, 4))
 
 
 @pytest.mark.parametrize("from_task", [0, 2, 4, 9])
 def test_flown_starts_lie_where_the_vehicle_was(window, key, from_task):
     task = hover_task()
-    found = drawn(FlownStarts(jnp.array(0.0), from_task), task, window, key, 5, 4)
-    assert found.x.R.shape == (5, 4, 3, 3)
+    result = pictures(WindowStarts(jnp.array(0.0), from_task), task, window, key, 5, 4)
+    assert result.x.R.shape == (5, 4, 3, 3)
     far = min(from_task, 4)
-    p = np.asarray(found.x.p)
+    p = np.asarray(result.x.p)
     assert (np.abs(p[:, :far] - np.array([0.0, 0.0, 1.0])) <= 1.0).all()  # the task's box
     rows = np.asarray(window.x.p)
     for each in p[:, far:].reshape(-1, 3):
@@ -45,17 +45,17 @@ def test_flown_starts_lie_where_the_vehicle_was(window, key, from_task):
 
 
 def test_their_noise_has_the_stated_size(window, key):
-    exact, noisy = (drawn(FlownStarts(jnp.array(s), 0), hover_task(), window, key, 50, 40) for s in (0.0, 0.1))
+    exact, noisy = (pictures(WindowStarts(jnp.array(s), 0), hover_task(), window, key, 50, 40) for s in (0.0, 0.1))
     for name in ("p", "v"):
-        moved = np.asarray(getattr(noisy.x, name)) - np.asarray(getattr(exact.x, name))
-        assert moved.std() == pytest.approx(0.1, rel=0.05)
+        shift = np.asarray(getattr(noisy.x, name)) - np.asarray(getattr(exact.x, name))
+        assert shift.std() == pytest.approx(0.1, rel=0.05)
     np.testing.assert_array_equal(noisy.x.R, exact.x.R)
     np.testing.assert_array_equal(noisy.t, exact.t)
 
 
 def test_a_start_is_of_the_time_at_which_its_state_was_so(window, key):
     """Of an old measurement that is earlier, or a start would be behind the reference."""
-    old = replaced(window, age=jnp.full_like(window.t, 0.03))
-    now, then = (drawn(FlownStarts(jnp.array(0.0), 0), hover_task(), each, key, 3, 4) for each in (window, old))
+    old = replace_fields(window, age=jnp.full_like(window.t, 0.03))
+    now, then = (pictures(WindowStarts(jnp.array(0.0), 0), hover_task(), each, key, 3, 4) for each in (window, old))
     np.testing.assert_array_equal(now.x.p, then.x.p)
     np.testing.assert_allclose(then.t, now.t - 0.03, atol=1e-12)

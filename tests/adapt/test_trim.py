@@ -8,7 +8,7 @@ import pytest
 from jax import random
 
 from helpers import GOAL, hover_env
-from retrim.adapt.trim import RestTrim, Untrimmed
+from retrim.adapt.trim import NoTrim, RestTrim
 from retrim.adapt.views import GravityView, WorldView
 from retrim.config import Setup, changed, load
 from retrim.control import LoraPolicy, Policy
@@ -18,7 +18,7 @@ from retrim.physics import Command, State, small, so3
 from retrim.tasks import Start
 
 TRIM, HOME = eqx.filter_jit(RestTrim()), jnp.array(GOAL)
-rolled = eqx.filter_jit(rollout)
+roll = eqx.filter_jit(rollout)
 low_rank = eqx.filter_jit(LoraPolicy.of)
 
 
@@ -53,7 +53,7 @@ def test_a_trimmed_policy_rests_at_home_under_a_push(key, d, lora):
     frame = env.frame(State.at(HOME), Command.hover())
     R = so3.mul(frame.Q.T, so3.rotz(jnp.array(0.7)))  # it leans as the push wants it to
     start = Start(jnp.array(0.0), State(HOME, R, jnp.zeros(3)))
-    before, after = (rolled(env, each.merged(), start) for each in (policy, TRIM(policy, env, window_of(R))))
+    before, after = (roll(env, each.merged(), start) for each in (policy, TRIM(policy, env, window_of(R))))
     np.testing.assert_allclose(after.x.p, np.broadcast_to(HOME, (20, 3)), atol=1e-9)
     np.testing.assert_allclose(after.u.c, frame.world_command(Command.hover()).c, rtol=1e-9)
     assert np.abs(np.asarray(before.x.p) - np.array(GOAL)).max() > 0.01
@@ -62,12 +62,14 @@ def test_a_trimmed_policy_rests_at_home_under_a_push(key, d, lora):
 def test_only_the_output_is_shifted(key):
     env = WorldView()(hover_env(horizon=20, history=2), eqx.Partial(always, jnp.zeros(3)))
     policy = awake(key, env.task.observation.size)
-    trimmed = TRIM(policy, env, window_of(jnp.eye(3)))
+    trim_result = TRIM(policy, env, window_of(jnp.eye(3)))
     both = random.normal(key, (2, env.task.observation.size))
-    shift = eqx.filter_jit(lambda trimmed, policy: jax.vmap(lambda o: trimmed.output(o) - policy.output(o))(both))
-    np.testing.assert_allclose(*shift(trimmed, policy), atol=1e-12)
-    jax.tree.map(np.testing.assert_array_equal, trimmed.layers[:-1], policy.layers[:-1])
-    assert Untrimmed()(policy, env, window_of(jnp.eye(3))) is policy
+    shift = eqx.filter_jit(
+        lambda trim_result, policy: jax.vmap(lambda o: trim_result.output(o) - policy.output(o))(both)
+    )
+    np.testing.assert_allclose(*shift(trim_result, policy), atol=1e-12)
+    jax.tree.map(np.testing.assert_array_equal, trim_result.layers[:-1], policy.layers[:-1])
+    assert NoTrim()(policy, env, window_of(jnp.eye(3))) is policy
 
 
 def test_the_heading_is_that_of_the_flight_however_it_leans(key):

@@ -24,23 +24,23 @@ KINDS = ("residual", "policy", "rejected", "skipped")
 SMALL = {"pretrain": {"hidden_sizes": (12, 12)}}
 
 
-def learnt(method):
+def make_learner_state(method):
     """A learner state with numbers in every leaf: weights, moments and counters."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset(**SMALL))
         policy = setup.new_policy(random.key(0))
         state = setup.learner.init(setup.low_rank(policy, random.key(1)) if method == "lora" else policy, random.key(2))
 
-    def filled(leaf):
+    def fill(leaf):
         numbers = np.random.default_rng(leaf.size).normal(size=leaf.shape)
         return jnp.asarray(numbers if jnp.issubdtype(leaf.dtype, jnp.floating) else 37 + leaf, dtype=leaf.dtype)
 
-    return jax.tree.map(filled, state)
+    return jax.tree.map(fill, state)
 
 
 @pytest.fixture(scope="module")
 def states():
-    return {method: learnt(method) for method in METHODS}
+    return {method: make_learner_state(method) for method in METHODS}
 
 
 def updates(state):
@@ -52,15 +52,15 @@ def updates(state):
     }
 
 
-def same(found, wanted):
+def same(result, expected):
     """Bit for bit, types included."""
-    assert type(found) is type(wanted)
-    assert found.computed_from == wanted.computed_from
-    for name in set(wanted.__dataclass_fields__) - {"state"}:
-        assert getattr(found, name) == getattr(wanted, name)
-    if hasattr(wanted, "state"):
-        assert jax.tree.structure(found.state) == jax.tree.structure(wanted.state)
-        for a, b in zip(jax.tree.leaves(found.state), jax.tree.leaves(wanted.state), strict=True):
+    assert type(result) is type(expected)
+    assert result.computed_from == expected.computed_from
+    for name in set(expected.__dataclass_fields__) - {"state"}:
+        assert getattr(result, name) == getattr(expected, name)
+    if hasattr(expected, "state"):
+        assert jax.tree.structure(result.state) == jax.tree.structure(expected.state)
+        for a, b in zip(jax.tree.leaves(result.state), jax.tree.leaves(expected.state), strict=True):
             assert a.dtype == b.dtype
             np.testing.assert_array_equal(a, b)
 
@@ -84,8 +84,8 @@ def test_counters_of_the_optimiser_come_back_as_integers(states, method):
 def test_an_incumbent_without_a_finite_cost_is_still_news(states):
     """A policy that replaces one that diverged."""
     update = PolicyUpdate(1.0, 0.2, float("nan"), states["full"].policy)
-    found = unpack_update(pack_update(update), states["full"], source="test")
-    assert np.isnan(found.incumbent_cost)
+    result = unpack_update(pack_update(update), states["full"], source="test")
+    assert np.isnan(result.incumbent_cost)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -152,9 +152,9 @@ def test_fields_that_do_not_belong(states, kind, plain):
 def test_a_message_without_fields(states):
     with pytest.raises(MessageError, match="not the fields of a 'skipped' update"):
         unpack_update(wire.pack((), kind="skipped", about={}), states["full"], source="test")
-    nested = "[" * 100_000 + "]" * 100_000
+    nesting = "[" * 100_000 + "]" * 100_000
     with pytest.raises(MessageError, match="not the fields of a 'skipped' update"):
-        unpack_update(wire.pack((), kind="skipped", about={"update": nested}), states["full"], source="test")
+        unpack_update(wire.pack((), kind="skipped", about={"update": nesting}), states["full"], source="test")
 
 
 def test_foreign_bytes(states):
@@ -179,9 +179,9 @@ def test_a_state_of_another_shape(states):
 
 def test_integers_where_weights_are_expected(states):
     state = states["full"]
-    counted = eqx.tree_at(lambda s: s.policy.layers[0].bias, state.policy, jnp.zeros(12, dtype=int))
+    count = eqx.tree_at(lambda s: s.policy.layers[0].bias, state.policy, jnp.zeros(12, dtype=int))
     with pytest.raises(MessageError, match="has type int64, expected floating point"):
-        unpack_update(pack_update(PolicyUpdate(1.0, 0.1, 0.2, counted)), state, source="test")
+        unpack_update(pack_update(PolicyUpdate(1.0, 0.1, 0.2, count)), state, source="test")
 
 
 def test_a_structure_is_enough_to_read(states):

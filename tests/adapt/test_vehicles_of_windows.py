@@ -50,11 +50,11 @@ def vehicle(as_a_user):
 
 
 def test_a_window_identifies_the_vehicle(window, vehicle):
-    found = eqx.filter_jit(vehicle.identify)(window)
-    assert float(found.path.delay) == pytest.approx(DELAY, abs=0.008)
-    assert float(found.path.response.thrust_gain) == pytest.approx(GAIN, rel=0.02)
+    result = eqx.filter_jit(vehicle.identify)(window)
+    assert float(result.path.delay) == pytest.approx(DELAY, abs=0.008)
+    assert float(result.path.response.thrust_gain) == pytest.approx(GAIN, rel=0.02)
     true = vehicle.family.coordinates(*(jnp.array(v) for v in (DELAY, LAG, float(ringing_of(1.0)), THRUST_LAG)))
-    low, high = found.belief.ends
+    low, high = result.belief.ends
     assert np.all(low[:2] < true[:2] + 0.05)
     assert np.all(high[:2] > true[:2] - 0.05)
 
@@ -68,19 +68,19 @@ def test_with_the_commands_that_arrived_nothing_is_missing(window, vehicle):
         weight = rows.valid[:, None]
         return jnp.sqrt(jnp.sum(weight * rows.a_res**2) / jnp.sum(weight)), jnp.sum(rows.valid)
 
-    (missed, counted), (without, _) = residual(vehicle), residual(OwnVehicle())
-    assert counted > N // 2
+    (error, count), (without, _) = residual(vehicle), residual(OwnVehicle())
+    assert count > N // 2
     assert float(without) > 1.0
-    assert float(missed) < 0.15 * float(without)
+    assert float(error) < 0.15 * float(without)
 
 
 def test_starts_get_vehicles_from_the_belief(window, vehicle):
     x = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4, 8, *leaf.shape)), State.at(jnp.zeros(3)))
-    found = eqx.filter_jit(vehicle.identify)(window)
+    result = eqx.filter_jit(vehicle.identify)(window)
     starts = eqx.filter_jit(vehicle.assign_vehicles)(
-        jax.vmap(jax.vmap(Start))(jnp.zeros((4, 8)), x), found, random.key(0)
+        jax.vmap(jax.vmap(Start))(jnp.zeros((4, 8)), x), result, random.key(0)
     )
-    belief = found.belief
+    belief = result.belief
     low, high = (vehicle.family.path(end).delay for end in belief.ends)
     delays = starts.member.path.delay
     assert delays.shape == (4, 8)

@@ -35,15 +35,15 @@ def folder(tmp_path_factory, as_a_user):
 
 
 def test_pretrain_writes_policy_and_results(folder):
-    found = results(folder / "p")
+    result = results(folder / "p")
     keys = {"schema", "command", "commit", "versions", "device", "seeds", "compile_s", "run_s", "interrupted", "rows"}
-    assert keys <= found.keys()
-    assert found["command"] == "retrim pretrain hover --config small.toml"
-    assert not found["interrupted"]
-    assert len(found["losses"]) == 150
-    (row,) = found["rows"]
+    assert keys <= result.keys()
+    assert result["command"] == "retrim pretrain hover --config small.toml"
+    assert not result["interrupted"]
+    assert len(result["losses"]) == 150
+    (row,) = result["rows"]
     assert (row["task"], row["preset"], row["updates"], row["envs"]) == ("hover", "hover/retrim", 150, 8)
-    assert row["loss"] == found["losses"][-1] < found["losses"][0]
+    assert row["loss"] == result["losses"][-1] < result["losses"][0]
     assert 0 < row["nominal_error_m"] < 0.5
     policy, preset = load_policy(folder / "p")
     assert preset.pretrain.hidden_sizes == (64, 64)
@@ -52,9 +52,9 @@ def test_pretrain_writes_policy_and_results(folder):
 
 def test_fly_writes_rows_events_logs_and_pictures(folder):
     out = folder / "f"
-    found = results(out)["rows"]
-    assert [row["method"] for row in found] == ["base", "full"]
-    for row in found:
+    result = results(out)["rows"]
+    assert [row["method"] for row in result] == ["base", "full"]
+    for row in result:
         keys = {"disturbance", "method", "plant", "vehicle", "sensors", "thrust_error", "metric", "mean", "std"}
         assert keys | {"median", "peak_after_5s", "n", "crashes", "errors"} <= row.keys()
         assert (row["n"], row["crashes"], len(row["errors"])) == (2, 0, 2)
@@ -66,14 +66,14 @@ def test_fly_writes_rows_events_logs_and_pictures(folder):
     assert len(list((out / "logs").glob("*.npz"))) == 4
     with np.load(out / "logs" / "full_seed0_start1.npz") as log:
         assert log["t"].shape == (101,)
-        assert log["error"][-100:].mean() == pytest.approx(found[1]["errors"][1], rel=1e-5)
+        assert log["error"][-100:].mean() == pytest.approx(result[1]["errors"][1], rel=1e-5)
 
 
 def test_what_was_learnt_is_kept_and_goes_on(folder):
     state, preset = load_learner_state(folder / "f" / "learner_state.safetensors")
     assert preset.name == "hover/retrim"
-    adapted, _ = load_policy(folder / "f" / "adapted.safetensors")
-    np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
+    adapted_policy, _ = load_policy(folder / "f" / "adapted.safetensors")
+    np.testing.assert_array_equal(adapted_policy.layers[0].weight, state.policy.policy.layers[0].weight)
     retrim("fly", "--resume", "f/learner_state.safetensors", *ROUGH, "--seconds", "2", "--out", "r", cwd=folder)
     went_on = results(folder / "r")["rows"]
     assert [row["method"] for row in went_on] == ["base", "full"]
@@ -91,7 +91,7 @@ def test_a_full_disk_loses_no_flight(folder, monkeypatch):
     words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--out", "full"
     out = retrim(*words, cwd=folder, code=1)
     assert "hover error, last 2 s of 2 s, 2 starts" in out
-    (place,) = {Path(found) for found in re.findall(r"\(No space left on device\); it is in (\S+)", out)}
+    (place,) = {Path(result) for result in re.findall(r"\(No space left on device\); it is in (\S+)", out)}
     for name in ("what was learnt", "events.jsonl", "the logs", "results.json"):
         assert f"retrim: {name} cannot be written to full (No space left on device); it is in {place}" in out
     assert results(place)["rows"] == results(folder / "f")["rows"]
@@ -113,7 +113,7 @@ def test_a_flight_repeats_bit_for_bit_and_another_seed_flies_otherwise(folder):
 def test_live_flies_against_the_clock_learns_and_lands(folder):
     out = retrim("live", "--policy", "p", "--disturbance", "small", "--seconds", "5", "--out", "l", cwd=folder)
     assert "flight over: landed" in out
-    found = {row["metric"]: row["value"] for row in results(folder / "l")["rows"]}
+    result = {row["metric"]: row["value"] for row in results(folder / "l")["rows"]}
     assert {
         "missed_ticks",
         "lateness_p99_ms",
@@ -121,11 +121,11 @@ def test_live_flies_against_the_clock_learns_and_lands(folder):
         "step_p99_ms",
         "steady",
         "recovery_5cm",
-    } <= found.keys()
-    assert found["policies"] >= 1
-    assert found["steady"] < 0.4  # as in lockstep; as it is, this small policy is metres off after five seconds
-    assert (found["refused_messages"], found["restarts"]) == (0, 0)
-    assert found["fallback_ticks"] < 125  # of 250: where other tests run, a process may be held back once for 0.1 s
+    } <= result.keys()
+    assert result["policies"] >= 1
+    assert result["steady"] < 0.4  # as in lockstep; as it is, this small policy is metres off after five seconds
+    assert (result["refused_messages"], result["restarts"]) == (0, 0)
+    assert result["fallback_ticks"] < 125  # of 250: where other tests run, a process may be held back once for 0.1 s
     assert load_learner_state(folder / "l" / "learner_state.safetensors")[1].name == "hover/retrim"
     load_policy(folder / "l" / "adapted.safetensors")
     assert (folder / "l" / "live.png").stat().st_size > 10_000
@@ -134,7 +134,7 @@ def test_live_flies_against_the_clock_learns_and_lands(folder):
 
 
 def test_what_live_refuses(folder):
-    for words, said in (
+    for words, text in (
         (("--fence", "0.1"), "--fence 0.1 m must be between 0.5 and 1000"),
         (("--seconds", "0"), "--seconds 0 must be between 1 and 3600"),
         (("--resume", "f/learner_state.safetensors"), "give either --policy FILE or --resume FILE"),
@@ -153,7 +153,7 @@ def test_what_live_refuses(folder):
         (("--record", "flight.bag"), "--record flight.bag: the name must end with .mcap"),
         (("--record", "nowhere/flight.mcap"), "nothing can be written in nowhere"),
     ):
-        assert said in retrim("live", "--policy", "p", *words, "--out", "lx", cwd=folder, code=1)
+        assert text in retrim("live", "--policy", "p", *words, "--out", "lx", cwd=folder, code=1)
     assert "'somewhere' is no address of a bus" in retrim("learn", "somewhere", cwd=folder, code=1)
     assert "zenoh:192.0.2.1:7447: learners beyond" in retrim("learn", "zenoh:192.0.2.1:7447", cwd=folder, code=1)
     assert "no rosmaster at 'http://127.0.0.1:1'" in retrim("learn", "ros:127.0.0.1:1", cwd=folder, code=1)
@@ -167,9 +167,9 @@ def test_fly_with_measured_latency(folder):
 
 def test_what_was_adapted_flies_as_it_is_and_the_default_folder_is_a_new_one_under_runs(folder):
     retrim("fly", "--policy", "f/adapted.safetensors", "--seconds", "2", "--adapt", "none", cwd=folder)
-    (made,) = (folder / "runs").glob("fly-*")
-    assert [row["method"] for row in results(made)["rows"]] == ["base"]
-    assert not (made / "learner_state.safetensors").exists()
+    (setup,) = (folder / "runs").glob("fly-*")
+    assert [row["method"] for row in results(setup)["rows"]] == ["base"]
+    assert not (setup / "learner_state.safetensors").exists()
 
 
 def test_demo_at_reduced_size(folder, monkeypatch):
@@ -185,9 +185,9 @@ def test_demo_at_reduced_size(folder, monkeypatch):
     out = retrim("demo", "--seconds", "2", "--starts", "1", "--out", "d", cwd=folder)
     assert "adapted, all weights" in out
     assert "One quadrotor with a rate loop of 100 ms" in out
-    found = [(r["disturbance"], r["method"]) for r in results(folder / "d")["rows"]]
-    assert found[:6] == [(level, method) for level in ("none", "small", "large") for method in ("base", "full")]
-    assert found[6:] == [("early-step", method) for method in ("base", "indi", "indi", "base-id")]
+    result = [(r["disturbance"], r["method"]) for r in results(folder / "d")["rows"]]
+    assert result[:6] == [(level, method) for level in ("none", "small", "large") for method in ("base", "full")]
+    assert result[6:] == [("early-step", method) for method in ("base", "indi", "indi", "base-id")]
     assert all((folder / "d" / f"hover_{level}.png").exists() for level in ("none", "small", "large"))
     assert (folder / "d" / "slow_vehicle.png").exists()
     whole = results(folder / "d")
@@ -212,10 +212,10 @@ def test_doctor_and_version(folder):
 
 
 def test_an_interruption_before_the_first_flight_is_over_is_a_line(folder, monkeypatch):
-    def interrupted(*_, **__):
+    def run_interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Fleet, "run", interrupted)
+    monkeypatch.setattr(Fleet, "run", run_interrupted)
     out = retrim("fly", "--policy", "p", "--seconds", "1", "--out", "none", cwd=folder, code=130)
     assert "interrupted before the first flight was over; nothing was saved" in out
 

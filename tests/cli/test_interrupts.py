@@ -6,7 +6,7 @@ import signal
 import jax
 import pytest
 
-from commands import SMALL, interrupted, results, retrim
+from commands import SMALL, results, retrim, run_interrupted
 from helpers import tiny_preset
 from retrim import Setup, load_policy, save_policy
 
@@ -28,13 +28,13 @@ PRETRAIN = "pretrain", "hover", "--config", "small.toml"
 
 
 def test_while_training_keeps_what_was_trained(folder):
-    code, out = interrupted((*PRETRAIN, "--updates", "100000", "--out", "cut"), folder, after=b"loss ")
+    code, out = run_interrupted((*PRETRAIN, "--updates", "100000", "--out", "cut"), folder, after=b"loss ")
     assert code == 130, out
     assert "Traceback" not in out
-    found = results(folder / "cut")
-    assert found["interrupted"]
-    assert 0 < len(found["losses"]) < 100_000
-    assert found["rows"][0]["updates"] == len(found["losses"])
+    result = results(folder / "cut")
+    assert result["interrupted"]
+    assert 0 < len(result["losses"]) < 100_000
+    assert result["rows"][0]["updates"] == len(result["losses"])
     assert load_policy(folder / "cut")[1].pretrain.num_updates == 100_000
     retrim("fly", "--policy", "cut", "--seconds", "1", "--adapt", "none", "--out", "cut_flown", cwd=folder)
 
@@ -42,7 +42,7 @@ def test_while_training_keeps_what_was_trained(folder):
 def test_while_compiling_leaves_nothing(folder):
     # A program that takes a minute to compile, so that there is time to interrupt it on any machine.
     setup = "import time; from retrim import Setup; Setup.pretraining = lambda *_: (time.sleep(60) for _ in range(2))"
-    code, out = interrupted((*PRETRAIN, "--out", "never"), folder, after=b"compiling", setup=setup)
+    code, out = run_interrupted((*PRETRAIN, "--out", "never"), folder, after=b"compiling", setup=setup)
     assert code == 130, out
     assert "Traceback" not in out
     assert "interrupted before the first steps were done; nothing was saved" in out
@@ -51,11 +51,11 @@ def test_while_compiling_leaves_nothing(folder):
 
 def test_between_training_and_its_score_keeps_the_policy_with_results(folder):
     path = folder / "between" / "policy.safetensors"
-    code, out = interrupted((*PRETRAIN, "--out", "between"), folder, after=path)
+    code, out = run_interrupted((*PRETRAIN, "--out", "between"), folder, after=path)
     assert code == 130, out
     assert "Traceback" not in out
-    found = results(folder / "between")
-    assert len(found["losses"]) == found["rows"][0]["updates"] == 20
+    result = results(folder / "between")
+    assert len(result["losses"]) == result["rows"][0]["updates"] == 20
     assert load_policy(folder / "between")[1].name == "hover/retrim"
 
 
@@ -66,7 +66,7 @@ def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(fol
         "presets.PRESETS['hover/retrim'] = loading.overlaid(presets.PRESETS['hover/retrim'], Path('small.toml'))"
     )
     words = "demo", "--starts", "1", "--seconds", "3", "--out", "demo"
-    code, out = interrupted(words, folder, after=b"hover error in its own model", setup=small)
+    code, out = run_interrupted(words, folder, after=b"hover error in its own model", setup=small)
     assert code == 130, out
     assert "Traceback" not in out
     assert len(results(folder / "demo")["losses"]) == 20
@@ -77,29 +77,29 @@ def test_while_flying_keeps_what_was_flown(folder):
     words = "fly", "--policy", "p", "--seconds", "20", "--starts", "60", "--adapt", "none", "--plant", "simple"
     one_by_one = "--latency", "measured"  # flights of one program land at once
     by = signal.SIGHUP  # as a terminal that is closed does
-    code, out = interrupted((*words, *one_by_one, "--out", "half"), folder, after=b" of 60 flights", by=by)
+    code, out = run_interrupted((*words, *one_by_one, "--out", "half"), folder, after=b" of 60 flights", by=by)
     assert code == 130, out
     assert "Traceback" not in out
-    found = results(folder / "half")
-    assert found["interrupted"]
-    assert 0 < found["rows"][0]["n"] < 60
+    result = results(folder / "half")
+    assert result["interrupted"]
+    assert 0 < result["rows"][0]["n"] < 60
     assert (folder / "half" / "hover_large.png").exists()
-    assert len(list((folder / "half" / "logs").glob("*.npz"))) == found["rows"][0]["n"]
+    assert len(list((folder / "half" / "logs").glob("*.npz"))) == result["rows"][0]["n"]
 
 
 def test_while_live_lands_the_vehicle_and_keeps_the_flight(folder):
     """It has a page and a recording; it does not learn."""
     words = "live", "--policy", "p", "--plant", "simple", "--disturbance", "none", "--adapt", "base-do"
-    shown = "--page", "--page-port", "18280", "--record", "live.mcap", "--out", "live"
-    code, out = interrupted((*words, *shown), folder, after="│ policy".encode())
+    display = "--page", "--page-port", "18280", "--record", "live.mcap", "--out", "live"
+    code, out = run_interrupted((*words, *display), folder, after="│ policy".encode())
     assert code == 0, out  # without --seconds, Ctrl-C is how a flight ends
     assert "Traceback" not in out
     assert "interrupted" not in out
     assert "flight over: landed" in out
     assert re.search(r"page: http://127\.0\.0\.1:182\d\d/[\w-]{32}$", out, re.M)
-    found = results(folder / "live")
-    assert not found["interrupted"]
-    assert {row["metric"]: row["value"] for row in found["rows"]}["policies"] == 0
+    result = results(folder / "live")
+    assert not result["interrupted"]
+    assert {row["metric"]: row["value"] for row in result["rows"]}["policies"] == 0
     assert (folder / "live" / "flight.csv").exists()
     assert not list((folder / "live").glob("start*"))
     assert (folder / "live.mcap").stat().st_size > 10_000

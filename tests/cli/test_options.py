@@ -23,8 +23,8 @@ main = importlib.import_module("retrim.cli.main")  # the package has a function 
     "registry", [DISTURBANCES, FAULTS, METHODS, PLANTS, REFERENCES, RESIDUALS, SENSORS, VEHICLES], ids=lambda r: r._kind
 )
 def test_help_lists_every_registered_name(command, registry, tmp_path):
-    shown = "".join(retrim(command, "--help", cwd=tmp_path).replace("│", " ").split())  # lines end inside of names
-    assert [name for name in registry if name not in shown] == []
+    display = "".join(retrim(command, "--help", cwd=tmp_path).replace("│", " ").split())  # lines end inside of names
+    assert [name for name in registry if name not in display] == []
 
 
 @pytest.mark.parametrize("command", ["pretrain", "fly", "live", "sweep", "export", "demo", "gauntlet"])
@@ -36,8 +36,8 @@ def test_an_option_without_a_default_shows_none(command, tmp_path):
 
 def test_methods_of_installed_packages_are_listed_and_suggested(tmp_path):
     assert {"datt", "raptor"} <= set(METHODS.plugins())
-    shown = "".join(retrim("fly", "--help", cwd=tmp_path).replace("│", " ").split())
-    assert "datt,indi-double,indi-half,raptorofinstalledpackages" in shown
+    display = "".join(retrim("fly", "--help", cwd=tmp_path).replace("│", " ").split())
+    assert "datt,indi-double,indi-half,raptorofinstalledpackages" in display
     with pytest.raises(ConfigError, match="no method 'rapto'; did you mean 'raptor'"):
         find_method("rapto")
 

@@ -242,9 +242,9 @@ def test_a_place_that_cannot_be_written_is_refused_before_anything_else(folder, 
         pytest.skip("root may write everywhere")
     (folder / "sizes.toml").write_text("seeds = [0, 1]\n")
     before = tree(folder)
-    found = retrim(*words, "--out", out, cwd=folder, code=1)
-    assert f"retrim: {out}: results cannot be written there" in found
-    assert found.count("\n") == 1
+    result = retrim(*words, "--out", out, cwd=folder, code=1)
+    assert f"retrim: {out}: results cannot be written there" in result
+    assert result.count("\n") == 1
     assert tree(folder) == before
 
 

@@ -30,10 +30,10 @@ def leaves(tree):
 def check(function, parameters, inputs, tolerance=1e-12):
     """Assert that the program returns what JAX returns, in the same shapes and types."""
     program = NumpyProgram(numpy_program(function, parameters, inputs))
-    found = program.step(program.prepare(leaves(parameters)), leaves(inputs))
-    wanted = leaves(jax.jit(function)(parameters, inputs))
-    assert len(found) == len(wanted)
-    for a, b in zip(found, wanted, strict=True):
+    result = program.step(program.prepare(leaves(parameters)), leaves(inputs))
+    expected = leaves(jax.jit(function)(parameters, inputs))
+    assert len(result) == len(expected)
+    for a, b in zip(result, expected, strict=True):
         assert (np.shape(a), np.asarray(a).dtype) == (np.shape(b), np.asarray(b).dtype)
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
@@ -177,7 +177,7 @@ def test_a_preset_flies_the_same_commands(preset, reference):
 
     memory = setup.controller(state).init(State.at(jnp.array([0.0, 0.0, 1.0])))
     program = NumpyProgram(numpy_program(decide, parameters, (memory, jnp.array(0.0), State.at(jnp.zeros(3)))))
-    prepared, remembered, jitted = program.prepare(leaves(parameters)), leaves(memory), jax.jit(decide)
+    preparation, memory_before, jitted = program.prepare(leaves(parameters)), leaves(memory), jax.jit(decide)
     for i in range(25):
         a, b, c = random.split(random.key(i), 3)
         x = State(
@@ -187,9 +187,9 @@ def test_a_preset_flies_the_same_commands(preset, reference):
         )
         t = jnp.array(0.02 * i)
         u, memory = jitted(parameters, (memory, t, x))
-        found = program.step(prepared, [*remembered, *leaves((t, x))])
-        remembered = found[2:]
-        for one, other in zip(found, leaves((u, memory)), strict=True):
+        result = program.step(preparation, [*memory_before, *leaves((t, x))])
+        memory_before = result[2:]
+        for one, other in zip(result, leaves((u, memory)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 

@@ -61,9 +61,9 @@ def test_the_model_of_training_follows_as_the_vehicle_does(spec):
     quick = lag_of(changed(preset, vehicle=fast), make_vehicle(fast))
     assert float(quick.c) == pytest.approx(0.03)
     assert np.all(np.asarray(quick.omega) < 0.5 * np.asarray(lag.omega) + 0.05)
-    measured = dataclasses.replace(spec, rate_lag=(0.05, 0.06, 0.2))
-    said = lag_of(changed(preset, vehicle=measured), make_vehicle(measured))
-    np.testing.assert_allclose(said.omega, [0.05, 0.06, 0.2])
+    measurement = dataclasses.replace(spec, rate_lag=(0.05, 0.06, 0.2))
+    text = lag_of(changed(preset, vehicle=measurement), make_vehicle(measurement))
+    np.testing.assert_allclose(text.omega, [0.05, 0.06, 0.2])
 
 
 def test_classical_controllers_are_as_slow_as_the_vehicle(spec):

@@ -14,15 +14,15 @@ from retrim.config.validation import MAX_TOML_BYTES
 def overlay(tmp_path):
     """Write a file, and return its path."""
 
-    def written(text, name="overlay.toml"):
+    def write(text, name="overlay.toml"):
         path = tmp_path / name
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         return path
 
-    return written
+    return write
 
 
-def refused(path, message):
+def check_refusal(path, message):
     with pytest.raises(ConfigError, match=message) as error:
         load("hover/fast", path)
     assert "\n" not in str(error.value)
@@ -30,25 +30,25 @@ def refused(path, message):
 
 
 def test_overlay(overlay):
-    found = load("hover/fast", overlay("delay_ticks = 2\n[adapt]\nnum_updates = 7\n"))
+    result = load("hover/fast", overlay("delay_ticks = 2\n[adapt]\nnum_updates = 7\n"))
     fast = PRESETS["hover/fast"]
-    assert found == changed(fast, delay_ticks=2, adapt={"num_updates": 7})
-    assert found.adapt.num_updates == 7
-    assert found.adapt.max_grad_norm == fast.adapt.max_grad_norm == 1.0
-    assert overlaid(found, overlay("[adapt]\nnum_envs = 3\n")).adapt.num_updates == 7
+    assert result == changed(fast, delay_ticks=2, adapt={"num_updates": 7})
+    assert result.adapt.num_updates == 7
+    assert result.adapt.max_grad_norm == fast.adapt.max_grad_norm == 1.0
+    assert overlaid(result, overlay("[adapt]\nnum_envs = 3\n")).adapt.num_updates == 7
 
 
 def test_a_table_of_a_task_is_overlaid_key_by_key(overlay):
-    found = load("vision/occluded", overlay("[vision]\ndropout = 0.2\n"))
-    assert found.vision.dropout == 0.2
-    assert found.vision.occlusion
-    assert found.vision.pixel_noise == 1.0
+    result = load("vision/occluded", overlay("[vision]\ndropout = 0.2\n"))
+    assert result.vision.dropout == 0.2
+    assert result.vision.occlusion
+    assert result.vision.pixel_noise == 1.0
 
 
 def test_whole_numbers_are_numbers(overlay):
-    found = load("hover/fast", overlay("termination_box = 4\ngoal = [0, 1, 2]\n[adapt]\nfit_every = 3\n"))
-    assert (found.termination_box, found.goal, found.adapt.fit_every) == (4.0, (0.0, 1.0, 2.0), 3.0)
-    assert type(found.termination_box) is float
+    result = load("hover/fast", overlay("termination_box = 4\ngoal = [0, 1, 2]\n[adapt]\nfit_every = 3\n"))
+    assert (result.termination_box, result.goal, result.adapt.fit_every) == (4.0, (0.0, 1.0, 2.0), 3.0)
+    assert type(result.termination_box) is float
 
 
 @pytest.mark.parametrize(
@@ -96,13 +96,13 @@ def test_whole_numbers_are_numbers(overlay):
     ],
 )
 def test_bad_overlays_name_the_path(overlay, text, message):
-    refused(overlay(text), message)
+    check_refusal(overlay(text), message)
 
 
 def test_what_is_no_file(tmp_path):
-    refused(tmp_path / "nothing.toml", "no such file")
-    refused(tmp_path, "not a regular file")
-    refused(Path("/dev/zero"), "not a regular file")
+    check_refusal(tmp_path / "nothing.toml", "no such file")
+    check_refusal(tmp_path, "not a regular file")
+    check_refusal(Path("/dev/zero"), "not a regular file")
 
 
 def test_unknown_presets():

@@ -39,9 +39,9 @@ VEHICLE = "mass = 0.7\ninertia = [2e-3, 2e-3, 3e-3]\narm = [0.08, 0.08]\nthrust_
 def test_names_of_presets_vehicles_and_tasks_are_plain(tmp_path, name):
     preset = load("hover/retrim")
     for key in ("name", "task"):
-        with pytest.raises(ConfigError, match=rf"{key}: .* must be 1 to 64 characters") as caught:
+        with pytest.raises(ConfigError, match=rf"{key}: .* must be 1 to 64 characters") as error:
             changed(preset, **{key: name})
-        assert str(caught.value).isprintable()
+        assert str(error.value).isprintable()
     text = VEHICLE + "motor_tau = 0.03\nname = " + re.sub("'", '"', repr(name)).replace("\\x1b", "\\u001b")
     (tmp_path / "v.toml").write_text(text)
     with pytest.raises(ConfigError, match=r"name: .* must be 1 to 64 characters"):

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fake_flights import flight
 from helpers import brief_preset
-from made_up import flight
 from retrim.adapt.views import GravityView, RestView
 from retrim.config import Setup, TaskRequest, changed
 from retrim.config.baselines import baseline_request
@@ -86,13 +86,13 @@ def linear(request):
     return eqx.nn.Linear(request.size, 4, key=request.key)
 
 
-def made(kind, **changes):
+def make(kind, **changes):
     return Setup.from_preset(changed(brief_preset(), name="sonar", task=f"{__name__}:{kind}", **changes))
 
 
 @pytest.fixture(scope="module")
 def seeing():
-    return made("estimating")
+    return make("estimating")
 
 
 def test_a_controller_receives_the_estimated_state(seeing, key):
@@ -114,7 +114,7 @@ def test_settings_and_methods_follow_from_the_observation(seeing, key):
         seeing.pilot(policy, "base-i")
     with pytest.raises(ConfigError, match="raptor"):
         seeing.pilot(policy, "raptor")
-    without = made("blind")
+    without = make("blind")
     with pytest.raises(ConfigError, match="method 'indi' needs the state"):
         without.pilot(None, "indi", key)
     with pytest.raises(ConfigError, match="effective gravity needs"):
@@ -145,7 +145,7 @@ def test_a_controller_refuses_an_observation_without_an_estimator(seeing, key):
 
 
 def test_the_learner_keeps_the_frame_that_a_memory_needs(seeing):
-    assert isinstance(made("estimating", adapt={"frame": "gravity"}).learner.view, RestView)
+    assert isinstance(make("estimating", adapt={"frame": "gravity"}).learner.view, RestView)
     assert isinstance(Setup.from_preset(changed(brief_preset(), adapt={"frame": "gravity"})).learner.view, GravityView)
 
 
@@ -164,8 +164,8 @@ def test_the_encoder_is_trained_with_its_examples(seeing, key):
 
 
 def test_its_image_is_drawn(seeing, tmp_path):
-    shown = flight(0.1)
-    text = picture([shown], seeing, shown.spec.scenario, tmp_path)[1].read_text()
+    display = flight(0.1)
+    text = picture([display], seeing, display.spec.scenario, tmp_path)[1].read_text()
     assert "what the camera saw of the points" in text
 
 

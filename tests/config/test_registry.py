@@ -180,28 +180,28 @@ def test_names_that_cannot_be(name):
 
 @pytest.mark.parametrize("kind", REGISTRIES)
 def test_an_unknown_name_lists_the_names_and_the_nearest(kind):
-    known = REGISTRIES[kind]
-    nearest = max(known, key=len)
+    model = REGISTRIES[kind]
+    nearest = max(model, key=len)
     with pytest.raises(ConfigError, match=rf"no {kind} '{nearest}x'; did you mean '{nearest}'\? there are ") as error:
-        known.find(nearest + "x")
-    for name in known:
+        model.find(nearest + "x")
+    for name in model:
         assert name in str(error.value)
     assert "module:name" in str(error.value)
     assert "\n" not in str(error.value)
     with pytest.raises(ConfigError, match=f"no {kind} 'qqqqqq'; there are"):
-        known.find("qqqqqq")
+        model.find("qqqqqq")
 
 
 def test_installed_packages_bring_names(monkeypatch):
-    asked = []
+    calls = []
 
     def entry_points(group):
-        asked.append(group)
+        calls.append(group)
         return [types.SimpleNamespace(name="theirs", load=lambda: abs)]
 
     monkeypatch.setattr(registry, "entry_points", entry_points)
     assert VEHICLES.find("theirs") is abs
-    assert asked == ["retrim.vehicles"]
+    assert calls == ["retrim.vehicles"]
 
 
 @pytest.mark.parametrize(
@@ -308,8 +308,8 @@ def test_ones_own_residual(mine):
 
 
 def test_ones_own_reference(mine):
-    found = make_reference(f"{mine}:reference")
-    np.testing.assert_allclose(found(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
+    result = make_reference(f"{mine}:reference")
+    np.testing.assert_allclose(result(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     setup = Setup.from_preset(changed(load("track/paper"), pretrain={"hidden_sizes": (8,)}), f"{mine}:reference")
     np.testing.assert_allclose(setup.flight_task.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows none"):

@@ -45,10 +45,10 @@ def effects(name, t=0.0, seed=0):
     ],
 )
 def test_pushes(name, t, push):
-    found = effects(name, t)
-    np.testing.assert_allclose(found.push, push)
-    np.testing.assert_array_equal(found.wind, 0.0)
-    np.testing.assert_array_equal(found.gain, 1.0)
+    result = effects(name, t)
+    np.testing.assert_allclose(result.push, push)
+    np.testing.assert_array_equal(result.wind, 0.0)
+    np.testing.assert_array_equal(result.gain, 1.0)
 
 
 @pytest.mark.parametrize(("name", "speed"), [("wind", 4.0), ("wind=6", 6.0), ("wind=0", 0.0)])
@@ -195,23 +195,23 @@ def test_a_delay_is_that_of_the_plant(plant):
 
 
 @pytest.mark.parametrize(
-    ("options", "dt", "said"),
+    ("options", "dt", "text"),
     [
         ({"sensors": "rough"}, 0.025, "plant 'bem' with sensors 'rough' at dt = 0.025 s: .* of SensorModel"),
         ({"plant": "mujoco"}, 0.015, "plant 'mujoco' with sensors 'ideal' at dt = 0.015 s: .* the simulator's step"),
     ],
 )
-def test_a_control_period_that_cannot_be_divided_is_named(options, dt, said):
+def test_a_control_period_that_cannot_be_divided_is_named(options, dt, text):
     if "plant" in options:
         pytest.importorskip(options["plant"])
-    with pytest.raises(ConfigError, match=said) as error:
+    with pytest.raises(ConfigError, match=text) as error:
         Scenario(**options).make(dt=dt)
     assert "\n" not in str(error.value)
 
 
 def test_a_kick_gains_its_speed_within_a_tenth_of_a_second():
-    gained = sum(0.001 * effects("kick=4", 7.95 + 0.001 * ms).push for ms in range(300))
-    np.testing.assert_allclose(gained, [4.0 / 2**0.5, 4.0 / 2**0.5, 0.0], rtol=0.02)
+    gain = sum(0.001 * effects("kick=4", 7.95 + 0.001 * ms).push for ms in range(300))
+    np.testing.assert_allclose(gain, [4.0 / 2**0.5, 4.0 / 2**0.5, 0.0], rtol=0.02)
 
 
 def test_every_disturbance_is_looked_at_here():
@@ -230,9 +230,9 @@ def test_every_disturbance_is_looked_at_here():
     ],
 )
 def test_sensors_by_name(name, numbers):
-    made = SENSORS.find(name)()
-    found = [float(getattr(made, field.name)) for field in dataclasses.fields(made)]
-    np.testing.assert_allclose(found, numbers)
+    setup = SENSORS.find(name)()
+    result = [float(getattr(setup, field.name)) for field in dataclasses.fields(setup)]
+    np.testing.assert_allclose(result, numbers)
     assert SENSORS.find("ideal")() is None
 
 
@@ -242,11 +242,11 @@ def test_sensors_by_name(name, numbers):
 def test_a_scenario_is_made_of_its_parts():
     """Disturbance and sensors follow from the seed; vehicle and control period arrive."""
 
-    def flown(seed, **options):
+    def fly_once(seed, **options):
         plant = Scenario("walk", "simple", "large", "mocap", **options).make("small", dt=0.01, seed=seed)
         return fly(plant, FunctionPilot(lambda measurement: Command.hover()), HERE, ticks=20)
 
-    one, again, other = flown(1), flown(1), flown(2)
+    one, again, other = fly_once(1), fly_once(1), fly_once(2)
     assert one.dt == 0.01
     np.testing.assert_array_equal(one.measured.p, again.measured.p)
     assert not np.array_equal(one.measured.p, other.measured.p)

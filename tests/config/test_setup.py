@@ -13,7 +13,7 @@ from helpers import draw_starts, tiny_preset
 from retrim import ConfigError
 from retrim.adapt.optimisers import CarriedAdam, FreshAdam
 from retrim.adapt.starts import TaskStarts
-from retrim.adapt.trim import RestTrim, Untrimmed
+from retrim.adapt.trim import NoTrim, RestTrim
 from retrim.adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.config import PRESETS, Scenario, Setup, changed, load, setup
@@ -21,13 +21,13 @@ from retrim.config.learners import check_frame
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.config.vehicles import make_vehicle
 from retrim.control.actuator_tracking import ActuatorTracking
+from retrim.control.belief_flight import IdentifiedFlight
 from retrim.control.controller import PolicyController
 from retrim.control.gravity_frame import GravityFrame, PoseFrame
-from retrim.control.identified import IdentifiedFlight
 from retrim.control.monitor import Monitor
 from retrim.control.near_target import NearTarget
 from retrim.learn import policy_loss
-from retrim.physics.actuators import Lagged
+from retrim.physics.actuators import LaggedModel
 from retrim.physics.dynamics import PointMass
 from retrim.runtime import fly
 from retrim.tasks import (
@@ -52,7 +52,7 @@ UNCLIPPED = ("hover/paper", "hover/released", "track/paper", "track/blind", "vis
 
 
 @pytest.fixture(scope="module", params=PRESETS)
-def built(request):
+def case(request):
     """A preset, with a small network, and its set-up."""
     preset = changed(load(request.param), pretrain={"hidden_sizes": (12, 12)})
     with jax.numpy_dtype_promotion("standard"):
@@ -62,22 +62,22 @@ def built(request):
 # ---- the environment
 
 
-def test_every_clock_ticks_alike(built):
-    preset, made = built
-    for env in (made.env, made.learner.env):
+def test_every_clock_ticks_alike(case):
+    preset, setup = case
+    for env in (setup.env, setup.learner.env):
         assert env.dynamics.dt == env.task.dt == preset.dt
-    assert made.flight_task.dt == preset.dt
+    assert setup.flight_task.dt == preset.dt
     assert Scenario().make(dt=preset.dt).dt == preset.dt
 
 
-def test_the_model_has_the_presets_delay_and_lag(built):
-    preset, made = built
+def test_the_model_has_the_presets_delay_and_lag(case):
+    preset, setup = case
     delays = {"hover/paper": 0, "track/paper": 0, "track/blind": 0, "hover/released": 2, "hover/100hz": 2}
     assert preset.delay_ticks == delays.get(preset.name, 1)
-    for env in (made.env, made.learner.env):
+    for env in (setup.env, setup.learner.env):
         assert float(env.delay) == pytest.approx(preset.delay_ticks * preset.dt)
         if preset.name in ("track/preview", "track/retrim", "track/any", "track/fast", "vision/retrim"):
-            assert isinstance(env.dynamics, Lagged)
+            assert isinstance(env.dynamics, LaggedModel)
             assert preset.actuator_tau == 0.033
             assert {float(env.dynamics.response.thrust_lag), *env.dynamics.response.rate_lag.tolist()} == {0.033}
             assert isinstance(env.dynamics.base, PointMass)
@@ -86,8 +86,8 @@ def test_the_model_has_the_presets_delay_and_lag(built):
             assert isinstance(env.dynamics, PointMass)
 
 
-def test_the_task_has_the_presets_numbers(built):
-    preset, made = built
+def test_the_task_has_the_presets_numbers(case):
+    preset, setup = case
     kinds = {("hover", "paper"): Hover, ("hover", "l2"): L2Hover, ("vision", "paper"): Hover, ("vision", "l2"): L2Hover}
     kinds |= {
         ("hover", "stiff"): StiffHover,
@@ -96,7 +96,7 @@ def test_the_task_has_the_presets_numbers(built):
         ("track", "l2"): L2Track,
         ("track", "sharp"): SharpTrack,
     }
-    for task in (made.env.task, made.flight_task):
+    for task in (setup.env.task, setup.flight_task):
         assert type(task) is kinds[preset.task, preset.reward]
         assert task.horizon == preset.pretrain.horizon
         assert float(task.box) == preset.termination_box
@@ -109,50 +109,50 @@ def test_the_task_has_the_presets_numbers(built):
     assert (preset.reward == "l2") == (preset.name in sharp)
 
 
-def test_the_observation_has_the_presets_numbers(built):
-    preset, made = built
-    seen = made.env.task.observation
+def test_the_observation_has_the_presets_numbers(case):
+    preset, setup = case
+    observation = setup.env.task.observation
     vehicle = make_vehicle(preset.vehicle)
     if preset.family is not None:
-        assert isinstance(seen, VehicleObs)
-        seen = seen.inner
-    assert isinstance(seen, HeadingObs) == (preset.axes == "heading")
-    seen = seen.inner if isinstance(seen, HeadingObs) else seen
-    scales = seen.state if isinstance(seen, StateAndErrorObs) else seen
+        assert isinstance(observation, VehicleObs)
+        observation = observation.inner
+    assert isinstance(observation, HeadingObs) == (preset.axes == "heading")
+    observation = observation.inner if isinstance(observation, HeadingObs) else observation
+    scales = observation.state if isinstance(observation, StateAndErrorObs) else observation
     np.testing.assert_array_equal(scales.omega_max, vehicle.omega_max)
     if preset.task == "vision":
-        assert isinstance(seen, Keypoints)
-        assert float(seen.noise) == preset.vision.pixel_noise
-        assert bool(jnp.all(seen.whiten == jnp.eye(70))) == (not preset.vision.whiten_pixels)
-        assert seen.dt == preset.dt
+        assert isinstance(observation, Keypoints)
+        assert float(observation.noise) == preset.vision.pixel_noise
+        assert bool(jnp.all(observation.whiten == jnp.eye(70))) == (not preset.vision.whiten_pixels)
+        assert observation.dt == preset.dt
     else:
         kind = preset.track.observation if preset.task == "track" else "state"
         kinds = {"both": StateAndErrorObs, "preview": Preview, "flat": Preview}
-        assert type(seen) is kinds.get(kind, StateObs)
-        if isinstance(seen, Preview):
-            assert seen.accelerations == ((0.04,) if kind == "flat" else ())
+        assert type(observation) is kinds.get(kind, StateObs)
+        if isinstance(observation, Preview):
+            assert observation.accelerations == ((0.04,) if kind == "flat" else ())
         assert scales.history == preset.command_history
 
 
-def test_occlusion_is_switched_on_in_flight_alone(built):
-    preset, made = built
-    flown = made.flight_task.observation_in_flight
+def test_occlusion_is_switched_on_in_flight_alone(case):
+    preset, setup = case
+    flight = setup.flight_task.observation_in_flight
     if preset.name in ("vision/occluded", "vision/retrim"):
-        assert isinstance(flown, OccludedKeypoints)
-        assert float(flown.dropout) == preset.vision.dropout == 0.05
-        assert float(flown.full.noise) == preset.vision.pixel_noise == 1.0
-        assert (flown.lag is None) == (preset.actuator_tau is None)
-        assert flown.delay_ticks == preset.plant_delay_ticks
-        np.testing.assert_array_equal(flown.full.whiten, made.env.task.observation.whiten)
-        assert isinstance(made.learner.env.task.observation, Keypoints)  # nor in updates
+        assert isinstance(flight, OccludedKeypoints)
+        assert float(flight.dropout) == preset.vision.dropout == 0.05
+        assert float(flight.full.noise) == preset.vision.pixel_noise == 1.0
+        assert (flight.lag is None) == (preset.actuator_tau is None)
+        assert flight.delay_ticks == preset.plant_delay_ticks
+        np.testing.assert_array_equal(flight.full.whiten, setup.env.task.observation.whiten)
+        assert isinstance(setup.learner.env.task.observation, Keypoints)  # nor in updates
     else:
-        assert flown is made.flight_task.observation
+        assert flight is setup.flight_task.observation
 
 
-def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(built):
-    preset, made = built
-    policy = made.new_policy(random.key(0))
-    sizes = (made.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)
+def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(case):
+    preset, setup = case
+    policy = setup.new_policy(random.key(0))
+    sizes = (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)
     assert [layer.weight.shape for layer in policy.layers] == [(b, a) for a, b in itertools.pairwise(sizes)]
     vehicle = make_vehicle(preset.vehicle)
     np.testing.assert_array_equal(policy.u_max.vector(), vehicle.command_max.vector())
@@ -162,16 +162,16 @@ def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(built):
 # ---- the learner
 
 
-def test_the_learner_has_the_presets_numbers(built):
-    preset, made = built
-    a, learner = preset.adapt, made.learner
+def test_the_learner_has_the_presets_numbers(case):
+    preset, setup = case
+    a, learner = preset.adapt, setup.learner
     if preset.family is None:
         assert learner.plant_delay_ticks == preset.plant_delay_ticks
         assert isinstance(learner.vehicles, OwnVehicle)
     else:  # the identified path has the delay
         assert learner.plant_delay_ticks == 0
         assert isinstance(learner.vehicles, IdentifiedVehicle)
-        assert learner.vehicles.family is made.env.family
+        assert learner.vehicles.family is setup.env.family
     assert learner.num_updates == a.num_updates
     assert learner.num_envs == a.num_envs
     assert float(learner.optimiser.rate) == a.learning_rate
@@ -186,26 +186,26 @@ def test_the_learner_has_the_presets_numbers(built):
         assert isinstance(learner.view, RestView if preset.task == "vision" else GravityView)
     else:
         assert isinstance(learner.view, WorldView)
-    assert learner.env.task is made.flight_task
-    assert isinstance(learner.trim, RestTrim if a.trim == "rest" else Untrimmed)
+    assert learner.env.task is setup.flight_task
+    assert isinstance(learner.trim, RestTrim if a.trim == "rest" else NoTrim)
     model = learner.residual_model
     if a.residual != "ensemble":
-        closed = model.first if a.residual == "layered" else model
-        assert (float(closed.memory), closed.dt, closed.rates.dt) == (a.memory, preset.dt, preset.dt)
-        assert float(closed.prior[3]) == pytest.approx(a.thrust_prior)
+        linear_model = model.first if a.residual == "layered" else model
+        assert (float(linear_model.memory), linear_model.dt, linear_model.rates.dt) == (a.memory, preset.dt, preset.dt)
+        assert float(linear_model.prior[3]) == pytest.approx(a.thrust_prior)
         if a.residual == "regression":
             return
         model = model.second
     np.testing.assert_array_equal(model.origin, preset.goal)
-    np.testing.assert_array_equal(model.omega_max, made.vehicle.omega_max)
+    np.testing.assert_array_equal(model.omega_max, setup.vehicle.omega_max)
     assert float(model.learning_rate) == a.fit_learning_rate == 1e-2
     assert float(model.spectral_weight) == a.spectral_weight == 1e-3
     assert model.steps == a.fit_steps
 
 
 @pytest.mark.parametrize("latency", ["fixed", "measured"])
-def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
-    preset, made = built
+def test_the_pilot_has_the_presets_schedule(case, latency, monkeypatch):
+    preset, result = case
     a, learners, pilots = preset.adapt, [], []
 
     class Learner(setup.LockstepLearner):
@@ -214,13 +214,13 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
             super().__init__(worker, latency_s, dt)
 
     class Pilot(setup.AdaptivePilot):
-        def __init__(self, controller, state, scheduled, *, dt, window):
-            pilots.append((controller, [each.every_s for each in scheduled], dt, window))
-            super().__init__(controller, state, scheduled, dt=dt, window=window)
+        def __init__(self, controller, state, schedule, *, dt, window):
+            pilots.append((controller, [each.every_s for each in schedule], dt, window))
+            super().__init__(controller, state, schedule, dt=dt, window=window)
 
     monkeypatch.setattr(setup, "LockstepLearner", Learner)
     monkeypatch.setattr(setup, "AdaptivePilot", Pilot)
-    made.pilot(made.new_policy(random.key(0)), "full", random.key(1), latency=latency)
+    result.pilot(result.new_policy(random.key(0)), "full", random.key(1), latency=latency)
     fixed = latency == "fixed"
     assert learners == [
         ("residual", a.fit_latency if fixed else None, preset.dt),
@@ -228,40 +228,40 @@ def test_the_pilot_has_the_presets_schedule(built, latency, monkeypatch):
     ]
     ((controller, *numbers),) = pilots
     assert numbers == [[a.fit_every, a.update_every], preset.dt, a.window]
-    flown = controller(made.learner.init(made.new_policy(random.key(0)), random.key(2)))
+    flight = controller(result.learner.init(result.new_policy(random.key(0)), random.key(2)))
     if preset.family is not None:
-        assert isinstance(flown, IdentifiedFlight)
-        assert isinstance(flown.inner, ActuatorTracking)
-        flown = flown.inner.inner
+        assert isinstance(flight, IdentifiedFlight)
+        assert isinstance(flight.inner, ActuatorTracking)
+        flight = flight.inner.inner
     if a.frame == "gravity" and preset.task == "vision":
-        assert isinstance(flown, PoseFrame)
-        flown = flown.inner
+        assert isinstance(flight, PoseFrame)
+        flight = flight.inner
     elif a.frame == "gravity":
-        assert isinstance(flown, Monitor)
-        flown = flown.frame
-        assert isinstance(flown, GravityFrame)
+        assert isinstance(flight, Monitor)
+        flight = flight.frame
+        assert isinstance(flight, GravityFrame)
         unknown = 0.5 * sum((0.0, 0.0) if preset.family is None else preset.family.delay)
-        declared = preset.plant_delay_ticks * preset.dt
-        assert float(flown.observer.path.delay) == pytest.approx(declared if preset.family is None else unknown)
-        assert flown.known.model is made.learner.residual_model
-        flown = flown.inner
+        declaration = preset.plant_delay_ticks * preset.dt
+        assert float(flight.observer.path.delay) == pytest.approx(declaration if preset.family is None else unknown)
+        assert flight.known_residual.model is result.learner.residual_model
+        flight = flight.inner
     if preset.family is not None and preset.task == "hover":
-        assert isinstance(flown, NearTarget)
-        assert float(flown.reach) == pytest.approx(0.5)
-        flown = flown.inner
-    assert isinstance(flown, PolicyController)
+        assert isinstance(flight, NearTarget)
+        assert float(flight.reach) == pytest.approx(0.5)
+        flight = flight.inner
+    assert isinstance(flight, PolicyController)
     if preset.family is None:
-        assert flown.observation is made.flight_task.observation_in_flight
+        assert flight.observation is result.flight_task.observation_in_flight
     else:  # with the belief about the vehicle
-        assert flown.observation.inner is made.flight_task.observation.inner
+        assert flight.observation.inner is result.flight_task.observation.inner
 
 
-def test_methods(built):
-    _, made = built
-    policy = made.new_policy(random.key(0))
+def test_methods(case):
+    _, setup = case
+    policy = setup.new_policy(random.key(0))
     with pytest.raises(ValueError, match="needs a key"):
-        made.pilot(policy, "full")
-    full, low_rank = (made.pilot(policy, method, random.key(1)) for method in ("full", "lora"))
+        setup.pilot(policy, "full")
+    full, low_rank = (setup.pilot(policy, method, random.key(1)) for method in ("full", "lora"))
     jax.tree.map(np.testing.assert_array_equal, full.state.policy.policy, policy)
     delta = low_rank.state.policy.policy
     jax.tree.map(np.testing.assert_array_equal, delta.base, policy)
@@ -284,32 +284,32 @@ def moves(optimiser, gradients):
     return np.asarray(jax.jit(lambda rows: jax.lax.scan(step, optimiser.init(jnp.zeros(4)), rows)[1])(rows))
 
 
-def test_pretraining_falls_along_a_cosine(built):
-    preset, made = built
+def test_pretraining_falls_along_a_cosine(case):
+    preset, setup = case
     p = preset.pretrain
-    steps = -moves(made.optimiser, np.full(p.num_updates, 0.1))
-    wanted = 0.5 * p.learning_rate * (1.0 + np.cos(np.pi * np.arange(p.num_updates) / p.num_updates))
-    np.testing.assert_allclose(steps, wanted, rtol=1e-4)
+    steps = -moves(setup.optimiser, np.full(p.num_updates, 0.1))
+    expected = 0.5 * p.learning_rate * (1.0 + np.cos(np.pi * np.arange(p.num_updates) / p.num_updates))
+    np.testing.assert_allclose(steps, expected, rtol=1e-4)
 
 
-def test_pretraining_clips_if_the_preset_says_so(built):
+def test_pretraining_clips_if_the_preset_says_so(case):
     """Four entries of 0.5 have the norm 1: a larger gradient moves the parameter no farther where that is the limit."""
-    preset, made = built
+    preset, setup = case
     limit = preset.pretrain.max_grad_norm
     assert limit in (None, 1.0)
     assert (limit is None) == (preset.name in UNCLIPPED)
-    at_limit, beyond = (moves(made.optimiser, [0.01, 0.01, huge])[-1] for huge in (0.5, 5.0))
+    at_limit, beyond = (moves(setup.optimiser, [0.01, 0.01, huge])[-1] for huge in (0.5, 5.0))
     assert (at_limit == pytest.approx(beyond)) == (limit is not None)
 
 
-def test_pretraining_has_the_presets_second_decay(built):
+def test_pretraining_has_the_presets_second_decay(case):
     """After a large gradient and a zero one, Adam's second moment tells its decay."""
-    preset, made = built
+    preset, setup = case
     b1, b2, rate = 0.9, preset.pretrain.adam_b2, preset.pretrain.learning_rate
-    moved = moves(made.optimiser, [0.4, 0.0])[1]
+    shift = moves(setup.optimiser, [0.4, 0.0])[1]
     m, v = b1 * (1 - b1) * 0.4 / (1 - b1**2), b2 * (1 - b2) * 0.16 / (1 - b2**2)
     cosine = 0.5 * (1 + math.cos(math.pi / preset.pretrain.num_updates))
-    assert float(moved) == pytest.approx(-rate * cosine * m / (math.sqrt(v) + 1e-8), rel=1e-6)
+    assert float(shift) == pytest.approx(-rate * cosine * m / (math.sqrt(v) + 1e-8), rel=1e-6)
 
 
 # ---- what a caller may get wrong
@@ -329,9 +329,9 @@ def test_what_does_not_fit_is_one_line():
     ("hidden", "message"), [((16, 16, 16), "3 ranks .* for 4 layers"), ((8, 16), "rank 10 for weights 16 x 8")]
 )
 def test_a_network_that_low_rank_cannot_take(hidden, message):
-    made = Setup.from_preset(tiny_preset(pretrain={"hidden_sizes": hidden}))
+    setup = Setup.from_preset(tiny_preset(pretrain={"hidden_sizes": hidden}))
     with pytest.raises(ConfigError, match=f"preset 'hover/fast': LoRA: {message}") as error:
-        made.pilot(made.new_policy(random.key(0)), "lora", random.key(1))
+        setup.pilot(setup.new_policy(random.key(0)), "lora", random.key(1))
     assert "\n" not in str(error.value)
 
 
@@ -374,12 +374,12 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
 
 def test_training_follows_references_as_they_are_felt():
     """Every member of the family is a built-in reference, level or tilted and scaled; flight follows the plain one."""
-    made = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "gravity_copies": 2}))
-    trained, flown = made.env.task.reference, made.flight_task.reference
-    assert trained.joins.shape[0] == 2 * (1 + 2)
-    assert flown.joins.shape[0] == 2
-    starts = trained.joins[:, 0]
-    p = jax.vmap(jax.vmap(trained, (0,)))(starts[:, None] + jnp.linspace(3.0, 12.0, 200)[None]).p
+    setup = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "gravity_copies": 2}))
+    trained_policy, flight = setup.env.task.reference, setup.flight_task.reference
+    assert trained_policy.joins.shape[0] == 2 * (1 + 2)
+    assert flight.joins.shape[0] == 2
+    starts = trained_policy.joins[:, 0]
+    p = jax.vmap(jax.vmap(trained_policy, (0,)))(starts[:, None] + jnp.linspace(3.0, 12.0, 200)[None]).p
     height = np.ptp(np.asarray(p)[:, :, 2], axis=1)
     assert (height[:2] < 1e-4).all()
     assert (height[2:] > 0.01).all()
@@ -397,17 +397,17 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
         adapt={"fit_steps": 20, "num_updates": 3, "num_envs": 4, "window": 60}
         | {"fit_every": 0.5, "update_every": 0.8, "fit_latency": 0.1, "update_latency": 0.25},
     )
-    made = Setup.from_preset(preset)
-    chunks = list(made.pretraining(1))
+    setup = Setup.from_preset(preset)
+    chunks = list(setup.pretraining(1))
     assert sum(losses.shape[0] for _, losses in chunks) == 150
     policy = chunks[-1][0]
-    x0 = draw_starts(made.env.task, random.key(7), 16)
-    fresh, trained = (policy_loss(p, made.env, x0) for p in (made.new_policy(random.key(1)), policy))
-    assert float(trained) < 0.7 * float(fresh)
+    x0 = draw_starts(setup.env.task, random.key(7), 16)
+    fresh, trained_policy = (policy_loss(p, setup.env, x0) for p in (setup.new_policy(random.key(1)), policy))
+    assert float(trained_policy) < 0.7 * float(fresh)
     plant = Scenario("small", "simple").make(preset.vehicle, dt=preset.dt)
     assert plant.dt == 0.01
-    pilot = made.pilot(policy, "full", random.key(3))
-    log = fly(plant, pilot, made.flight_starts(1)[0], ticks=130)
+    pilot = setup.pilot(policy, "full", random.key(3))
+    log = fly(plant, pilot, setup.flight_starts(1)[0], ticks=130)
     assert len(log.t) == 131
     np.testing.assert_allclose(np.diff(log.t), 0.01)
     assert log.missed_ticks == 0
@@ -421,10 +421,10 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
 def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
     spec = VehicleSpec("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05, (0.07, 0.08, 0.4))
     for name in ("hover/retrim", "track/retrim"):
-        made = Setup.from_preset(changed(load(name), vehicle=spec))
-        response = made.env.dynamics.response
+        setup = Setup.from_preset(changed(load(name), vehicle=spec))
+        response = setup.env.dynamics.response
         np.testing.assert_allclose([response.thrust_lag, *response.rate_lag], [0.05, 0.07, 0.08, 0.4])
-        prior = made.learner.residual_model.init(jax.random.key(0))
+        prior = setup.learner.residual_model.init(jax.random.key(0))
         rates = prior.rates if name == "hover/retrim" else prior.first.rates
         np.testing.assert_allclose(rates.tau, [0.07, 0.08, 0.4])
 
@@ -432,12 +432,12 @@ def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
 @pytest.mark.parametrize(("delay", "ticks"), [(0.041, 2), (0.0, 0), (None, 1)])
 def test_a_vehicle_whose_delay_is_known_is_trained_with_it(delay, ticks):
     body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
-    made = Setup.from_preset(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
-    assert made.learner.plant_delay_ticks == made.preset.plant_delay_ticks == ticks
+    setup = Setup.from_preset(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
+    assert setup.learner.plant_delay_ticks == setup.preset.plant_delay_ticks == ticks
     exact = 0.02 if delay is None else delay  # the model, and the observer in flight
-    observer = made.controller(made.learner.init(made.new_policy(random.key(0)), random.key(2))).frame.observer
-    assert [float(made.env.delay), float(observer.path.delay)] == pytest.approx([exact, exact])
-    assert Setup.from_preset(made.preset).preset == made.preset
+    observer = setup.controller(setup.learner.init(setup.new_policy(random.key(0)), random.key(2))).frame.observer
+    assert [float(setup.env.delay), float(observer.path.delay)] == pytest.approx([exact, exact])
+    assert Setup.from_preset(setup.preset).preset == setup.preset
 
 
 def test_a_delay_of_too_many_ticks_is_one_line_that_says_why():

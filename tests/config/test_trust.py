@@ -54,10 +54,10 @@ def test_names_of_a_preset_are_those_that_it_would_import():
 def test_a_refusal_is_one_short_line_with_the_way_out():
     with pytest.raises(ConfigError, match=r"^f: names Python code, 'os:abort', .*pass --trust os:abort, or trust="):
         check_trust("os:abort", (), source="f")
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError) as error:
         check_trust("os:\n\x1b[2J" + 10**6 * "x", (), source="f")
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < 500
+    assert str(error.value).isprintable()
+    assert len(str(error.value)) < 500
     check_trust("os:abort", ("os:abort",), source="f")
 
 
@@ -97,8 +97,8 @@ def test_a_file_over_a_preset_needs_trust_and_the_preset_below_does_not(mine, tm
         load("hover/retrim", tmp_path / "over.toml")
     assert overlaid(below, tmp_path / "over.toml", trust=(f"{mine}:vehicle",)) != below
     (tmp_path / "other.toml").write_text("dt = 0.01")
-    typed = changed(below, vehicle=f"{mine}:vehicle")
-    assert overlaid(typed, tmp_path / "other.toml").vehicle == f"{mine}:vehicle"
+    typed_text = changed(below, vehicle=f"{mine}:vehicle")
+    assert overlaid(typed_text, tmp_path / "other.toml").vehicle == f"{mine}:vehicle"
 
 
 @pytest.mark.parametrize("key", ["methods", "disturbances", "plants", "vehicles", "sensors", "references"])

@@ -25,13 +25,13 @@ SEVEN_INCH = {
 
 @pytest.fixture
 def vehicle_file(tmp_path):
-    def written(file_name="seven_inch.toml", **changes):
+    def write(file_name="seven_inch.toml", **changes):
         lines = {k: v for k, v in (SEVEN_INCH | changes).items() if v is not None}
         path = tmp_path / file_name
         path.write_text("".join(f"{key} = {value}\n" for key, value in lines.items()))
         return path
 
-    return written
+    return write
 
 
 def test_a_seven_inch_quadrotor(vehicle_file):
@@ -58,16 +58,16 @@ def test_what_a_file_leaves_out_follows_from_its_size(vehicle_file, size):
     other = dataclasses.replace(
         spec, arm=arm, propeller_diameter=5.5 * size, inertia=tuple(size**2 * moment for moment in spec.inertia)
     )
-    one, scaled = spec.build(), other.build()
+    one, scaling = spec.build(), other.build()
     for name, power in (("radius", 1), ("chord_root", 1), ("chord_tip", 1)):
-        assert getattr(scaled.propeller, name) == pytest.approx(size**power * getattr(one.propeller, name))
+        assert getattr(scaling.propeller, name) == pytest.approx(size**power * getattr(one.propeller, name))
     for name, power in (
         ("drag_area", 2), ("thrust_coefficient", 4), ("rotor_inertia", 5), ("torque_ratio", 1),
         ("motor_max", -2), ("motor_min", -2),
     ):  # fmt: skip
-        np.testing.assert_allclose(getattr(scaled, name), size**power * getattr(one, name), rtol=1e-6, err_msg=name)
+        np.testing.assert_allclose(getattr(scaling, name), size**power * getattr(one, name), rtol=1e-6, err_msg=name)
     for name in ("base", "linear", "root"):
-        assert getattr(scaled.esc, name) == pytest.approx(size**-2 * getattr(one.esc, name))
+        assert getattr(scaling.esc, name) == pytest.approx(size**-2 * getattr(one.esc, name))
     like = dataclasses.replace(spec, arm=(0.075, 0.1), inertia=(0.004, 0.005, 0.008)).build()  # as far as kingfisher's
     np.testing.assert_allclose(like.drag_area, kingfisher().drag_area)
     # Without propellers of its own, they are as large as nine tenths of what the shorter arm leaves them:
@@ -86,9 +86,9 @@ def test_a_propeller_is_as_large_as_it_is_said_to_be(vehicle_file, kind, inches)
 def test_it_hovers_on_hover_commands(vehicle_file, plant, propeller):
     """Within 5 cm over a second, without an error of the thrust map."""
     path = vehicle_file(propeller_diameter=propeller)
-    made = Scenario(plant=plant, vehicle=str(path), thrust_error=0.0).make()
+    setup = Scenario(plant=plant, vehicle=str(path), thrust_error=0.0).make()
     x0 = State.at(jnp.array([0.3, -0.2, 1.5]))
-    log = fly(made, FunctionPilot(lambda measurement: Command.hover()), x0, ticks=50)
+    log = fly(setup, FunctionPilot(lambda measurement: Command.hover()), x0, ticks=50)
     assert np.linalg.norm(log.p - log.p[0], axis=1).max() < 0.05
 
 

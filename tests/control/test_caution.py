@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from jax import lax, random
 
+from retrim.control.belief_flight import BeliefFlight
 from retrim.control.caution import Caution
 from retrim.control.condition import Cause, Stage
 from retrim.control.controller import AbstractController
-from retrim.control.identified import BeliefFlight
 from retrim.control.vehicle_report import VehicleEstimate
 from retrim.physics import ActuatorResponse, Command, State, small, so3
 from retrim.physics.effects import ExternalEffects
@@ -53,10 +53,10 @@ def test_it_makes_the_assumed_vehicle_slower_and_changes_nothing_else():
     belief = PathBelief.between(jnp.array([-0.8, -0.6, -0.3, 0.1]), jnp.array([-0.7, -0.2, 0.5, 0.4]))
     none = Caution.none(State.at(jnp.zeros(3)))
     for level in (0.0, 0.4, 1.0):
-        low, high = dataclasses.replace(none, level=jnp.array(level)).applied(belief).ends
-        for found, before in zip((low, high), belief.ends, strict=True):
+        low, high = dataclasses.replace(none, level=jnp.array(level)).apply(belief).ends
+        for result, before in zip((low, high), belief.ends, strict=True):
             expected = np.array(before) + level * np.array([1.0, 1.0, 0.0, 0.0]) * (1.0 - np.array(before))
-            np.testing.assert_allclose(found, expected, atol=1e-6)
+            np.testing.assert_allclose(result, expected, atol=1e-6)
 
 
 def test_it_makes_the_commands_of_the_thrust_smaller():

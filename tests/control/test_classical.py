@@ -14,7 +14,7 @@ from retrim.control.geometric import Gains, GeometricController
 from retrim.control.indi import IndiController
 from retrim.estimation.prediction import Prediction
 from retrim.physics import Command, CommandPath, PointMass, State, small, so3
-from retrim.physics.actuators import Lagged
+from retrim.physics.actuators import LaggedModel
 from retrim.tasks import Preview, Track
 from retrim.tasks.shapes import figure8
 
@@ -27,15 +27,15 @@ def gains(integral=0.0):
     return Gains(jnp.array(12.0), jnp.array(6.0), jnp.array(12.0), jnp.array(integral))
 
 
-def made(kind, task):
+def make(kind, task):
     if kind == "indi":
         return IndiController(task, gains(), PREDICTION, jnp.array(0.08), *LIMITS)
     return GeometricController(task, gains(12.0 if kind == "geometric-i" else 0.0), PREDICTION, jnp.array(6.0), *LIMITS)
 
 
 @eqx.filter_jit
-def _flown(controller, x0, push, start, ticks):
-    model = Lagged(PointMass(DT), first_order(TAU))
+def _fly_once(controller, x0, push, start, ticks):
+    model = LaggedModel(PointMass(DT), first_order(TAU))
 
     def tick(carry, k):
         s, memory, waiting = carry
@@ -48,9 +48,9 @@ def _flown(controller, x0, push, start, ticks):
     return lax.scan(tick, first, jnp.arange(ticks))[1]
 
 
-def flown(controller, x0, push, seconds=8.0, start=0.0):
+def fly_once(controller, x0, push, seconds=8.0, start=0.0):
     """States by tick, in the lagged model with a command delay of one tick, pushed from ``start`` on [s]."""
-    return _flown(controller, x0, push, jnp.array(start), round(seconds / DT))
+    return _fly_once(controller, x0, push, jnp.array(start), round(seconds / DT))
 
 
 @pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])
@@ -58,7 +58,7 @@ def test_it_comes_to_hover_from_anywhere_near(kind, key):
     task = hover_task()
     for k in random.split(key, 3):
         x0 = State(jnp.array(GOAL) + random.uniform(k, (3,), minval=-1.0), random_state(k, 0.3).R, jnp.zeros(3))
-        path = flown(made(kind, task), x0, jnp.zeros(3))
+        path = fly_once(make(kind, task), x0, jnp.zeros(3))
         np.testing.assert_allclose(path.p[-1], GOAL, atol=2e-3)
         assert float(jnp.max(jnp.abs(path.v[-50:]))) < 5e-3
 
@@ -67,7 +67,7 @@ def test_it_comes_to_hover_from_anywhere_near(kind, key):
 @pytest.mark.parametrize("push", [(2.0, 2.0, 2.0), (-1.0, 0.5, -3.0)])
 def test_it_rejects_a_step(kind, push):
     task, d = hover_task(), jnp.array(push)
-    path = flown(made(kind, task), State.at(jnp.array(GOAL)), d, start=1.0, seconds=12.0)
+    path = fly_once(make(kind, task), State.at(jnp.array(GOAL)), d, start=1.0, seconds=12.0)
     error = jnp.sqrt(jnp.sum((path.p - jnp.array([GOAL])) ** 2, axis=1))
     assert float(jnp.max(error)) > 0.02  # the step is felt
     assert float(error[-1]) < 2e-3
@@ -75,7 +75,7 @@ def test_it_rejects_a_step(kind, push):
 
 def test_without_integral_action_it_rests_where_its_spring_balances_the_push():
     d = jnp.array([0.6, -0.3, 0.2])
-    path = flown(made("geometric", hover_task()), State.at(jnp.array(GOAL)), d)
+    path = fly_once(make("geometric", hover_task()), State.at(jnp.array(GOAL)), d)
     expected = d / 12.0 * (1.0 + 6.0 * DT + 0.5 * 12.0 * DT**2)  # what it predicts knows of no push
     np.testing.assert_allclose(path.p[-1] - jnp.array(GOAL), expected, rtol=0.01)
 
@@ -83,26 +83,26 @@ def test_without_integral_action_it_rests_where_its_spring_balances_the_push():
 def test_indi_believes_the_accelerometer():
     """A measured acceleration beyond that of the velocities is a disturbance to it."""
     task, x = hover_task(), State.at(jnp.array(GOAL))
-    plain = made("indi", task)
+    plain = make("indi", task)
     _, memory = plain(plain.init(x), jnp.array(0.0), x)  # before the first tick there is nothing to compare
     level, _ = plain(memory, jnp.array(DT), x)
-    pulled, _ = plain.with_inertial(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(DT), x)
+    pull, _ = plain.with_inertial(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(DT), x)
     share = 1.0 - np.exp(-DT / 0.08)  # of 1 m/s^2; and the vehicle will have fallen a little until it is answered
-    assert share < float(pulled.c - level.c) < 1.2 * share
+    assert share < float(pull.c - level.c) < 1.2 * share
 
 
 @pytest.mark.parametrize("kind", ["geometric", "indi"])
 def test_it_asks_for_nothing_that_the_vehicle_refuses(kind):
     """Far away and upside down: both limits of the thrust, and those of the rates."""
-    controller, low, high = made(kind, hover_task()), *(limit.vector() for limit in LIMITS)
-    told = set()
+    controller, low, high = make(kind, hover_task()), *(limit.vector() for limit in LIMITS)
+    message = set()
     for R, z in ((jnp.eye(3), -9.0), (so3.exp(jnp.array([2.8, 0.4, 0.0])), 9.0)):
         x = State(jnp.array([6.0, -6.0, z]), R, jnp.zeros(3))
         u = controller(controller.init(x), jnp.array(0.0), x)[0].vector()
         assert bool(jnp.all((low <= u) & (u <= high)))
-        told |= {("low", k) for k in np.flatnonzero(u == low)} | {("high", k) for k in np.flatnonzero(u == high)}
-    assert {("low", 0), ("high", 0)} <= told
-    assert told & {("low", 1), ("high", 1)}
+        message |= {("low", k) for k in np.flatnonzero(u == low)} | {("high", k) for k in np.flatnonzero(u == high)}
+    assert {("low", 0), ("high", 0)} <= message
+    assert message & {("low", 1), ("high", 1)}
 
 
 @pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])
@@ -111,9 +111,9 @@ def test_it_follows_a_figure_8(kind):
     task = Track(reference, Preview(reference, small().omega_max, 0), jnp.array(1.0), jnp.array(5.0))
     here = at(reference, [0.0])
     start = State(jnp.asarray(here.p[0]), jnp.eye(3), jnp.asarray(here.v[0]))
-    path = flown(made(kind, task), start, jnp.zeros(3), seconds=10.0)
-    wanted = at(reference, DT * np.arange(1.0, path.p.shape[0] + 1)).p
-    error = np.linalg.norm(np.asarray(path.p) - wanted, axis=1)
+    path = fly_once(make(kind, task), start, jnp.zeros(3), seconds=10.0)
+    expected = at(reference, DT * np.arange(1.0, path.p.shape[0] + 1)).p
+    error = np.linalg.norm(np.asarray(path.p) - expected, axis=1)
     assert np.mean(error[250:]) < 0.03
 
 
@@ -123,15 +123,15 @@ def test_it_does_not_care_where_it_is_or_where_north_is(kind, key):
     turn, shift = so3.rotz(jnp.array(1.2)), jnp.array([5.0, -3.0, 2.0])
     here = dataclasses.replace(task, goal=jnp.array(GOAL))
 
-    def decided(x, goal, heading):
-        controller = made(kind, dataclasses.replace(here, goal=goal))
+    def decide(x, goal, heading):
+        controller = make(kind, dataclasses.replace(here, goal=goal))
         point = controller.task.setpoint(jnp.array(0.0))._replace(heading=jnp.array(heading))
         thrust = thrust_of(controller.gains.acceleration(x, point, jnp.zeros(3)))
         return command_for(x, thrust, point, controller.gains.turning()).vector()
 
-    first = decided(x, jnp.array(GOAL), 0.0)
-    moved = State(turn @ x.p + shift, turn @ x.R, turn @ x.v)
-    np.testing.assert_allclose(decided(moved, turn @ jnp.array(GOAL) + shift, 1.2), first, atol=1e-9)
+    first = decide(x, jnp.array(GOAL), 0.0)
+    state_after = State(turn @ x.p + shift, turn @ x.R, turn @ x.v)
+    np.testing.assert_allclose(decide(state_after, turn @ jnp.array(GOAL) + shift, 1.2), first, atol=1e-9)
 
 
 def test_attitudes_are_rotations_and_a_vehicle_in_its_attitude_is_told_the_reference(key):

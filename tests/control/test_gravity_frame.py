@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, first_order, hover_env, hover_task, random_command, random_state, replaced
+from helpers import GOAL, first_order, hover_env, hover_task, random_command, random_state, replace_fields
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import AbstractController, PolicyController
@@ -18,7 +18,7 @@ from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, FittedResidual, rollout
 from retrim.learn.residuals import RegressionModel
 from retrim.physics import ActuatorState, Command, Hybrid, PointMass, State, small, so3
-from retrim.physics.actuators import Lagged, RateBiased
+from retrim.physics.actuators import LaggedModel, RateBiasedModel
 from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import (
     Keypoints,
@@ -59,13 +59,15 @@ def test_felt_gravity_is_standard_gravity_in_the_frame(d):
     frame = EffectiveGravityFrame.of(jnp.array(d))
     np.testing.assert_allclose(frame.Q @ frame.Q.T, np.eye(3), atol=1e-12)
     assert float(jnp.linalg.det(frame.Q)) == pytest.approx(1.0)
-    felt = jnp.array([0.0, 0.0, -9.81]) + jnp.array(d)
-    np.testing.assert_allclose(frame.vector(felt), [0.0, 0.0, -9.81], atol=1e-12)
-    axis = jnp.cross(felt, jnp.array([0.0, 0.0, 1.0]))  # the smallest rotation leaves this one alone
+    specific_force = jnp.array([0.0, 0.0, -9.81]) + jnp.array(d)
+    np.testing.assert_allclose(frame.vector(specific_force), [0.0, 0.0, -9.81], atol=1e-12)
+    axis = jnp.cross(specific_force, jnp.array([0.0, 0.0, 1.0]))  # the smallest rotation leaves this one alone
     np.testing.assert_allclose(frame.Q @ axis, axis, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", [PointMass(0.02), Lagged(PointMass(0.02), first_order(0.03))], ids=["bare", "lagged"])
+@pytest.mark.parametrize(
+    "model", [PointMass(0.02), LaggedModel(PointMass(0.02), first_order(0.03))], ids=["bare", "lagged"]
+)
 def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
     """From any state, under any command, with any residual: one tick of Eq. (1), turned before or after."""
     k_x, k_u = random.split(key)
@@ -76,11 +78,11 @@ def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
         frame = EffectiveGravityFrame.of(d)
         left = lambda x, u: frame.vector(residual(frame.world_state(x), frame.world_command(u)) - d)  # noqa: E731
         world, inside = Hybrid(model, residual), Hybrid(model, left)
-        s, turned = world.init(x), inside.init(frame.state(x))
-        if isinstance(model, Lagged):  # its actuators hover at first, in the world as in the frame
-            turned = replaced(turned, actuators=ActuatorState.at(frame.command(s.actuators.command)))
-        s, turned = world.step(s, u, jnp.zeros(3)), inside.step(turned, frame.command(u), jnp.zeros(3))
-        return inside.state(turned), frame.state(world.state(s))
+        s, rotation = world.init(x), inside.init(frame.state(x))
+        if isinstance(model, LaggedModel):  # its actuators hover at first, in the world as in the frame
+            rotation = replace_fields(rotation, actuators=ActuatorState.at(frame.command(s.actuators.command)))
+        s, rotation = world.step(s, u, jnp.zeros(3)), inside.step(rotation, frame.command(u), jnp.zeros(3))
+        return inside.state(rotation), frame.state(world.state(s))
 
     all_pushes = jax.jit(jax.vmap(ticks, in_axes=(0, None)))
     for drag in (0.0, 0.3):  # without, and with a part that depends on the state
@@ -101,22 +103,22 @@ def test_flatness_flies_the_turned_reference(make):
 
     @jax.jit
     @jax.vmap
-    def seen(d):
+    def observe(d):
         frame = EffectiveGravityFrame.of(d)
-        here, framed = jax.vmap(reference)(times), reference.in_frame(frame)
-        turned = jax.vmap(framed)(times)
+        here, in_frame = jax.vmap(reference)(times), reference.in_frame(frame)
+        rotation = jax.vmap(in_frame)(times)
         close_to = (jax.vmap(frame.vector)(here.p), jax.vmap(frame.vector)(here.v))
-        inside = framed.distance(frame.vector(away)) / frame.scale
-        return here, turned, close_to, frame.scale, framed.lap, (inside, reference.distance(away))
+        inside = in_frame.distance(frame.vector(away)) / frame.scale
+        return here, rotation, close_to, frame.scale, in_frame.lap, (inside, reference.distance(away))
 
-    here, turned, (p, v), scale, lap, (inside, outside) = jax.tree.map(np.asarray, seen(jnp.array(PUSHES)))
-    close(turned.p, p)
-    close(turned.v, v)
-    thrust = turned.u[..., 0] / scale[:, None]
-    needed = np.linalg.norm(here.a - np.array([0.0, 0.0, -9.81]) - np.array(PUSHES)[:, None], axis=-1)
-    np.testing.assert_allclose(thrust, needed, rtol=1e-6)
+    here, rotation, (p, v), scale, lap, (inside, outside) = jax.tree.map(np.asarray, observe(jnp.array(PUSHES)))
+    close(rotation.p, p)
+    close(rotation.v, v)
+    thrust = rotation.u[..., 0] / scale[:, None]
+    needs = np.linalg.norm(here.a - np.array([0.0, 0.0, -9.81]) - np.array(PUSHES)[:, None], axis=-1)
+    np.testing.assert_allclose(thrust, needs, rtol=1e-6)
     assert PUSHES[0] == (0.0, 0.0, 0.0)
-    np.testing.assert_allclose(turned.u[0], here.u[0], atol=0.02)
+    np.testing.assert_allclose(rotation.u[0], here.u[0], atol=0.02)
     np.testing.assert_array_equal(lap, np.broadcast_to(reference.lap, lap.shape))
     np.testing.assert_allclose(inside, outside, rtol=1e-6)
 
@@ -158,18 +160,18 @@ def test_a_turned_task_sees_and_rewards_the_same(kind, key):
 
     @eqx.filter_jit
     def both(task, frame):
-        turned, memory = task.in_frame(frame), task.observation.init(x)
+        rotation, memory = task.in_frame(frame), task.observation.init(x)
         outside, _ = task.observation(memory, t, x, Command.hover())
-        inside, _ = turned.observation(memory, t, frame.state(x), Command.hover())
+        inside, _ = rotation.observation(memory, t, frame.state(x), Command.hover())
         vectors = [(inside[k : k + 3], frame.vector(outside[k : k + 3])) for k in (0, 3, 6, 9, 12, 15, 18, 30)]
-        at = turned.reference(t)
-        reward = turned.reward(t, State(at.p, jnp.eye(3), at.v), Command.of(at.u))
-        return vectors, turned.error(t, frame.state(x)), frame.scale * task.error(t, x), at.heading, reward
+        at = rotation.reference(t)
+        reward = rotation.reward(t, State(at.p, jnp.eye(3), at.v), Command.of(at.u))
+        return vectors, rotation.error(t, frame.state(x)), frame.scale * task.error(t, x), at.heading, reward
 
-    vectors, error, scaled, heading, reward = both(task, frame)
+    vectors, error, scaling, heading, reward = both(task, frame)
     for inside, outside in vectors:  # positions, velocities, and its own velocity
         np.testing.assert_allclose(inside, outside, atol=1e-9)
-    np.testing.assert_allclose(error, scaled, rtol=1e-9)
+    np.testing.assert_allclose(error, scaling, rtol=1e-9)
     heads = 0.5 * (1.0 - np.cos(float(heading)))
     if kind is L2Track:
         np.testing.assert_allclose(reward, -heads, atol=1e-9)
@@ -181,19 +183,19 @@ def test_a_constant_push_leaves_nothing_to_learn(d, key):
     env, d = hover_env(horizon=25), jnp.array(d)  # too short to be terminated
     frame, policy = EffectiveGravityFrame.of(d), fresh(15, key)
     start = Start(jnp.array(0.0), random_state(key))
-    pushed = roll(GravityView(LIMIT)(env, eqx.Partial(always, d)), policy, start)
+    with_push = roll(GravityView(LIMIT)(env, eqx.Partial(always, d)), policy, start)
     calm_env, calm_start = Env(env.dynamics, env.task.in_frame(frame)), Start(start.t, frame.state(start.x))
     calm = roll(calm_env, policy, calm_start)
-    close(jax.vmap(frame.state)(pushed.x), calm.x, 1e-9)
-    close(jax.vmap(frame.command)(pushed.u), calm.u, 1e-9)
-    np.testing.assert_allclose(pushed.reward, calm.reward, atol=1e-9)
+    close(jax.vmap(frame.state)(with_push.x), calm.x, 1e-9)
+    close(jax.vmap(frame.command)(with_push.u), calm.u, 1e-9)
+    np.testing.assert_allclose(with_push.reward, calm.reward, atol=1e-9)
 
 
 def test_the_world_is_seen_as_it_is():
     env, residual = hover_env(), lambda x, u: x.v
-    seen = WorldView()(env, residual)
-    assert seen.frame_disturbance is None
-    assert seen.dynamics.residual is residual
+    observation = WorldView()(env, residual)
+    assert observation.frame_disturbance is None
+    assert observation.dynamics.residual is residual
 
 
 def test_the_frame_sends_no_gradient_back(key):
@@ -203,7 +205,7 @@ def test_the_frame_sends_no_gradient_back(key):
     x = random_state(key)
 
     def tilt(v):
-        return view.frame(replaced(x, v=v), Command.hover()).Q
+        return view.frame(replace_fields(x, v=v), Command.hover()).Q
 
     np.testing.assert_array_equal(jax.jit(jax.jacobian(tilt))(x.v), 0.0)
 
@@ -214,19 +216,19 @@ def test_what_is_known_needs_no_estimate(key):
     residual = lambda x, u: d - 0.4 * x.v + 0.1 * (u.c - 9.81) * x.R[:, 2]  # noqa: E731
     x, u = random_state(key), random_command(key)
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), LIMIT, jnp.array(jnp.inf))
-    framed = GravityFrame(PolicyController(hover_env().task.observation, fresh(15, key)), observer, residual)
+    in_frame = GravityFrame(PolicyController(hover_env().task.observation, fresh(15, key)), observer, residual)
 
     @jax.jit
-    def seen():
-        memory = framed.init(x)
+    def observe():
+        memory = in_frame.init(x)
         first = observer(memory.observer, jnp.array(-0.02), x)
-        memory = replaced(memory, observer=observer.issued(first, u))  # no delay is declared: it acts at once
+        memory = replace_fields(memory, observer=observer.issued(first, u))  # no delay is declared: it acts at once
         after = Hybrid(PointMass(0.02), residual).step(x, u, jnp.zeros(3))
-        _, memory = framed(memory, jnp.array(0.0), after)
+        _, memory = in_frame(memory, jnp.array(0.0), after)
         apart = StateDependentResidual(residual, jnp.array(1.0))(x, u) + d, residual(x, u)
         return apart, memory.observer.d_hat, (memory.frame.d, residual(after, u))
 
-    apart, d_hat, both = seen()
+    apart, d_hat, both = observe()
     np.testing.assert_allclose(*apart, atol=1e-12)
     np.testing.assert_allclose(d_hat, d, atol=1e-6)
     np.testing.assert_allclose(*both, atol=1e-6)
@@ -237,7 +239,7 @@ def test_the_frame_is_capped_and_defined_near_free_fall():
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.2), LIMIT, jnp.array(2.0))
     s = observer.init(State.at(jnp.zeros(3)))
     falling = State(jnp.zeros(3), jnp.eye(3), jnp.array([0.0, 0.0, -1e4]))
-    s = observer(replaced(s, t=jnp.array(0.0)), jnp.array(0.02), falling)
+    s = observer(replace_fields(s, t=jnp.array(0.0)), jnp.array(0.02), falling)
     assert float(jnp.linalg.norm(s.d_hat)) <= 6.0 + 1e-6
     frame = EffectiveGravityFrame.of(s.d_hat)
     assert np.isfinite(frame.Q).all()
@@ -254,25 +256,25 @@ def test_what_a_pose_filter_feels_turns_the_picture(key):
     calm = PolicyController(full.in_frame(frame), policy)
 
     @jax.jit
-    def decided():
+    def decide():
         memory, last = controller.init(x)
-        sure = replaced(memory.pose, x=replaced(x, v=-0.02 * d), d=d, P=1e-12 * jnp.eye(12))
+        sure = replace_fields(memory.pose, x=replace_fields(x, v=-0.02 * d), d=d, P=1e-12 * jnp.eye(12))
         calmly = jnp.zeros((3, 4)).at[:, 0].set(1.0 / frame.scale - 1.0)  # what has been hover in the frame
         memory = memory._replace(
             commands=calmly, pose=sure, poses=jax.tree.map(lambda leaf: jnp.repeat(leaf[None], 13, axis=0), x)
         )
         u, after = controller((memory, last), jnp.array(0.0), x)
         start = calm.init(frame.state(x))
-        wanted, _ = calm((start[0], frame.command(last)), jnp.array(0.0), frame.state(x))
-        turned = frame.command(u).vector(), wanted.vector()
-        return turned, (after[1], u), (controller.accepted(after, last)[1], last)
+        expected, _ = calm((start[0], frame.command(last)), jnp.array(0.0), frame.state(x))
+        rotation = frame.command(u).vector(), expected.vector()
+        return rotation, (after[1], u), (controller.accepted(after, last)[1], last)
 
     back = PointMass(0.02).step(State(x.p, x.R, -x.v), Command.hover(), jnp.zeros(3))
     close(back.p, x.p)  # it hovers: a tick ago it was here
-    turned, remembered, accepted = decided()
-    np.testing.assert_allclose(*turned, atol=1e-4)
-    close(*remembered)
-    close(*accepted)
+    rotation, memory, accepted_command = decide()
+    np.testing.assert_allclose(*rotation, atol=1e-4)
+    close(*memory)
+    close(*accepted_command)
 
 
 def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(key):
@@ -280,11 +282,11 @@ def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(
     d, full = jnp.array([1.5, -1.0, 2.0]), Keypoints.of(HOME, small().omega_max, whitened=False)
     task = dataclasses.replace(hover_task(horizon=14), observation=full)
     env = RestView(LIMIT)(Env(PointMass(0.02), task), lambda x, u: d)
-    seen = []
+    observation = []
 
     class Looking(type(full)):
         def stacked(self, frames):
-            jax.debug.callback(lambda rows: seen.append(np.asarray(rows)), frames)
+            jax.debug.callback(lambda rows: observation.append(np.asarray(rows)), frames)
             return super().stacked(frames)
 
     looking = Looking(**{f.name: getattr(full, f.name) for f in dataclasses.fields(full)})
@@ -295,15 +297,15 @@ def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(
     still = eqx.tree_at(lambda p: p.layers[-1].weight, policy, jnp.zeros_like(policy.layers[-1].weight))
     roll(env, still, Start(jnp.array(0.0), at_rest))
     jax.effects_barrier()
-    first = seen[0]
+    first = observation[0]
     np.testing.assert_allclose(first, np.repeat(first[-1:], len(first), axis=0), atol=1e-9)
 
 
 def test_training_on_keypoints_sees_one_frame(key):
     """That of what was learnt, at rest; its norm is limited."""
     d, env = jnp.array([1.5, -1.0, 2.0]), hover_env(horizon=3)
-    seen = RestView(LIMIT)(env, lambda x, u: d - 0.5 * x.v)
-    close(seen.frame(random_state(key), Command.hover()), EffectiveGravityFrame.of(d))
+    observation = RestView(LIMIT)(env, lambda x, u: d - 0.5 * x.v)
+    close(observation.frame(random_state(key), Command.hover()), EffectiveGravityFrame.of(d))
     far = RestView(LIMIT)(env, lambda x, u: 9.0 * d).frame(random_state(key), Command.hover())
     np.testing.assert_allclose(jnp.linalg.norm(far.d), LIMIT, rtol=1e-6)
 
@@ -329,23 +331,23 @@ def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
     policy = fresh(env.task.observation.size, random.key(3))
     inner = PolicyController(env.task.observation, policy)
     exact = DisturbanceObserver(PointMass(0.02), jnp.array(1e-9), jnp.array(9.0), jnp.array(jnp.inf))
-    framed = GravityFrame(inner, exact)
+    in_frame = GravityFrame(inner, exact)
     start = Start(jnp.array(0.0), frame.state(x0))
     calm = roll(Env(PointMass(0.02), env.task.in_frame(frame)), policy, start)
 
-    memory = framed.init(x0)
-    memory = replaced(memory, observer=replaced(memory.observer, d_hat=d))
-    positions = _positions(framed, d, memory, x0)
+    memory = in_frame.init(x0)
+    memory = replace_fields(memory, observer=replace_fields(memory.observer, d_hat=d))
+    positions = _positions(in_frame, d, memory, x0)
     np.testing.assert_allclose(jax.vmap(frame.vector)(positions), calm.x.p, atol=1e-6)
 
 
 @eqx.filter_jit
-def _positions(framed, d, memory, x):
+def _positions(in_frame, d, memory, x):
     """Of 40 ticks under the push ``d``."""
 
     def tick(carry, k):
         memory, x = carry
-        u, memory = framed(memory, 0.02 * k, x)
+        u, memory = in_frame(memory, 0.02 * k, x)
         return (memory, PointMass(0.02).step(x, u, d)), x.p
 
     return lax.scan(tick, (memory, x), jnp.arange(40.0))[1]
@@ -357,7 +359,7 @@ def test_a_known_rate_bias_is_taken_off_the_command(key):
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.05), LIMIT, jnp.array(4.0))
     inner = PolicyController(hover_env(history=2).task.observation, policy)
     age = jnp.array(0.01)
-    plain, told_less = (GravityFrame(inner, observer, age=age, rate_bias=b) for b in (jnp.zeros(3), bias))
+    plain, naive = (GravityFrame(inner, observer, age=age, rate_bias=b) for b in (jnp.zeros(3), bias))
 
     @eqx.filter_jit
     def fly(controller, model):
@@ -370,20 +372,22 @@ def test_a_known_rate_bias_is_taken_off_the_command(key):
         x = State.at(HOME + 0.1)
         return lax.scan(tick, (x, controller.init(x)), jnp.arange(10.0))[1]
 
-    close(fly(told_less, RateBiased(PointMass(0.02), bias)), fly(plain, PointMass(0.02)), 1e-9)
+    close(fly(naive, RateBiasedModel(PointMass(0.02), bias)), fly(plain, PointMass(0.02)), 1e-9)
 
 
 def test_a_corrected_model_turns_as_the_vehicle_was_seen_to_turn(key):
     """In the world with bias and lag; in the frame, whose controller answers the bias, with the lag."""
     model = RegressionModel.of(0.02)
     fresh = model.init(key)
-    known = replaced(fresh, rates=replaced(fresh.rates, bias=jnp.array([0.3, 0.0, 0.0]), tau=jnp.full(3, 0.08)))
-    env = hover_env(Lagged(PointMass(0.02), first_order(0.03)))
-    world, framed = (view(env, FittedResidual(model, known)).dynamics for view in (WorldView(), GravityView(LIMIT)))
-    true = Lagged(PointMass(0.02), first_order(0.08))
-    for seen, expected in ((world, RateBiased(true, known.rates.bias)), (framed, true)):
+    names = replace_fields(
+        fresh, rates=replace_fields(fresh.rates, bias=jnp.array([0.3, 0.0, 0.0]), tau=jnp.full(3, 0.08))
+    )
+    env = hover_env(LaggedModel(PointMass(0.02), first_order(0.03)))
+    world, in_frame = (view(env, FittedResidual(model, names)).dynamics for view in (WorldView(), GravityView(LIMIT)))
+    true = LaggedModel(PointMass(0.02), first_order(0.08))
+    for observation, expected in ((world, RateBiasedModel(true, names.rates.bias)), (in_frame, true)):
         x, u = random_state(key), random_command(key)
-        close(seen.step(seen.init(x), u, jnp.zeros(3)), expected.step(expected.init(x), u, jnp.zeros(3)))
+        close(observation.step(observation.init(x), u, jnp.zeros(3)), expected.step(expected.init(x), u, jnp.zeros(3)))
 
 
 class Standstill(AbstractController[None]):

@@ -11,7 +11,7 @@ from jax import random
 from helpers import draw_starts, hover_env, random_starts, tiny_preset
 from retrim.adapt.buffer import RollingBuffer
 from retrim.adapt.gate import judge
-from retrim.adapt.starts import drawn
+from retrim.adapt.starts import sample_starts
 from retrim.config import Setup
 from retrim.control import LoraPolicy, Policy
 from retrim.control.lora import LowRankFactors
@@ -26,7 +26,7 @@ def size(tree):
 
 
 @eqx.filter_jit
-def moved(lora, key):
+def move(lora, key):
     """With a delta that changes something."""
     leaves, shape = jax.tree.flatten(lora.delta)
     keys = random.split(key, len(leaves))
@@ -79,16 +79,16 @@ def test_a_fresh_delta_changes_nothing(base, lora, key):
 
 def test_merged_by_hand(base, lora, key):
     """W + scale up down in NumPy, bias as it was; and the commands of y = W x + scale B (A x) + b."""
-    trained = moved(lora, key)
-    plain = trained.merged()
-    for layer, frozen, thin in zip(plain.layers, base.layers, trained.delta, strict=True):
-        merged = np.asarray(frozen.weight) + 4.0 * np.asarray(thin.up) @ np.asarray(thin.down)
-        np.testing.assert_allclose(layer.weight, merged, rtol=1e-12, atol=1e-13)
+    trained_policy = move(lora, key)
+    plain = trained_policy.merged()
+    for layer, frozen, thin in zip(plain.layers, base.layers, trained_policy.delta, strict=True):
+        merge_result = np.asarray(frozen.weight) + 4.0 * np.asarray(thin.up) @ np.asarray(thin.down)
+        np.testing.assert_allclose(layer.weight, merge_result, rtol=1e-12, atol=1e-13)
         np.testing.assert_array_equal(layer.bias, frozen.bias)
         rank = np.linalg.matrix_rank(np.asarray(layer.weight - frozen.weight), tol=1e-9)
         assert rank == thin.down.shape[0]
     h = o = np.asarray(random.normal(key, (15,)))
-    for i, (frozen, thin) in enumerate(zip(base.layers, trained.delta, strict=True)):
+    for i, (frozen, thin) in enumerate(zip(base.layers, trained_policy.delta, strict=True)):
         h = frozen.weight @ h + 4.0 * thin.up @ (thin.down @ h) + frozen.bias
         h = np.maximum(h, 0.0) if i < 2 else h
     np.testing.assert_allclose(plain(jnp.asarray(o)).vector(), base.bounded(jnp.asarray(h)).vector(), rtol=1e-10)
@@ -97,22 +97,22 @@ def test_merged_by_hand(base, lora, key):
 
 def test_merging_twice_and_forgetting(base, lora, key):
     """Plain is plain; and with the fresh delta put back, it is the base again."""
-    trained = moved(lora, key)
-    same(trained.merged().merged(), trained.merged())
-    same(trained.with_params(lora.delta).merged(), base)
+    trained_policy = move(lora, key)
+    same(trained_policy.merged().merged(), trained_policy.merged())
+    same(trained_policy.with_params(lora.delta).merged(), base)
 
 
 def test_scale_counts(base, key):
-    one, two = (moved(LoraPolicy.of(base, key=key, ranks=RANKS, scale=s), key).merged() for s in (1.0, 2.0))
+    one, two = (move(LoraPolicy.of(base, key=key, ranks=RANKS, scale=s), key).merged() for s in (1.0, 2.0))
     for frozen, a, b in zip(base.layers, one.layers, two.layers, strict=True):
         np.testing.assert_allclose(b.weight - frozen.weight, 2.0 * (a.weight - frozen.weight), atol=1e-13)
 
 
-@pytest.mark.parametrize("touched", [False, True])
-def test_gradient_through_the_pull_is_exact(touched, lora, key):
+@pytest.mark.parametrize("contact", [False, True])
+def test_gradient_through_the_pull_is_exact(contact, lora, key):
     """What bptt does, perturbations and then back through the merger, against autodiff of the loss in the delta."""
     env = hover_env(horizon=5, delay_ticks=1)
-    lora = moved(lora, key) if touched else lora
+    lora = move(lora, key) if contact else lora
     x0 = draw_starts(env.task, key, 3)
 
     @eqx.filter_jit
@@ -122,18 +122,18 @@ def test_gradient_through_the_pull_is_exact(touched, lora, key):
         loss = lambda delta: policy_loss(lora.with_params(delta).merged(), env, x0)  # noqa: E731
         return (value, pull(by_layers)[0]), jax.value_and_grad(loss)(lora.delta)
 
-    (value, found), (expected, wanted) = both(lora)
+    (value, result), (expected, target) = both(lora)
     assert float(value) == pytest.approx(float(expected), rel=1e-13)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(target), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12 * max(1.0, float(jnp.abs(b).max())))
-    assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(found)) > 1e-4
-    if not touched:  # B is zero: A has no gradient yet, B has
-        for thin in found:
+    assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(result)) > 1e-4
+    if not contact:  # B is zero: A has no gradient yet, B has
+        for thin in result:
             np.testing.assert_array_equal(thin.down, 0.0)
 
 
 def test_no_gradient_reaches_the_base(lora, key):
-    lora = moved(lora, key)
+    lora = move(lora, key)
     o = random.normal(key, (15,))
     slope = jax.jit(jax.grad(lambda p: jnp.sum(p.merged()(o).vector())))(lora)
     for leaf in jax.tree.leaves((slope.base, slope.scale)):
@@ -151,15 +151,15 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
     train = eqx.filter_jit(lambda s, x0: bptt(s, env, x0, optimiser=optimiser))
     state, losses = train(PolicyState(lora, optimiser.init(lora.params)), random_starts(env.task, key, 40, 8))
     assert losses.shape == (40,)
-    trained = state.policy
-    same(trained.base, before)
-    same(trained.scale, lora.scale)
-    for thin, fresh in zip(trained.delta, lora.delta, strict=True):
+    trained_policy = state.policy
+    same(trained_policy.base, before)
+    same(trained_policy.scale, lora.scale)
+    for thin, fresh in zip(trained_policy.delta, lora.delta, strict=True):
         assert float(jnp.abs(thin.up - fresh.up).max()) > 1e-3
         assert float(jnp.abs(thin.down - fresh.down).max()) > 1e-4
     x0 = draw_starts(env.task, random.key(9), 32)
     loss = eqx.filter_jit(lambda policy: policy_loss(policy, env, x0))
-    assert float(loss(trained.merged())) < 0.9 * float(loss(base))
+    assert float(loss(trained_policy.merged())) < 0.9 * float(loss(base))
 
 
 @pytest.mark.usefixtures("optax_promotion")
@@ -167,8 +167,8 @@ def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
     env, optimiser = hover_env(horizon=3), optax.adam(1e-2)
     state = PolicyState(lora, jax.jit(optimiser.init)(lora.params))
     x0 = random_starts(env.task, key, 1, 2)
-    broken = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
-    after, losses = eqx.filter_jit(lambda s, x: bptt(s, env, x, optimiser=optimiser))(state, broken)
+    bad = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
+    after, losses = eqx.filter_jit(lambda s, x: bptt(s, env, x, optimiser=optimiser))(state, bad)
     assert not np.isfinite(losses).all()
     same(after, state)
 
@@ -177,10 +177,10 @@ def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
 def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     """An update returns a low-rank policy with the same base; the gate is given plain policies."""
     preset = tiny_preset(pretrain={"horizon": 20, "hidden_sizes": (12, 12)})
-    judged = []
+    judgements = []
 
     def noting(candidate, incumbent, *rest, **options):
-        judged.extend([candidate, incumbent])
+        judgements.extend([candidate, incumbent])
         return judge(candidate, incumbent, *rest, **options)
 
     monkeypatch.setattr("retrim.adapt.learner.judge", noting)
@@ -195,14 +195,14 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     assert isinstance(after.policy, LoraPolicy)
     same(after.policy.base, base)
     assert any(float(jnp.abs(thin.up).max()) > 0.0 for thin in after.policy.delta)
-    assert [type(p) for p in judged] == [Policy, Policy]
+    assert [type(p) for p in judgements] == [Policy, Policy]
     assert bool(verdict.finite)
     assert bool(verdict.admitted) == (float(verdict.candidate) <= float(verdict.incumbent))
     # a broken delta is found in the merged weights
     x0 = draw_starts(setup.env.task, key, 2)
     bad = eqx.tree_at(lambda p: p.delta[0].up, after.policy, jnp.full_like(after.policy.delta[0].up, jnp.nan))
-    found = judge(bad.merged(), base, setup.env, x0)
-    assert found.reason() == "a weight is not finite"
+    result = judge(bad.merged(), base, setup.env, x0)
+    assert result.reason() == "a weight is not finite"
 
 
 def test_starts_are_drawn_from_what_was_flown(key):
@@ -210,10 +210,10 @@ def test_starts_are_drawn_from_what_was_flown(key):
     buffer = RollingBuffer(5)
     for i in range(3):
         buffer.push(0.02 * (i + 1), State.at(jnp.array([float(i + 1), 0.0, 1.0])), Command.hover())
-    found = eqx.filter_jit(drawn)(buffer.window(), key, (60,))
-    np.testing.assert_allclose(found.t, 0.02 * found.x.p[:, 0])
-    assert set(np.asarray(found.x.p[:, 0]).tolist()) == {1.0, 2.0, 3.0}
-    assert found.x.R.shape == (60, 3, 3)
+    result = eqx.filter_jit(sample_starts)(buffer.window(), key, (60,))
+    np.testing.assert_allclose(result.t, 0.02 * result.x.p[:, 0])
+    assert set(np.asarray(result.x.p[:, 0]).tolist()) == {1.0, 2.0, 3.0}
+    assert result.x.R.shape == (60, 3, 3)
 
 
 # ---- refusals

@@ -43,9 +43,9 @@ def flight(setup, monitor, *, seconds=4.0, fault=None, later=None, model=CheapMo
 
     @eqx.filter_jit
     def fly(monitor, later, x0):
-        begun = take_off(simulation, monitor, x0)
-        begun, first = fly_ticks(simulation, monitor, begun, half, room=half)
-        _, second = fly_ticks(simulation, later, begun, whole - half, room=whole - half)
+        start = take_off(simulation, monitor, x0)
+        start, first = fly_ticks(simulation, monitor, start, half, room=half)
+        _, second = fly_ticks(simulation, later, start, whole - half, room=whole - half)
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
     ticks = fly(monitor, monitor if later is None else later, setup.flight_starts(1, 4)[0])
@@ -84,12 +84,12 @@ def test_late_measurements_do_not_fly_the_estimate(flying):
     setup, _, monitor = flying
     world = {"fault": measurement_fault("late=2"), "model": LinearDragQuadrotor.of(small(), DT), "seconds": 8.0}
     _, error = flight(setup, monitor, **world)
-    _, observed = flight(setup, monitor.frame, **world)
-    assert not observed[-50:].max() < 10.0
+    _, observations = flight(setup, monitor.frame, **world)
+    assert not observations[-50:].max() < 10.0
     assert error[-50:].max() < 0.5
 
 
-def judged(monitor, memory, *, excess, ticks=1):
+def judge_excess(monitor, memory, *, excess, ticks=1):
     """The memory after some intervals whose errors exceed those of the twin by so much [m]."""
     x = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
     last = round(INTERVAL / DT)
@@ -114,15 +114,15 @@ def test_steps_back_are_in_order_and_last_longer_each_time(flying):
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
     waits = []
     for stage in (Stage.OBSERVED, Stage.SLOW, Stage.BASE):
-        memory = judged(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
+        memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
         assert int(memory.stage) == stage
         assert int(memory.cause) == Cause.ERROR
         waits.append(float(memory.wait))
     np.testing.assert_allclose(waits, [HOLD, 2 * HOLD, 4 * HOLD], atol=0.1)
-    memory = judged(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
+    memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
     assert int(memory.stage) == Stage.BASE
-    rested = dataclasses.replace(memory, wait=jnp.zeros_like(memory.wait))
-    back = judged(monitor, rested, excess=0.0)
+    rest = dataclasses.replace(memory, wait=jnp.zeros_like(memory.wait))
+    back = judge_excess(monitor, rest, excess=0.0)
     assert (int(back.stage), int(back.cause)) == (Stage.SLOW, Cause.RECOVERY)
 
 
@@ -130,10 +130,10 @@ def test_fewer_bad_intervals_than_needed_change_nothing(flying):
     _, _, monitor = flying
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
     for _ in range(3):
-        memory = judged(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES - 1)
-        memory = judged(monitor, memory, excess=0.5 * MARGIN)
+        memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES - 1)
+        memory = judge_excess(monitor, memory, excess=0.5 * MARGIN)
     assert int(memory.stage) == Stage.ADAPTED
-    assert int(judged(monitor, memory, excess=1.0).stage) == Stage.OBSERVED  # far off: once is enough
+    assert int(judge_excess(monitor, memory, excess=1.0).stage) == Stage.OBSERVED  # far off: once is enough
 
 
 def test_a_second_oscillation_is_the_last_one(flying):
@@ -143,12 +143,12 @@ def test_a_second_oscillation_is_the_last_one(flying):
     x = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
     once = judge(monitor, wild(memory), jnp.float32(0.0), x)
     assert (int(once.stage), int(once.best), int(once.cause)) == (Stage.BASE, Stage.SLOW, Cause.OSCILLATION)
-    back = judged(monitor, dataclasses.replace(once, wait=jnp.float32(0.0)), excess=0.0)
+    back = judge_excess(monitor, dataclasses.replace(once, wait=jnp.float32(0.0)), excess=0.0)
     assert int(back.stage) == Stage.SLOW
     twice = judge(monitor, wild(back), jnp.float32(0.0), x)
     assert (int(twice.stage), int(twice.best)) == (Stage.BASE, Stage.BASE)
-    rested = judged(monitor, dataclasses.replace(twice, wait=jnp.float32(0.0)), excess=0.0)
-    assert int(rested.stage) == Stage.BASE
+    rest = judge_excess(monitor, dataclasses.replace(twice, wait=jnp.float32(0.0)), excess=0.0)
+    assert int(rest.stage) == Stage.BASE
 
 
 def test_swings_count_reversals_and_not_steps():

@@ -10,11 +10,11 @@ import pytest
 from jax import lax, random
 
 from helpers import GOAL, first_order, hover_task, random_state
-from retrim.control.mppi import MppiController, _turned
+from retrim.control.mppi import MppiController, _turn
 from retrim.estimation.l1 import L1Estimator
 from retrim.estimation.prediction import Prediction
 from retrim.physics import Command, CommandPath, PointMass, State, small, so3
-from retrim.physics.actuators import Lagged
+from retrim.physics.actuators import LaggedModel
 
 DT, TAU = 0.02, 0.033
 L1 = L1Estimator(jnp.array(-0.2), jnp.exp(jnp.array(-DT / 0.3)), DT)
@@ -42,8 +42,8 @@ def mppi(estimator=None, samples=256, seed=0):
 def test_attitudes_turn_as_one_by_one(key):
     R = jax.vmap(lambda k: random_state(k).R)(random.split(key, 5))
     w = jnp.concatenate([random.normal(key, (4, 3)), jnp.zeros((1, 3))])
-    found = jax.jit(lambda R, w: jnp.moveaxis(_turned(jnp.moveaxis(R, 0, -1), w.T), -1, 0))(R, w)
-    np.testing.assert_allclose(found, jax.jit(jax.vmap(lambda R, w: R @ so3.exp(w)))(R, w), atol=1e-9)
+    result = jax.jit(lambda R, w: jnp.moveaxis(_turn(jnp.moveaxis(R, 0, -1), w.T), -1, 0))(R, w)
+    np.testing.assert_allclose(result, jax.jit(jax.vmap(lambda R, w: R @ so3.exp(w)))(R, w), atol=1e-9)
 
 
 def test_noise_is_as_correlated_as_it_is_told():
@@ -58,34 +58,34 @@ def test_a_plan_costs_what_it_does(key):
     """Of a plan that stays where the vehicle should be: nothing; and a metre away: its distance, for the horizon."""
     controller = mppi(samples=3)
     hover = jnp.tile(Command.hover(float).vector()[None, :, None], (30, 1, 3))
-    wanted = jax.vmap(controller.task.setpoint)(DT * jnp.arange(30.0))
+    expected = jax.vmap(controller.task.setpoint)(DT * jnp.arange(30.0))
     for away in (0.0, 1.0):
         x = State.at(jnp.array(GOAL) + jnp.array([away, 0.0, 0.0]))
-        cost = controller._costs(hover, x, Command.hover(float), wanted, jnp.zeros(3))
+        cost = controller._costs(hover, x, Command.hover(float), expected, jnp.zeros(3))
         np.testing.assert_allclose(cost, 10.0 * away * 30 * DT, atol=1e-4)
 
 
 def test_more_samples_plan_better(key):
     """Mean over seeds of the cost of the mean that is planned, from a start that is off and tilted."""
     x = State(jnp.array([0.4, -0.3, 1.2]), so3.exp(jnp.array([0.2, -0.1, 0.3])), jnp.array([0.5, 0.0, -0.2]))
-    wanted = jax.vmap(hover_task().setpoint)(DT * jnp.arange(30.0))
+    expected = jax.vmap(hover_task().setpoint)(DT * jnp.arange(30.0))
 
-    def planned(samples):
+    def plan(samples):
         def cost(key):
             controller = dataclasses.replace(mppi(samples=samples), key=key)
             _, memory = controller(controller.init(x), jnp.array(0.0), x)
             plan = jnp.concatenate([memory.mean[:1], memory.mean[:-1]])[:, :, None]
             one = dataclasses.replace(controller, samples=1)
-            return one._costs(plan, x, Command.hover(float), wanted, jnp.zeros(3))[0]
+            return one._costs(plan, x, Command.hover(float), expected, jnp.zeros(3))[0]
 
         return float(jnp.mean(jax.jit(jax.vmap(cost))(random.split(key, 16))))
 
-    few, some, many = (planned(n) for n in (8, 64, 512))
+    few, some, many = (plan(n) for n in (8, 64, 512))
     hover = mppi(samples=1)._costs(
         jnp.tile(Command.hover(float).vector()[None, :, None], (30, 1, 1)),
         x,
         Command.hover(float),
-        wanted,
+        expected,
         jnp.zeros(3),
     )[0]
     assert many < some < few
@@ -93,9 +93,9 @@ def test_more_samples_plan_better(key):
 
 
 @eqx.filter_jit
-def flown(controller, push):
+def fly_once(controller, push):
     """Positions and commands of 4 s in the lagged model, whose commands act a tick late."""
-    model = Lagged(PointMass(DT), first_order(TAU))
+    model = LaggedModel(PointMass(DT), first_order(TAU))
 
     def tick(carry, k):
         s, memory, waiting = carry
@@ -112,7 +112,7 @@ def flown(controller, push):
 def test_it_hovers_within_the_limits_and_the_estimator_takes_the_push_off(push):
     errors = []
     for estimator in (None, L1):
-        p, u = (np.asarray(column) for column in flown(mppi(estimator, samples=128), jnp.full(3, push)))
+        p, u = (np.asarray(column) for column in fly_once(mppi(estimator, samples=128), jnp.full(3, push)))
         low, high = (np.asarray(limit.vector()) for limit in (small().command_min, small().command_max))
         assert ((u >= low) & (u <= high)).all()
         errors.append(np.linalg.norm(p[-75:] - np.array(GOAL), axis=1).mean())

@@ -33,10 +33,10 @@ def command(controller, x):
 def test_the_controller_sees_no_larger_error_than_the_limit(controller, distance):
     x = random_state(random.key(0))
     direction = x.p / jnp.linalg.norm(x.p)
-    far, shown = (
+    far, display = (
         State(controller.task.home() + each * direction, x.R, x.v) for each in (distance, min(distance, REACH))
     )
-    np.testing.assert_allclose(command(controller, far), command(controller.inner, shown), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(command(controller, far), command(controller.inner, display), rtol=1e-5, atol=1e-5)
 
 
 def test_an_infinite_limit_changes_nothing(controller):
@@ -47,12 +47,12 @@ def test_an_infinite_limit_changes_nothing(controller):
 
 def test_it_turns_with_its_task(controller):
     frame, x = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5])), random_state(random.key(3))
-    turned, seen = controller.in_frame(frame), frame.state(x)
-    home = turned.task.home()
-    near = home + REACH * (seen.p - home) / jnp.linalg.norm(seen.p - home)
+    rotation, observation = controller.in_frame(frame), frame.state(x)
+    home = rotation.task.home()
+    near = home + REACH * (observation.p - home) / jnp.linalg.norm(observation.p - home)
     np.testing.assert_allclose(
-        command(turned, seen),
-        command(controller.inner.in_frame(frame), State(near, seen.R, seen.v)),
+        command(rotation, observation),
+        command(controller.inner.in_frame(frame), State(near, observation.R, observation.v)),
         rtol=1e-5,
         atol=1e-5,
     )

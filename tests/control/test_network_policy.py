@@ -78,8 +78,8 @@ def test_networks_of_wrong_kinds():
         def __call__(self, o):
             return jnp.eye(4) @ o
 
-    made = {"three": lambda request: Three(), "square": lambda request: Square(), "none": lambda request: 3}
-    for name, make in made.items():
+    setup = {"three": lambda request: Three(), "square": lambda request: Square(), "none": lambda request: 3}
+    for name, make in setup.items():
         register_network(name, make)
     try:
         with pytest.raises(ConfigError, match=r"network 'three' returns an array of shape \(3,\), expected \(4,\)"):
@@ -89,7 +89,7 @@ def test_networks_of_wrong_kinds():
         with pytest.raises(ConfigError, match=r"gives a int, expected a callable equinox\.Module"):
             make_policy(request_for("none"))
     finally:
-        for name in made:
-            del NETWORKS._known[name]
+        for name in setup:
+            del NETWORKS._objects[name]
     with pytest.raises(ConfigError, match="no network 'mpl'; did you mean 'mlp'"):
         make_policy(request_for("mpl"))

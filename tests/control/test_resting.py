@@ -34,21 +34,21 @@ def command(controller, x):
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, -3.0])
-@pytest.mark.parametrize("known", [0.0, 0.4, 1.0])
-def test_at_rest_it_commands_hover(controller, heading, known):
-    belief = PathBelief.between(-known * jnp.ones(4), known * jnp.ones(4))
-    told = eqx.tree_at(lambda c: c.observation.belief, controller, belief)
+@pytest.mark.parametrize("model", [0.0, 0.4, 1.0])
+def test_at_rest_it_commands_hover(controller, heading, model):
+    belief = PathBelief.between(-model * jnp.ones(4), model * jnp.ones(4))
+    message = eqx.tree_at(lambda c: c.observation.belief, controller, belief)
     x = State(jnp.array(GOAL), so3.rotz(jnp.array(heading)), jnp.zeros(3))
-    np.testing.assert_allclose(command(told, x), Command.hover().vector(), atol=1e-6)
-    plain = PolicyController(told.observation, told.policy)
+    np.testing.assert_allclose(command(message, x), Command.hover().vector(), atol=1e-6)
+    plain = PolicyController(message.observation, message.policy)
     assert np.abs(command(plain, x) - Command.hover().vector()).max() > 0.01  # or the test shows nothing
 
 
 def test_it_turns_with_its_home(controller):
     frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5]))
-    turned, x = controller.in_frame(frame), random_state(random.key(1))
+    rotation, x = controller.in_frame(frame), random_state(random.key(1))
     home = frame.state(State.at(jnp.array(GOAL)))
     heading = jnp.arctan2(home.R[1, 0], home.R[0, 0])
     rest = State(home.p, so3.rotz(heading), jnp.zeros(3))
-    np.testing.assert_allclose(command(turned, rest), Command.hover().vector(), atol=1e-6)
-    assert np.all(np.isfinite(command(turned, frame.state(x))))
+    np.testing.assert_allclose(command(rotation, rest), Command.hover().vector(), atol=1e-6)
+    assert np.all(np.isfinite(command(rotation, frame.state(x))))

@@ -20,7 +20,7 @@ SMALL = {
 }
 
 
-def untrained(setup, seed=0):
+def make_untrained(setup, seed=0):
     """In place of minutes of training."""
     from jax import random
 
@@ -33,21 +33,21 @@ def run(page: Path) -> str | None:
     for block in blocks:
         if block["title"]:
             Path(block["title"]).write_text(block["code"])
-    wanted = [block["code"] for block in blocks if block["language"] == "python" and not block["title"]]
+    expected = [block["code"] for block in blocks if block["language"] == "python" and not block["title"]]
     try:
-        for code in wanted:
+        for code in expected:
             for long, short in SHORTER.items():
                 code = code.replace(long, short)
             exec(compile(code, str(page), "exec"), {"__name__": "page"})
     except BaseException:
         return traceback.format_exc()
-    return None if wanted else "there is no Python block"
+    return None if expected else "there is no Python block"
 
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path.cwd()))
-    retrim.Setup.pretrained = untrained
+    retrim.Setup.pretrained = make_untrained
     PRESETS.update({name: retrim.changed(preset, **SMALL) for name, preset in PRESETS.items()})
     retrim.enable_compile_cache()
-    found = {name: run(Path(name)) for name in sys.argv[1:]}
-    Path("pages.json").write_text(json.dumps(found))
+    result = {name: run(Path(name)) for name in sys.argv[1:]}
+    Path("pages.json").write_text(json.dumps(result))

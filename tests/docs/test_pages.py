@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from made_up import flight
+from fake_flights import flight
 from retrim.cli.main import commands
 from retrim.config.loading import overlaid
 from retrim.config.named_presets import PRESETS
@@ -31,7 +31,7 @@ TOML = re.compile(r'^```toml title="(?P<title>[^"]+)"\n(?P<code>.*?)^```', re.M 
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory):
+def tracebacks(tmp_path_factory):
     """Traceback, or None, of each page; one process for all, since most of the time is compiling."""
     folder = tmp_path_factory.mktemp("reader")
     words = [sys.executable, str(Path(__file__).with_name("run_pages.py")), *map(str, PAGES)]
@@ -42,21 +42,21 @@ def ran(tmp_path_factory):
 
 @pytest.mark.documentation
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_blocks_of_a_page_run(ran, page):
-    assert ran[str(page)] is None, ran[str(page)]
+def test_blocks_of_a_page_run(tracebacks, page):
+    assert tracebacks[str(page)] is None, tracebacks[str(page)]
 
 
 @pytest.mark.parametrize(("page", "kind"), [("vehicle", VehicleSpec), ("sweep", Sweep)])
 def test_a_page_lists_every_key_and_no_other(page, kind):
-    listed = re.findall(r"^\| `(\w+)` \|", (DOCS / "how-to" / f"{page}.md").read_text(), re.M)
-    assert sorted(listed) == sorted(field.name for field in dataclasses.fields(kind))
+    listed_rows = re.findall(r"^\| `(\w+)` \|", (DOCS / "how-to" / f"{page}.md").read_text(), re.M)
+    assert sorted(listed_rows) == sorted(field.name for field in dataclasses.fields(kind))
 
 
 def test_the_page_of_sweeps_tells_the_defaults():
-    told = dict(re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", (DOCS / "how-to" / "sweep.md").read_text(), re.M))
+    message = dict(re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", (DOCS / "how-to" / "sweep.md").read_text(), re.M))
     plain = Sweep()
-    assert set(told) == {field.name for field in dataclasses.fields(Sweep)} - {"seconds", "overlay"}
-    for key, text in told.items():
+    assert set(message) == {field.name for field in dataclasses.fields(Sweep)} - {"seconds", "overlay"}
+    for key, text in message.items():
         value = getattr(plain, key)
         assert json.loads(text) == (list(value) if isinstance(value, tuple) else value), key
 
@@ -65,9 +65,9 @@ def test_the_page_of_replay_tells_the_limits_and_every_map():
     page = (DOCS / "how-to" / "replay.md").read_text()
     rows = re.findall(r"^\| ([^|]+?) \| (-?\d* ?%?) ?\| (\d+) % \|$", page, re.M)
     for name, words in WORDS.items():
-        (found,) = [row for row in rows if row[0].startswith(words)]
-        refused = f"{round(100 * REFUSED[name])} %" if name in REFUSED else ""
-        assert found[1:] == (refused, f"{round(100 * DOUBTFUL[name])}")
+        (result,) = [row for row in rows if row[0].startswith(words)]
+        refusal = f"{round(100 * REFUSED[name])} %" if name in REFUSED else ""
+        assert result[1:] == (refusal, f"{round(100 * DOUBTFUL[name])}")
     command = (ROOT / "src" / "retrim" / "replay" / "replay.py").read_text()
     for name in names():
         assert f"`{name}`" in page
@@ -80,8 +80,8 @@ def test_the_first_page_tells_every_figure_of_the_results():
         [record(flight(0.1, cross=np.full(501, 0.1))), failed_record(flight(0.1).spec, "small", "e", "no")]
     )
     page = (DOCS / "getting-started.md").read_text()
-    told = {name for row in re.findall(r"^\| (`[^|]+) \|", page, re.M) for name in re.findall(r"`(\w+)`", row)}
-    assert (plain | tracking).keys() - {*CONDITIONS, "metric"} <= told
+    message = {name for row in re.findall(r"^\| (`[^|]+) \|", page, re.M) for name in re.findall(r"`(\w+)`", row)}
+    assert (plain | tracking).keys() - {*CONDITIONS, "metric"} <= message
 
 
 def test_toml_files_of_pages_are_accepted(tmp_path):
@@ -94,23 +94,23 @@ def test_toml_files_of_pages_are_accepted(tmp_path):
         "excite": lambda path: overlaid(PRESETS["hover/any"], path),
         "east": lambda path: tomllib.loads(path.read_text()),
     }
-    found = {block["title"]: block["code"] for page in PAGES for block in TOML.finditer(page.read_text())}
-    assert set(readers) == {Path(title).stem for title in found}
-    for title, code in found.items():
+    result = {block["title"]: block["code"] for page in PAGES for block in TOML.finditer(page.read_text())}
+    assert set(readers) == {Path(title).stem for title in result}
+    for title, code in result.items():
         (tmp_path / title).write_text(code)
         readers[Path(title).stem](tmp_path / title)
 
 
 def test_commands_of_documents_exist():
-    shown = set[str]()
+    display = set[str]()
     for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.glob("*.md"), *(DOCS / "how-to").glob("*.md")):
         for block in re.finditer(r"^```(?P<kind>[^\n]*)\n(?P<text>.*?)^```$", page.read_text(), re.M | re.S):
             if not block["kind"]:
-                shown |= set(re.findall(r"^(?:\.venv/bin/)?retrim ([a-z]+)", block["text"], re.M))
-    assert shown <= set(commands())
-    assert {"pretrain", "fly", "sweep"} <= shown
+                display |= set(re.findall(r"^(?:\.venv/bin/)?retrim ([a-z]+)", block["text"], re.M))
+    assert display <= set(commands())
+    assert {"pretrain", "fly", "sweep"} <= display
 
 
 def test_every_preset_is_described():
-    listed = re.findall(r"^\| `(\w+/\w+)` \|", (DOCS / "presets.md").read_text(), re.M)
-    assert sorted(listed) == sorted(PRESETS)
+    listed_rows = re.findall(r"^\| `(\w+/\w+)` \|", (DOCS / "presets.md").read_text(), re.M)
+    assert sorted(listed_rows) == sorted(PRESETS)

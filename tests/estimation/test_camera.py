@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import replaced
+from helpers import replace_fields
 from retrim.estimation import Camera
 from retrim.estimation.camera import in_camera
 from retrim.physics import State, so3
@@ -27,13 +27,13 @@ slope = eqx.filter_jit(lambda camera, P: jax.vmap(jax.jacobian(lambda q: camera.
 
 def test_centre_and_neighbourhood_by_hand(camera):
     """On the axis: the principal point. Close to it a pinhole with focal length f / (1 + xi), for d1 = d2 = z."""
-    found = project(camera, jnp.array([[0.0, 0.0, 2.0], [0.002, 0.0, 2.0], [0.0, -0.002, 2.0]]))
+    result = project(camera, jnp.array([[0.0, 0.0, 2.0], [0.002, 0.0, 2.0], [0.0, -0.002, 2.0]]))
     centre = 2.0 * np.array([632.1317557 / 1280.0, 388.2472267 / 720.0]) - 1.0
-    np.testing.assert_allclose(found.pixel[0], centre, atol=1e-9)
+    np.testing.assert_allclose(result.pixel[0], centre, atol=1e-9)
     xi, f = -0.0074411489, (599.87676297, 449.29110372)
     slope = 1.0 / (0.6138265280850498 * (1.0 + xi) + (1.0 - 0.6138265280850498) * (1.0 + xi))
-    np.testing.assert_allclose(found.pixel[1] - centre, [2.0 * f[0] * 1e-3 * slope / 1280.0, 0.0], atol=1e-8)
-    np.testing.assert_allclose(found.pixel[2] - centre, [0.0, -2.0 * f[1] * 1e-3 * slope / 720.0], atol=1e-8)
+    np.testing.assert_allclose(result.pixel[1] - centre, [2.0 * f[0] * 1e-3 * slope / 1280.0, 0.0], atol=1e-8)
+    np.testing.assert_allclose(result.pixel[2] - centre, [0.0, -2.0 * f[1] * 1e-3 * slope / 720.0], atol=1e-8)
 
 
 def test_looks_down_with_x_to_the_right():
@@ -41,8 +41,8 @@ def test_looks_down_with_x_to_the_right():
     x = State.at(jnp.array([0.0, 0.0, 3.0]))
     points = in_camera(x, jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
     np.testing.assert_allclose(points, [[0.0, -1.0, 3.0], [-1.0, 0.0, 3.0], [0.0, 0.0, 3.0]], atol=1e-12)
-    turned = in_camera(replaced(x, R=so3.rotz(jnp.array(0.5 * math.pi))), jnp.array([[0.0, 1.0, 0.0]]))
-    np.testing.assert_allclose(turned, [[0.0, -1.0, 3.0]], atol=1e-12)
+    rotation = in_camera(replace_fields(x, R=so3.rotz(jnp.array(0.5 * math.pi))), jnp.array([[0.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(rotation, [[0.0, -1.0, 3.0]], atol=1e-12)
 
 
 def test_bearing_is_the_inverse_of_project(camera):
@@ -50,9 +50,9 @@ def test_bearing_is_the_inverse_of_project(camera):
     rays = bearing(camera, pixels)
     np.testing.assert_allclose(jnp.linalg.norm(rays, axis=1), 1.0, atol=1e-9)
     far = 0.3 + 5.0 * random.uniform(random.key(2), (200, 1))
-    found = project(camera, rays * far)
-    np.testing.assert_allclose(found.pixel, pixels, atol=1e-8)
-    assert found.visible.all()
+    result = project(camera, rays * far)
+    np.testing.assert_allclose(result.pixel, pixels, atol=1e-8)
+    assert result.visible.all()
 
 
 def test_about_120_degrees_across(camera):
@@ -68,12 +68,12 @@ ODD = [
 
 def test_finite_and_unseen_far_off_axis_and_behind(camera):
     points = jnp.array(ODD)
-    found = project(camera, points)
+    result = project(camera, points)
     slopes = slope(camera, points)
-    assert np.isfinite(found.pixel).all()
+    assert np.isfinite(result.pixel).all()
     assert np.isfinite(slopes).all()
-    assert not found.visible[:6].any()
-    assert not found.visible[8]
+    assert not result.visible[:6].any()
+    assert not result.visible[8]
 
 
 def test_the_border_decides(camera):
@@ -81,9 +81,9 @@ def test_the_border_decides(camera):
     for axis in (0, 1):
         for side in (-1.0, 1.0):
             rays = bearing(camera, jnp.asarray(np.outer([0.999, 1.0, 1.001], side * np.eye(2)[axis])))
-            found = project(camera, rays)
-            assert bool(found.visible[0])
-            assert not bool(found.visible[2])
+            result = project(camera, rays)
+            assert bool(result.visible[0])
+            assert not bool(result.visible[2])
             assert np.isfinite(slope(camera, rays)[1]).all()
 
 

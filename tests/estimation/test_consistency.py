@@ -25,8 +25,8 @@ def motion(key):
 find = jax.jit(lambda before, after: contradictions(before, after, DT, NOISE))
 
 
-def names(found):
-    return [name for name, value in vars(found).items() if bool(value)]
+def names(result):
+    return [name for name, value in vars(result).items() if bool(value)]
 
 
 def test_agile_flight_contradicts_nothing():
@@ -55,8 +55,8 @@ def test_a_repeated_measurement():
 
 def test_a_jump_of_the_attitude_and_a_matrix_that_is_no_rotation():
     before, after = motion(random.key(4))
-    turned = State(after.p, so3.mul(after.R, so3.exp(jnp.array([0.0, 0.0, 1.5]))), after.v)
-    assert names(find(before, turned)) == ["attitude"]
+    rotation = State(after.p, so3.mul(after.R, so3.exp(jnp.array([0.0, 0.0, 1.5]))), after.v)
+    assert names(find(before, rotation)) == ["attitude"]
     assert names(find(before, State(after.p, 1.2 * after.R, after.v))) == ["attitude"]
 
 
@@ -70,8 +70,8 @@ def test_an_impossible_acceleration():
 @pytest.mark.parametrize("field", ["p", "R", "v"])
 def test_what_is_not_finite(field):
     before, after = motion(random.key(6))
-    broken = State(**{name: getattr(after, name) * (jnp.nan if name == field else 1.0) for name in ("p", "R", "v")})
-    assert "not_finite" in names(find(before, broken))
+    bad = State(**{name: getattr(after, name) * (jnp.nan if name == field else 1.0) for name in ("p", "R", "v")})
+    assert "not_finite" in names(find(before, bad))
 
 
 def test_noise_widens_the_test_up_to_a_limit():
@@ -84,7 +84,7 @@ def test_noise_widens_the_test_up_to_a_limit():
     np.testing.assert_array_equal(find(before, after).any, False)
 
 
-def watched(scale, key, *, noise=0.0, speed=1.0, ticks=150):
+def watch(scale, key, *, noise=0.0, speed=1.0, ticks=150):
     """The memory after a flight back and forth whose velocities are measured with a wrong scale."""
     t = DT * jnp.arange(float(ticks))
     along = jnp.array([1.0, 0.5, -0.3])
@@ -102,21 +102,21 @@ def watched(scale, key, *, noise=0.0, speed=1.0, ticks=150):
     return memory
 
 
-watched = jax.jit(watched, static_argnames=("ticks",))
+watch = jax.jit(watch, static_argnames=("ticks",))
 
 
 @pytest.mark.parametrize("speed", [0.8, 1.2])
 @pytest.mark.parametrize(("scale", "wrong"), [(0.5, True), (1.7, True), (0.9, False), (1.0, False)])
 def test_a_wrong_scale_of_velocities_is_found_while_the_vehicle_moves(scale, wrong, speed):
     for noise in (0.0, 1e-3):
-        memory = watched(scale, random.key(0), noise=noise, speed=speed)
+        memory = watch(scale, random.key(0), noise=noise, speed=speed)
         assert bool(memory.scaled) == wrong
         assert (float(memory.doubt) > 0.8) == wrong
 
 
 def test_noise_at_rest_is_no_wrong_scale():
     for noise in (1e-3, 5e-3, 2e-2):
-        assert not bool(watched(1.0, random.key(1), noise=noise, speed=0.0).scaled)
+        assert not bool(watch(1.0, random.key(1), noise=noise, speed=0.0).scaled)
 
 
 def test_a_constant_error_of_the_velocity_is_no_wrong_scale():
@@ -124,7 +124,7 @@ def test_a_constant_error_of_the_velocity_is_no_wrong_scale():
     x = State(jnp.zeros(3), jnp.eye(3), v)
     memory = Consistency.start(x)
     for k in range(50):
-        moved = jnp.array([1e-5 * k, 0.0, 0.0])  # not to the bit the same
-        x, memory = State(moved, x.R, v), memory.after(x, State(moved, x.R, v), DT, jnp.array(True))
+        shift = jnp.array([1e-5 * k, 0.0, 0.0])  # not to the bit the same
+        x, memory = State(shift, x.R, v), memory.after(x, State(shift, x.R, v), DT, jnp.array(True))
     assert not bool(memory.scaled)
     assert bool(memory.certain)

@@ -7,26 +7,26 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import stacked
+from helpers import stack_trees
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.physics import ActuatorResponse, Command, CommandPath, PointMass, State, so3
-from retrim.physics.actuators import lagged
+from retrim.physics.actuators import apply_lag
 
 DT, D = 0.02, jnp.array([1.5, -1.0, 2.0])
 
 
-def observed(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D, thrust_tau=None):
+def observe(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D, thrust_tau=None):
     """Estimates while a vehicle tumbles under random commands that act ``late`` ticks after they were issued.
 
     It turns ``turning`` times as fast as it is told to, its thrust follows by ``thrust_tau`` [s], and its velocity is
     measured with ``noise`` [m/s].
     """
     thrust_tau = None if thrust_tau is None else jnp.array(thrust_tau)
-    return _observed(observer, key, ticks, jnp.array(noise), late, jnp.array(turning), d, thrust_tau)
+    return _observe(observer, key, ticks, jnp.array(noise), late, jnp.array(turning), d, thrust_tau)
 
 
 @eqx.filter_jit
-def _observed(observer, key, ticks, noise, late, turning, d, thrust_tau):
+def _observe(observer, key, ticks, noise, late, turning, d, thrust_tau):
     model = PointMass(DT)
     keys = random.split(key, ticks)
 
@@ -40,18 +40,18 @@ def _observed(observer, key, ticks, noise, late, turning, d, thrust_tau):
         s = observer.issued(s, u)
         queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), queue, u)
         acting = jax.tree.map(lambda leaf: leaf[0], queue)
-        c, thrust = (acting.c, thrust) if thrust_tau is None else lagged(thrust, acting.c, DT, thrust_tau)
+        c, thrust = (acting.c, thrust) if thrust_tau is None else apply_lag(thrust, acting.c, DT, thrust_tau)
         x = model.step(x, Command(c, turning * acting.omega), d)
-        seen = State(x.p, x.R, x.v + noise * random.normal(k_noise, (3,)))
-        s = observer(s, t, seen)
+        observation = State(x.p, x.R, x.v + noise * random.normal(k_noise, (3,)))
+        s = observer(s, t, observation)
         return (s, x, queue, thrust), (s.d_hat, s.noise)
 
     x = State.at(jnp.zeros(3))
     hover = jax.tree.map(lambda leaf: jnp.stack([leaf] * (late + 1)), Command.hover(jnp.float64))
     start = (observer(observer.init(x), jnp.array(0.0), x), x, hover, hover.c[0])
     times = DT * jnp.arange(1.0, ticks + 1.0)
-    _, found = jax.lax.scan(tick, start, (keys, random.split(random.fold_in(key, 7), ticks), times))
-    return found
+    _, result = jax.lax.scan(tick, start, (keys, random.split(random.fold_in(key, 7), ticks), times))
+    return result
 
 
 def make(*, tau=0.05, wander=4.0, limit=9.0, thrust_tau=None, limits=None, delay_ticks=0):
@@ -63,18 +63,18 @@ def make(*, tau=0.05, wander=4.0, limit=9.0, thrust_tau=None, limits=None, delay
 @pytest.mark.parametrize(("late", "turning"), [(0, 1.0), (2, 1.0), (0, 0.5)])
 def test_without_noise_it_is_a_low_pass_of_what_acts(late, turning, key):
     """Whatever is commanded, however late, and whether the vehicle turns as it is told or not."""
-    found, _ = observed(make(delay_ticks=late, wander=np.inf), key, ticks=60, late=late, turning=turning)
+    result, _ = observe(make(delay_ticks=late, wander=np.inf), key, ticks=60, late=late, turning=turning)
     expected = np.asarray(D) * (1.0 - np.exp(-DT / 0.05 * np.arange(1, 61)))[:, None]
-    np.testing.assert_allclose(found, expected, atol=2e-3 if turning == 1.0 else 2e-2)
+    np.testing.assert_allclose(result, expected, atol=2e-3 if turning == 1.0 else 2e-2)
 
 
 @pytest.mark.parametrize("late", [0, 2])
 def test_thrust_that_follows_late_is_no_disturbance(late, key):
     """As long as the lag is declared; otherwise each change of thrust passes for one."""
     calm = {"late": late, "thrust_tau": 0.04, "ticks": 60, "d": jnp.zeros(3)}
-    told, _ = observed(make(delay_ticks=late, wander=np.inf, thrust_tau=0.04), key, **calm)
-    untold, _ = observed(make(delay_ticks=late, wander=np.inf), key, **calm)
-    assert float(jnp.abs(told).max()) < 2e-3
+    message, _ = observe(make(delay_ticks=late, wander=np.inf, thrust_tau=0.04), key, **calm)
+    untold, _ = observe(make(delay_ticks=late, wander=np.inf), key, **calm)
+    assert float(jnp.abs(message).max()) < 2e-3
     assert float(jnp.abs(untold).max()) > 0.3
 
 
@@ -85,36 +85,36 @@ def test_while_a_command_at_a_limit_acts_the_estimate_is_held(key):
     idle = Command(jnp.array(0.3), jnp.array([9.9, 0.0, 0.0]))
 
     def tick(carry, xs):
-        (s, x, acting), (told, t) = carry, xs
+        (s, x, acting), (message, t) = carry, xs
         at_limit = acting.c < 1.0
-        lifted = jnp.where(at_limit, 1.0, 0.0) * 9.0 * x.R[:, 2]
-        x = model.step(x, acting, D + lifted)
-        s = observer.issued(observer(s, t, x), told)
-        return (s, x, told), (s.d_hat, at_limit)
+        lift = jnp.where(at_limit, 1.0, 0.0) * 9.0 * x.R[:, 2]
+        x = model.step(x, acting, D + lift)
+        s = observer.issued(observer(s, t, x), message)
+        return (s, x, message), (s.d_hat, at_limit)
 
-    told = [hover] * 50 + [idle] * 20 + [hover] * 50
+    message = [hover] * 50 + [idle] * 20 + [hover] * 50
     x = State.at(jnp.zeros(3))
-    later = stacked(told), jnp.asarray(DT * np.arange(1.0, len(told) + 1.0))
+    later = stack_trees(message), jnp.asarray(DT * np.arange(1.0, len(message) + 1.0))
 
     @jax.jit
-    def flown(x):
+    def fly_once(x):
         first = observer(observer.init(x), jnp.array(0.0), x), x, hover
         return jax.lax.scan(tick, first, later)[1]
 
-    found, at_limit = map(np.asarray, flown(x))
-    np.testing.assert_allclose(found[51:], np.broadcast_to(D, found[51:].shape), atol=0.02)
+    result, at_limit = map(np.asarray, fly_once(x))
+    np.testing.assert_allclose(result[51:], np.broadcast_to(D, result[51:].shape), atol=0.02)
     assert int(at_limit.sum()) == 20
 
 
 def test_the_estimated_noise_is_that_of_the_velocities(key):
     for noise in (0.003, 0.03):
-        _, found = observed(make(), key, ticks=1000, noise=noise)
-        assert float(found[300:].mean()) == pytest.approx(noise, rel=0.1)
+        _, result = observe(make(), key, ticks=1000, noise=noise)
+        assert float(result[300:].mean()) == pytest.approx(noise, rel=0.1)
 
 
 def test_noise_makes_it_slower_and_leaves_it_true(key):
-    fast, _ = observed(make(wander=np.inf), key, ticks=1000, noise=0.03)
-    wise, _ = observed(make(), key, ticks=1000, noise=0.03)
+    fast, _ = observe(make(wander=np.inf), key, ticks=1000, noise=0.03)
+    wise, _ = observe(make(), key, ticks=1000, noise=0.03)
     assert wise[500:].std(axis=0).max() < 0.5 * fast[500:].std(axis=0).min()
     np.testing.assert_allclose(wise[500:].mean(axis=0), D, atol=0.05)
 
@@ -122,7 +122,7 @@ def test_noise_makes_it_slower_and_leaves_it_true(key):
 def test_it_follows_a_wandering_disturbance_about_as_well_as_the_best_constant_filter(key):
     """The filter that is optimal for this noise and this wander, found by trying time constants."""
     walk = jnp.cumsum(4.0 * DT**0.5 * random.normal(random.fold_in(key, 3), (1500, 3)), axis=0)
-    seen = jnp.cumsum(DT * walk, axis=0) + 0.02 * random.normal(random.fold_in(key, 4), walk.shape)
+    observation = jnp.cumsum(DT * walk, axis=0) + 0.02 * random.normal(random.fold_in(key, 4), walk.shape)
 
     @eqx.filter_jit
     def error(observer):
@@ -132,8 +132,8 @@ def test_it_follows_a_wandering_disturbance_about_as_well_as_the_best_constant_f
             return s, s.d_hat
 
         first = observer.init(State.at(jnp.zeros(3)))
-        _, found = jax.lax.scan(tick, first, (seen, DT * jnp.arange(float(len(seen)))))
-        return jnp.sqrt(jnp.mean((found - walk)[200:] ** 2))
+        _, result = jax.lax.scan(tick, first, (observation, DT * jnp.arange(float(len(observation)))))
+        return jnp.sqrt(jnp.mean((result - walk)[200:] ** 2))
 
     constant = min(error(make(tau=tau, wander=np.inf, limit=99.0)) for tau in (0.02, 0.05, 0.1, 0.2, 0.4))
     assert error(make(tau=1e-3, limit=99.0)) < 1.02 * constant
@@ -144,11 +144,11 @@ def test_what_a_vehicle_gained_by_another_time_than_a_tick_is_no_disturbance():
     observer, model, u = make(wander=np.inf), PointMass(DT), Command(jnp.array(12.0), jnp.array([0.5, 0.0, 0.0]))
     x = State(jnp.zeros(3), so3.exp(jnp.array([0.3, -0.3, 0.0])), jnp.array([1.0, 0.0, 0.0]))
     step = jax.jit(lambda s, t, x: observer.issued(observer(s, t, x), u))
-    moved = jax.jit(lambda x: model.step(x, u, D))
+    shift = jax.jit(lambda x: model.step(x, u, D))
     s = step(observer.init(x), jnp.array(0.0), x)
     np.testing.assert_array_equal(s.d_hat, 0.0)
     for k in range(1, 40):
-        x = moved(x)
+        x = shift(x)
         if k in (20, 21, 30):
             continue
         before, s = s, step(s, jnp.array(DT * k), x)

@@ -34,11 +34,11 @@ def estimates(estimator, d, key, ticks=400):
 def test_it_converges_to_a_constant_with_its_time_constant(pole, tau, key):
     d = jnp.array([2.0, -0.5, 1.0])
     estimator = L1Estimator(jnp.array(pole), jnp.exp(jnp.array(-DT / tau)), DT)
-    found = np.asarray(jax.jit(lambda: estimates(estimator, d, key))())
-    t = DT * np.arange(1, len(found) + 1)
+    result = np.asarray(jax.jit(lambda: estimates(estimator, d, key))())
+    t = DT * np.arange(1, len(result) + 1)
     expected = np.asarray(d) * (1.0 - np.exp(-t / tau))[:, None]
-    np.testing.assert_allclose(found, expected, atol=2.0 * DT * abs(pole) * 1.1 + 1e-3)  # the law is exact to A_s dt
-    np.testing.assert_allclose(found[0] / found[-1], -np.expm1(-DT / tau) / -np.expm1(-t[-1] / tau), rtol=0.05)
+    np.testing.assert_allclose(result, expected, atol=2.0 * DT * abs(pole) * 1.1 + 1e-3)  # the law is exact to A_s dt
+    np.testing.assert_allclose(result[0] / result[-1], -np.expm1(-DT / tau) / -np.expm1(-t[-1] / tau), rtol=0.05)
 
 
 def test_it_is_linear_in_the_disturbance(key):
@@ -52,18 +52,18 @@ def test_what_a_vehicle_gained_by_another_time_than_a_tick_is_no_disturbance():
     """Not at the first measurement, and not over ticks that were missed; then it goes on as its law says."""
     d, thrust = jnp.array([1.0, -0.5, 0.3]), jnp.array([2.0, 0.0, 11.0])
     estimator = L1Estimator(jnp.array(-0.2), jnp.exp(jnp.array(-DT / 0.1)), DT)
-    gained = DT * (thrust + jnp.array([0.0, 0.0, -9.81]) + d)
+    gain = DT * (thrust + jnp.array([0.0, 0.0, -9.81]) + d)
 
     def after(ticks):
-        memory, found = L1State.start(State.at(jnp.zeros(3))), []
+        memory, result = L1State.start(State.at(jnp.zeros(3))), []
         for k in ticks:
-            x = State(jnp.zeros(3), jnp.eye(3), jnp.array([3.0, 0.0, 0.0]) + k * gained)
+            x = State(jnp.zeros(3), jnp.eye(3), jnp.array([3.0, 0.0, 0.0]) + k * gain)
             memory = estimator(memory, jnp.array(DT * k), x, thrust)
-            found.append(np.asarray(memory.d_hat))
-        return np.stack(found)
+            result.append(np.asarray(memory.d_hat))
+        return np.stack(result)
 
-    whole, missed = after(range(40)), after([*range(20), *range(23, 40)])
+    whole, error = after(range(40)), after([*range(20), *range(23, 40)])
     np.testing.assert_array_equal(whole[0], 0.0)
-    np.testing.assert_array_equal(missed[20], missed[19])
-    np.testing.assert_allclose(missed[21:], whole[20:36], atol=0.02)
-    np.testing.assert_allclose(missed[-1], d, atol=0.03)
+    np.testing.assert_array_equal(error[20], error[19])
+    np.testing.assert_allclose(error[21:], whole[20:36], atol=0.02)
+    np.testing.assert_allclose(error[-1], d, atol=0.03)

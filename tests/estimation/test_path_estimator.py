@@ -32,17 +32,17 @@ def estimates(rows, age, inertial):
     return jax.lax.scan(tick, ESTIMATOR.init(State(*(row[0] for row in rows[1:4]))), rows)
 
 
-def estimate(flights, i=0, *, inertial=True, start=0.0, ticks=None, **changed):
+def estimate(flights, i=0, *, inertial=True, start=0.0, ticks=None, **changes):
     """Return the estimates of flight ``i`` as NumPy arrays over time."""
-    chosen = {
+    choice = {
         name: np.array(getattr(flights, name)[i][:ticks]) for name in ("p", "R", "v", "omega", "a", "u")
-    } | changed
-    t = start + DT * np.arange(len(chosen["u"]))
-    rows = tuple(jnp.asarray(x, jnp.float32) for x in (t, *chosen.values()))
+    } | changes
+    t = start + DT * np.arange(len(choice["u"]))
+    rows = tuple(jnp.asarray(x, jnp.float32) for x in (t, *choice.values()))
     return jax.tree.map(np.asarray, estimates(rows, jnp.float32(flights.age), inertial)[1])
 
 
-def one_vehicle(**changed):
+def one_vehicle(**changes):
     """Return a vehicle in the middle of the ranges."""
     typical = {
         "delay": 0.03,
@@ -52,7 +52,7 @@ def one_vehicle(**changed):
         "thrust_gain": 0.8,
         "thrust_lag": 0.04,
     }
-    return Vehicles(*(np.array([x]) for x in (typical | changed).values()))
+    return Vehicles(*(np.array([x]) for x in (typical | changes).values()))
 
 
 @pytest.mark.parametrize(("lag", "damping"), [(0.1, 0.4), (0.05, 0.7), (0.08, 1.0), (0.03, 1.2), (0.05, 20.0)])
@@ -65,9 +65,9 @@ def test_a_step_response_solves_its_differential_equation(lag, damping, width):
 
     y = integrate.solve_ivp(A, (0.0, 0.4), [0.0, 0.0, 0.0], t_eval=times, rtol=1e-8, atol=1e-10, method="LSODA").y
     before = np.interp(times - width, times, y[2])
-    wanted = (y[2] - before) / width if width else y[0]
-    found = mean_step_response(jnp.array(times), jnp.array(width), jnp.array(lag), jnp.array(ringing_of(damping)))
-    np.testing.assert_allclose(found, wanted, atol=2e-3 if damping > 5 else 5e-4)
+    expected = (y[2] - before) / width if width else y[0]
+    result = mean_step_response(jnp.array(times), jnp.array(width), jnp.array(lag), jnp.array(ringing_of(damping)))
+    np.testing.assert_allclose(result, expected, atol=2e-3 if damping > 5 else 5e-4)
 
 
 def _linear_channel(kind, kinds, sigma, n=60):
@@ -92,7 +92,7 @@ def _linear_channel(kind, kinds, sigma, n=60):
             jnp.zeros(()),
             jnp.zeros(()),
         )
-        channel = channel.measured(jnp.array(features, float)[None], sample, jnp.ones(()), DT, pushed=True)
+        channel = channel.measured(jnp.array(features, float)[None], sample, jnp.ones(()), DT, may_jump=True)
         if k % 10 == 9:
             channel = channel.predicted_by(posterior.path_posterior(channel, prior, None, DT))
         u = np.array([0.0, 0.0, 0.0, rng.choice([-1.0, 1.0])])
@@ -109,10 +109,10 @@ def _brute_force(cells, kind, channel, prior, rows, values):
     y = rows @ h.T
     left = values[:, None] - float(prior.gain) * y
     loading = y * float(prior.gain_spread) / float(channel.noise)
-    solved = np.linalg.solve(dense, loading)
+    solution = np.linalg.solve(dense, loading)
     # The covariance of each cell is ``dense`` and the square of its loading: Sherman and Morrison.
-    extra = 1.0 + np.sum(loading * solved, axis=0)
-    square = np.sum(left * np.linalg.solve(dense, left), axis=0) - np.sum(left * solved, axis=0) ** 2 / extra
+    extra = 1.0 + np.sum(loading * solution, axis=0)
+    square = np.sum(left * np.linalg.solve(dense, left), axis=0) - np.sum(left * solution, axis=0) ** 2 / extra
     square += n * float(prior.floor) ** 2 + posterior.FREEDOM * float(prior.noise) ** 2
     half_log = 0.5 * (np.linalg.slogdet(dense)[1] + np.log(extra))
     return -half_log - 0.5 * (n + posterior.FREEDOM) * np.log(square)
@@ -121,25 +121,25 @@ def _brute_force(cells, kind, channel, prior, rows, values):
 @pytest.mark.parametrize(("kinds", "kind", "sigma"), [(noise.DIRECT, 0, 0.05), (noise.DIFFERENCE, 0, 0.1)])
 def test_it_is_the_exact_posterior_of_a_linear_vehicle(kinds, kind, sigma):
     channel, prior, rows, values = _linear_channel(kind, kinds, sigma)
-    found = posterior.path_posterior(channel, prior, None, DT)
-    chosen = kinds[int(found.kind)]
+    result = posterior.path_posterior(channel, prior, None, DT)
+    choice = kinds[int(result.kind)]
     axes = np.linspace(0.0, 0.06, 49), np.log(np.geomspace(0.04, 0.14, 49)), np.linspace(0.01, 0.85, 29)
     grid = np.meshgrid(*axes, indexing="ij")
     cells = np.stack([x.ravel() for x in grid], axis=1)
-    exact = _brute_force(jnp.array(cells, float), chosen, channel, prior, rows, values)
+    exact = _brute_force(jnp.array(cells, float), choice, channel, prior, rows, values)
     log_prior = -0.5 * ((cells[:, 1] - np.log(float(prior.lag))) / float(prior.lag_spread)) ** 2
     weight = np.exp(exact + log_prior - np.max(exact + log_prior))
     weight /= weight.sum()
     for i in range(3):
         mean = weight @ cells[:, i]
         deviation = np.sqrt(weight @ (cells[:, i] - mean) ** 2)
-        mine = float(found.weight @ found.cells[:, i])
-        spread = np.sqrt(float(found.weight @ (found.cells[:, i] - mine) ** 2))
+        mine = float(result.weight @ result.cells[:, i])
+        spread = np.sqrt(float(result.weight @ (result.cells[:, i] - mine) ** 2))
         assert abs(mine - mean) < 0.25 * deviation
         assert 0.75 < spread / deviation < 1.3
-    likely = np.asarray(found.cells)[np.argsort(-np.asarray(found.weight))[:50]]
-    again = _brute_force(jnp.array(likely, float), chosen, channel, prior, rows, values)
-    here = np.asarray(posterior.log_likelihood(channel, prior, jnp.array(likely), DT))[int(found.kind)]
+    likely = np.asarray(result.cells)[np.argsort(-np.asarray(result.weight))[:50]]
+    again = _brute_force(jnp.array(likely, float), choice, channel, prior, rows, values)
+    here = np.asarray(posterior.log_likelihood(channel, prior, jnp.array(likely), DT))[int(result.kind)]
     np.testing.assert_allclose(here - here[0], again - again[0], atol=0.1)
 
 
@@ -153,9 +153,9 @@ def many():
 
 
 def test_fifty_vehicles_are_identified_within_a_second(many):
-    vehicles, found = many
+    vehicles, result = many
     delay, lag, gain = (
-        np.array([getattr(each, name).mean[-1] for each in found]) for name in ("delay", "rate_lag", "thrust_gain")
+        np.array([getattr(each, name).mean[-1] for each in result]) for name in ("delay", "rate_lag", "thrust_gain")
     )
     assert np.mean(np.abs(delay - vehicles.delay) < 0.008) >= 0.97
     assert np.mean(np.abs(lag / vehicles.rate_lag - 1.0) < 0.2) >= 0.95
@@ -164,11 +164,11 @@ def test_fifty_vehicles_are_identified_within_a_second(many):
 
 @pytest.mark.parametrize("name", ["delay", "rate_lag", "yaw_lag", "thrust_gain", "thrust_lag"])
 def test_intervals_cover_what_they_state(many, name):
-    vehicles, found = many
-    low, high = (np.array([getattr(getattr(each, name), end)[-1] for each in found]) for end in ("low", "high"))
+    vehicles, result = many
+    low, high = (np.array([getattr(getattr(each, name), end)[-1] for each in result]) for end in ("low", "high"))
     truth = getattr(vehicles, name)
     assert 0.82 <= np.mean((low <= truth) & (truth <= high)) <= 1.0
-    assert all(getattr(each, name).excited[-1] for each in found)
+    assert all(getattr(each, name).excited[-1] for each in result)
 
 
 def test_roll_and_pitch_may_change_places_and_clocks_may_start_anywhere():
@@ -176,19 +176,19 @@ def test_roll_and_pitch_may_change_places_and_clocks_may_start_anywhere():
     plain, later = estimate(flights), estimate(flights, start=37.0)
     u, omega = flights.u[0].copy(), flights.omega[0].copy()
     u[:, [1, 2]], omega[:, [0, 1]] = u[:, [2, 1]], omega[:, [1, 0]]
-    swapped = estimate(flights, u=u, omega=omega)
+    swap = estimate(flights, u=u, omega=omega)
     for name in ("delay", "rate_lag", "rate_gain"):
-        one, two, three = (getattr(each, name) for each in (plain, swapped, later))
+        one, two, three = (getattr(each, name) for each in (plain, swap, later))
         assert abs(one.mean[-1] - two.mean[-1]) < 0.05 * one.deviation[-1]
         assert abs(one.mean[-1] - three.mean[-1]) < 0.05 * one.deviation[-1]
 
 
 def test_nothing_is_compiled_for_other_values():
-    traced = []
+    traces = []
 
     @jax.jit
     def update(s, t, x, omega, a, age, u):
-        traced.append(1)
+        traces.append(1)
         return ESTIMATOR.issued(ESTIMATOR.update(s, t, x, omega, a, age), u)
 
     for delay in (0.01, 0.053):
@@ -205,7 +205,7 @@ def test_nothing_is_compiled_for_other_values():
                 jnp.float32(flights.age),
                 Command.of(u[k]),
             )
-    assert len(traced) == 1
+    assert len(traces) == 1
 
 
 @pytest.mark.parametrize("inertial", [True, False])
@@ -217,11 +217,11 @@ def test_a_vehicle_at_rest_says_nothing(inertial):
     quiet = {"p": 1e-4 * rng.normal(size=(n, 3)), "R": R, "v": 3e-3 * rng.normal(size=(n, 3)), "u": u}
     quiet |= {"omega": 0.02 * rng.normal(size=(n, 3)), "a": 0.2 * rng.normal(size=(n, 3))}
     flights = fly(rng, one_vehicle(), LEVELS["ideal"], n * DT)
-    found = estimate(flights, inertial=inertial, **{name: quiet[name] for name in ("p", "R", "v", "omega", "a", "u")})
+    result = estimate(flights, inertial=inertial, **{name: quiet[name] for name in ("p", "R", "v", "omega", "a", "u")})
     for name in ("delay", "rate_lag", "rate_gain", "yaw_lag"):
-        assert not getattr(found, name).excited[-1], name
-    assert found.thrust_gain.deviation[-1] > 0.1
-    assert "not excited" in describe_path(jax.tree.map(lambda leaf: leaf[-1], found))
+        assert not getattr(result, name).excited[-1], name
+    assert result.thrust_gain.deviation[-1] > 0.1
+    assert "not excited" in describe_path(jax.tree.map(lambda leaf: leaf[-1], result))
 
 
 def test_wrong_measurements_do_not_move_it():
@@ -239,14 +239,14 @@ def test_wrong_measurements_do_not_move_it():
 
 
 def test_it_follows_a_change_of_the_vehicle():
-    def excited(t):
+    def excite(t):
         return doublets(t % 1.0)
 
     before, after = one_vehicle(rate_lag=0.04), one_vehicle(rate_lag=0.1)
-    flights = fly(np.random.default_rng(6), before, LEVELS["onboard"], 7.0, excited, after, 2.0)
-    found = estimate(flights)
-    assert found.rate_lag.mean[95] == pytest.approx(0.04, rel=0.1)
-    assert found.rate_lag.mean[-1] == pytest.approx(0.1, rel=0.2)
+    flights = fly(np.random.default_rng(6), before, LEVELS["onboard"], 7.0, excite, after, 2.0)
+    result = estimate(flights)
+    assert result.rate_lag.mean[95] == pytest.approx(0.04, rel=0.1)
+    assert result.rate_lag.mean[-1] == pytest.approx(0.1, rel=0.2)
 
 
 def test_the_line_that_reports_it():

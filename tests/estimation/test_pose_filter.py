@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, first_order, random_command, replaced, stacked
+from helpers import GOAL, first_order, random_command, replace_fields, stack_trees
 from retrim.estimation import Camera, PoseFilter
 from retrim.estimation.camera import in_camera
-from retrim.physics import Command, Lagged, PointMass, State, so3
+from retrim.physics import Command, LaggedModel, PointMass, State, so3
 from retrim.tasks.keypoints import PATTERN
 
 DT = 0.02
@@ -24,15 +24,15 @@ def pixels_at(x):
 
 
 @eqx.filter_jit
-def tracked(estimate, x, us, visible):
+def track(estimate, x, us, visible):
     """The filter beside a point mass; ``visible`` (ticks x 7) says what it is shown."""
     noise = 2.0 * 0.5 / CAMERA.size
 
     def tick(carry, step):
         estimate, x = carry
-        u, seen = step
+        u, observation = step
         x = PointMass(DT).step(x, u, jnp.zeros(3))
-        estimate = estimate.predicted(u, DT).corrected(CAMERA, GROUND, pixels_at(x), seen, noise)
+        estimate = estimate.predict(u, DT).correct(CAMERA, GROUND, pixels_at(x), observation, noise)
         gap = estimate.x.p - x.p, so3.log(x.R.T @ estimate.x.R), estimate.x.v - x.v
         return (estimate, x), (jnp.stack([jnp.sqrt(jnp.sum(g**2)) for g in gap]), estimate.P)
 
@@ -41,8 +41,8 @@ def tracked(estimate, x, us, visible):
 
 
 @eqx.filter_jit
-def corrected(estimate, pixels, visible):
-    return estimate.corrected(CAMERA, GROUND, pixels, visible, 1.0 / CAMERA.size)
+def correct(estimate, pixels, visible):
+    return estimate.correct(CAMERA, GROUND, pixels, visible, 1.0 / CAMERA.size)
 
 
 def hovering(n):
@@ -58,7 +58,7 @@ def test_converges_from_its_hand_over(seed):
     x = State.at(jnp.array(GOAL))
     start = PoseFilter.near(x, random.key(seed))
     assert float(jnp.linalg.norm(start.x.p - x.p)) > 0.01
-    _, _, gaps, _ = tracked(start, x, stacked(hovering(40)), jnp.ones((40, 7), dtype=bool))
+    _, _, gaps, _ = track(start, x, stack_trees(hovering(40)), jnp.ones((40, 7), dtype=bool))
     assert float(gaps[15:, 0].max()) < 2e-3  # m
     assert float(gaps[15:, 1].max()) < 2e-3  # rad
     assert float(gaps[25:, 2].max()) < 0.02  # m/s
@@ -76,10 +76,10 @@ def test_hand_over_is_as_uncertain_as_it_says():
 
 def test_predicts_through_the_dark(key):
     """15 ticks without any point, under commands that it knows: the error stays, the doubt grows."""
-    us = stacked(hovering(25) + [random_command(k) for k in random.split(key, 15)])
+    us = stack_trees(hovering(25) + [random_command(k) for k in random.split(key, 15)])
     dark = jnp.arange(40)[:, None] < jnp.full((1, 7), 25)
     x0 = State.at(jnp.array(GOAL))
-    _, x, gaps, P = tracked(PoseFilter.near(x0, key), x0, us, dark)
+    _, x, gaps, P = track(PoseFilter.near(x0, key), x0, us, dark)
     assert float(jnp.linalg.norm(x.v)) > 0.1  # it has moved
     assert float(gaps[-1, 0]) < 5e-3
     assert float(gaps[-1, 1]) < 5e-3
@@ -94,22 +94,22 @@ def test_one_point_corrects(key):
     estimate = PoseFilter.near(x, key)
     pixels = pixels_at(x)
     for i in range(7):
-        after = corrected(estimate, pixels, jnp.arange(7) == i)
+        after = correct(estimate, pixels, jnp.arange(7) == i)
         shrunk = np.linalg.eigvalsh(estimate.P - after.P)
         assert shrunk.min() > -1e-12
         assert (shrunk > 1e-4).sum() == 2  # two numbers, two directions
         assert float(jnp.trace(after.P)) < float(jnp.trace(estimate.P))
-    none = corrected(estimate, pixels, jnp.zeros(7, dtype=bool))
+    none = correct(estimate, pixels, jnp.zeros(7, dtype=bool))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), none, estimate)
 
 
 def test_covariance_stays_one(key):
     """Symmetric and positive, whatever comes into estimate and goes."""
     kv, ku, ks = random.split(key, 3)
-    us = stacked(gentle(ku, 40))
-    seen = random.uniform(kv, (40, 7)) < 0.3
+    us = stack_trees(gentle(ku, 40))
+    observation = random.uniform(kv, (40, 7)) < 0.3
     x0 = State.at(jnp.array(GOAL))
-    _, _, gaps, P = tracked(PoseFilter.near(x0, ks), x0, us, seen)
+    _, _, gaps, P = track(PoseFilter.near(x0, ks), x0, us, observation)
     np.testing.assert_allclose(P, np.swapaxes(P, 1, 2), atol=1e-15)
     assert np.linalg.eigvalsh(P).min() > 0.0
     assert float(gaps[20:, 0].max()) < 0.02
@@ -117,9 +117,9 @@ def test_covariance_stays_one(key):
 
 def test_a_stray_point_does_not_throw_it(key):
     x = State.at(jnp.array(GOAL))
-    estimate, *_ = tracked(PoseFilter.near(x, key), x, stacked(hovering(40)), jnp.ones((40, 7), dtype=bool))
+    estimate, *_ = track(PoseFilter.near(x, key), x, stack_trees(hovering(40)), jnp.ones((40, 7), dtype=bool))
     pixels = pixels_at(x).at[2].set(jnp.array([-0.9, -0.9]))
-    after = corrected(estimate, pixels, jnp.ones(7, dtype=bool))
+    after = correct(estimate, pixels, jnp.ones(7, dtype=bool))
     assert float(jnp.linalg.norm(after.x.p - x.p)) < 0.02
 
 
@@ -132,8 +132,8 @@ def test_a_push_is_felt(push, key):
     @jax.jit
     def tick(estimate, x):
         x = PointMass(DT).step(x, hold, jnp.array(push))
-        seen = jnp.ones(7, dtype=bool)
-        return estimate.predicted(hold, DT).corrected(CAMERA, GROUND, pixels_at(x), seen, noise), x
+        observation = jnp.ones(7, dtype=bool)
+        return estimate.predict(hold, DT).correct(CAMERA, GROUND, pixels_at(x), observation, noise), x
 
     for _ in range(30):
         estimate, x = tick(estimate, x)
@@ -146,7 +146,7 @@ def test_a_first_look_may_be_far_off():
     x = State.at(jnp.array([0.1, 0.2, 1.2]))
     estimate = PoseFilter.near(x, random.key(0))
     off = State(x.p + jnp.array([0.2, -0.1, 0.15]), so3.exp(jnp.array([0.1, -0.05, 0.08])), x.v)
-    after = corrected(replaced(estimate, x=off), pixels_at(x), jnp.ones(7, dtype=bool))
+    after = correct(replace_fields(estimate, x=off), pixels_at(x), jnp.ones(7, dtype=bool))
     assert float(jnp.linalg.norm(after.x.p - x.p)) < 0.01
     assert float(jnp.linalg.norm(so3.log(x.R.T @ after.x.R))) < 0.01
 
@@ -154,19 +154,19 @@ def test_a_first_look_may_be_far_off():
 @pytest.mark.parametrize("tau", [0.03, 0.06])
 def test_it_knows_of_lag(tau, key):
     """In the dark, under a command that jumps, it follows a vehicle with such actuators; not without knowing."""
-    plant = Lagged(PointMass(DT), first_order(tau))
+    plant = LaggedModel(PointMass(DT), first_order(tau))
     x0 = State.at(jnp.array(GOAL))
-    start = replaced(PoseFilter.near(x0, key), x=x0)
+    start = replace_fields(PoseFilter.near(x0, key), x=x0)
     jumps = [Command(jnp.array(15.0), jnp.array([3.0, -2.0, 1.0]))] * 6
 
     @eqx.filter_jit
-    def flown(us, lag):
+    def fly_once(us, lag):
         def tick(carry, u):
             s, estimate = carry
-            return (plant.step(s, u, jnp.zeros(3)), estimate.predicted(u, DT, lag)), None
+            return (plant.step(s, u, jnp.zeros(3)), estimate.predict(u, DT, lag)), None
 
         (s, estimate), _ = lax.scan(tick, (plant.init(x0), start), us)
         return jnp.linalg.norm(plant.state(s).v - estimate.x.v)
 
-    assert float(flown(stacked(jumps), jnp.array(tau))) < 1e-9
-    assert float(flown(stacked(jumps), None)) > 0.1
+    assert float(fly_once(stack_trees(jumps), jnp.array(tau))) < 1e-9
+    assert float(fly_once(stack_trees(jumps), None)) > 0.1

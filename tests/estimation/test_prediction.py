@@ -10,7 +10,7 @@ from helpers import first_order, random_command, random_state
 from retrim.estimation.prediction import Prediction
 from retrim.physics import ActuatorResponse, Command, CommandPath, PointMass
 from retrim.physics.actuator_response import ActuatorState
-from retrim.physics.actuators import Lagged
+from retrim.physics.actuators import LaggedModel
 
 DT, TAU = 0.02, 0.033
 
@@ -22,7 +22,7 @@ def prediction_of(lag, ticks):
 @pytest.mark.parametrize("delay", [0, 1, 3])
 def test_it_is_what_the_lagged_model_does(delay, key):
     """Commands under way act first, each for a tick; then the new one begins."""
-    model, d = Lagged(PointMass(DT), first_order(TAU)), jnp.array([0.5, -1.0, 0.3])
+    model, d = LaggedModel(PointMass(DT), first_order(TAU)), jnp.array([0.5, -1.0, 0.3])
     k_x, *keys = random.split(key, 9)
     s = model.init(random_state(k_x))
     prediction = prediction_of(TAU, delay)
@@ -44,10 +44,10 @@ def test_it_is_what_the_lagged_model_does(delay, key):
 def test_what_the_plant_accepted_is_what_counts(key):
     x, (k_a, k_b) = random_state(key), random.split(key)
     prediction = prediction_of(TAU, 1)
-    issued, accepted = random_command(k_a), random_command(k_b)
-    told = prediction.accepted(prediction.issued(prediction.init(x), issued), accepted)
-    known = prediction.issued(prediction.init(x), accepted)
-    for a, b in zip(prediction(told, x, jnp.zeros(3)), prediction(known, x, jnp.zeros(3)), strict=True):
+    commands, accepted_command = random_command(k_a), random_command(k_b)
+    message = prediction.accepted(prediction.issued(prediction.init(x), commands), accepted_command)
+    model = prediction.issued(prediction.init(x), accepted_command)
+    for a, b in zip(prediction(message, x, jnp.zeros(3)), prediction(model, x, jnp.zeros(3)), strict=True):
         jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
@@ -78,17 +78,17 @@ def test_a_delay_between_two_ticks_and_a_ringing_rate_loop(key):
         memory = prediction.issued(memory, u)
         for k in range(round(n * DT / fine), round((n + 1) * DT / fine)):
             x, actuators = _fine_step(model, response, commands, arrivals, k, x, actuators, d)
-    ((at, found),) = ((at, found) for at, found in expected.items() if found is not None)
+    ((at, result),) = ((at, result) for at, result in expected.items() if result is not None)
     for k in range(len(commands) * round(DT / fine), at):
         x, actuators = _fine_step(model, response, commands, arrivals, k, x, actuators, d)
-    np.testing.assert_allclose(found[0].p, x.p, atol=2e-4)
-    np.testing.assert_allclose(found[0].v, x.v, atol=5e-3)
-    np.testing.assert_allclose(found[1].vector(), actuators.command.vector(), atol=1e-6)
+    np.testing.assert_allclose(result[0].p, x.p, atol=2e-4)
+    np.testing.assert_allclose(result[0].v, x.v, atol=5e-3)
+    np.testing.assert_allclose(result[1].vector(), actuators.command.vector(), atol=1e-6)
 
 
 def _fine_step(model, response, commands, arrivals, k, x, actuators, d):
-    arrived = [n for n, at in enumerate(arrivals) if at <= k]
-    u = commands[arrived[-1]] if arrived else Command.hover(x.p.dtype)
+    arrival_list = [n for n, at in enumerate(arrivals) if at <= k]
+    u = commands[arrival_list[-1]] if arrival_list else Command.hover(x.p.dtype)
     away, actuators = response(actuators, u, model.dt)
     mean = jax.tree.map(lambda target, each: target + each / model.dt, response.target(u), away)
     return model.step(x, mean, d), actuators

@@ -53,8 +53,8 @@ def here(as_a_user):
     """The address of a scheduler with two workers, which are threads of this process."""
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None, host="127.0.0.1"
-    ) as found:
-        yield found.scheduler_address
+    ) as result:
+        yield result.scheduler_address
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def fleet(as_a_user):
 def test_lots_that_travel_are_the_flights_of_one_process(here, fleet):
     with Cluster(here) as there:
         assert there.workers == 2
-        away = fleet.run(there, by_lot=True)
+        away = fleet.run(there, by_batch=True)
     assert away.rows() == fleet.run().rows()
     assert not away.failed
 
@@ -83,21 +83,21 @@ def test_a_job_that_fails_is_told_and_the_others_land(here, fleet, monkeypatch):
     monkeypatch.setattr(jobs, "fly_batch", failing)
     monkeypatch.setattr("retrim.evaluation.batches.lanes", lambda: 1)
     with Cluster(here) as there:
-        flights = fleet.run(there, by_lot=True)
-    assert [flight.spec.method for flight in flights.flown] == ["base", "base"]
+        flights = fleet.run(there, by_batch=True)
+    assert [flight.spec.method for flight in flights.flights] == ["base", "base"]
     assert {spec.method for spec in flights.failed} == {"full"}
     assert set(flights.failed.values()) == {"OSError: the disk is full"}
     assert flights.interrupted
 
 
 def test_a_failed_flight_is_a_row_with_its_error():
-    flown = {**failed_record(FlightSpec(Scenario(), "full", 0), "small", "m", ""), "error": 0.01, "failed": None}
-    lost = failed_record(FlightSpec(Scenario(), "full", 1), "small", "m", "OSError: gone")
-    row = summary([flown, lost])
+    flight = {**failed_record(FlightSpec(Scenario(), "full", 0), "small", "m", ""), "error": 0.01, "failed": None}
+    gap = failed_record(FlightSpec(Scenario(), "full", 1), "small", "m", "OSError: gone")
+    row = summary([flight, gap])
     assert (row["n"], row["crashes"], row["failures"]) == (2, 0, ["OSError: gone"])
     assert (row["mean"], row["max"], row["median"]) == (0.01, 0.01, 0.01)
     assert cell(row) == "0.010, 1 of 2 failed"
-    assert cell(summary([lost])) == "1 of 1 failed"
+    assert cell(summary([gap])) == "1 of 1 failed"
 
 
 def test_a_table_with_holes_is_not_made(here, tmp_path, monkeypatch):
@@ -107,8 +107,8 @@ def test_a_table_with_holes_is_not_made(here, tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "fly_batch", failing)
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
     words = "--presets", "hover/fast", "--methods", "base", "--seeds", "0", "--starts", "4", "--seconds", "1"
-    said = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
-    assert "flights failed elsewhere, the first by OSError: the disk is full" in said
+    text = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
+    assert "flights failed elsewhere, the first by OSError: the disk is full" in text
 
 
 def test_a_training_that_fails_costs_no_other(here, tmp_path, monkeypatch):
@@ -121,8 +121,8 @@ def test_a_training_that_fails_costs_no_other(here, tmp_path, monkeypatch):
 
     monkeypatch.setattr(training, "train", failing)
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
-    said = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
-    assert "1 of 2 trainings of hover/retrim failed: seed 1: too large" in said
+    text = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
+    assert "1 of 2 trainings of hover/retrim failed: seed 1: too large" in text
     assert [path.stem[-5:] for path in (tmp_path / "s/policies").iterdir()] == ["seed0"]
 
 
@@ -137,8 +137,8 @@ def test_a_flight_that_fails_leaves_the_others_and_an_exit_code(here, tmp_path, 
     monkeypatch.setattr(jobs, "fly_batch", failing)
     monkeypatch.setattr("retrim.evaluation.batches.lanes", lambda: 1)
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"full"', '"indi"'))
-    said = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
-    assert "2 flights failed elsewhere, the first by OSError: gone; the same command flies them" in said
+    text = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
+    assert "2 flights failed elsewhere, the first by OSError: gone; the same command flies them" in text
     base, indi = rows(tmp_path / "s")
     assert "failures" not in base
     assert (indi["n"], indi["failures"], indi["mean"]) == (2, ["OSError: gone"] * 2, None)
@@ -193,20 +193,20 @@ def test_other_versions_are_refused_before_the_first_job(here, monkeypatch):
 def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(here, tmp_path, monkeypatch):
     """The policies are trained by the workers, too."""
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
-    said = retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
-    assert f"2 workers at {here}" in said
+    text = retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
+    assert f"2 workers at {here}" in text
     retrim("sweep", "study.toml", "--out", "here", cwd=tmp_path)
     assert rows(tmp_path / "there") == rows(tmp_path / "here")
-    kept = [json.loads(line) for line in (tmp_path / "there/flights.jsonl").read_text().splitlines()]
-    kept[0] |= {"failed": "OSError: gone", "error": None}
-    (tmp_path / "there/flights.jsonl").write_text("".join(json.dumps(row) + "\n" for row in kept))
+    rest = [json.loads(line) for line in (tmp_path / "there/flights.jsonl").read_text().splitlines()]
+    rest[0] |= {"failed": "OSError: gone", "error": None}
+    (tmp_path / "there/flights.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rest))
     retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
     assert [row["n"] for row in rows(tmp_path / "there")] == [2] * 2
     assert not any("failures" in row for row in rows(tmp_path / "there"))
 
 
-@pytest.mark.parametrize("lost", range(cluster.ATTEMPTS + 1))
-def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(lost):
+@pytest.mark.parametrize("gap", range(cluster.ATTEMPTS + 1))
+def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(gap):
     """Its result is there unless it was lost as often as it may be."""
 
     class Gone:
@@ -222,15 +222,15 @@ def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(los
         def release(self):
             pass
 
-    given, outer = [], Future()
+    argument, outer = [], Future()
 
     def submit():
-        given.append("lost" if len(given) < lost else "finished")
-        return Gone(given[-1])
+        argument.append("lost" if len(argument) < gap else "finished")
+        return Gone(argument[-1])
 
     Cluster.__new__(Cluster)._start(outer, submit, cluster.ATTEMPTS)
-    assert len(given) == min(lost + 1, cluster.ATTEMPTS)
-    if lost < cluster.ATTEMPTS:
+    assert len(argument) == min(gap + 1, cluster.ATTEMPTS)
+    if gap < cluster.ATTEMPTS:
         assert outer.result(0) == "whole"
     else:
         with pytest.raises(JobError, match=rf"lost {cluster.ATTEMPTS} times \(lost\)"):
@@ -240,13 +240,13 @@ def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(los
 def test_a_table_grows_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
     words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "1"
-    said = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
+    text = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
     whole = json.loads((tmp_path / "s" / "scaling.json").read_text())
-    found = whole["rows"]
+    result = whole["rows"]
     assert whole["seeds"] == [0]
-    assert [row["flights"] for row in found] == [4, 8]
-    assert all(row["run_s"] > 0 and row["peak_mb"] > 50 for row in found)
-    assert "flights a second" in said
+    assert [row["flights"] for row in result] == [4, 8]
+    assert all(row["run_s"] > 0 and row["peak_mb"] > 50 for row in result)
+    assert "flights a second" in text
     assert (tmp_path / "s" / "scaling.png").stat().st_size > 5000
     assert "(scaling.png)" in (tmp_path / "s" / "scaling.md").read_text()
     assert "--flights 6 must be a positive multiple of 4" in retrim(
@@ -309,10 +309,10 @@ def processes(folder):
     with contextlib.ExitStack() as stack:
 
         def start(*words):
-            found = subprocess.Popen([*dask, *words], start_new_session=True, **quiet)
-            stack.callback(found.wait, 30)
-            stack.callback(lambda: os.killpg(found.pid, signal.SIGKILL))
-            return found
+            result = subprocess.Popen([*dask, *words], start_new_session=True, **quiet)
+            stack.callback(result.wait, 30)
+            stack.callback(lambda: os.killpg(result.pid, signal.SIGKILL))
+            return result
 
         start("scheduler", "--host", "127.0.0.1", "--port", "0", *place)
         while not (folder / "scheduler.json").exists():

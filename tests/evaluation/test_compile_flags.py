@@ -12,12 +12,12 @@ EMITTERS, LEVEL = compile_flags.QUICK
 
 
 @pytest.fixture
-def told(monkeypatch):
+def flags_of(monkeypatch):
     """What ``XLA_FLAGS`` says after a command has begun."""
     monkeypatch.setattr(compile_flags, "enable_compile_cache", lambda: None)
 
-    def begin(command, given="", *, jaxlib="0.10.1", plugins=()):
-        monkeypatch.setenv("XLA_FLAGS", given)
+    def begin(command, argument="", *, jaxlib="0.10.1", plugins=()):
+        monkeypatch.setenv("XLA_FLAGS", argument)
         monkeypatch.setattr(compile_flags, "version", lambda name: jaxlib)
         monkeypatch.setattr(compile_flags, "entry_points", lambda group: plugins)
         compile_flags.compile_for(command)
@@ -26,18 +26,18 @@ def told(monkeypatch):
     return begin
 
 
-def test_a_short_command_compiles_quickly_and_the_user_s_flags_stand(told):
-    assert told("fly") == [EMITTERS, LEVEL]
-    assert told("demo", "--xla_dump_to=x") == ["--xla_dump_to=x", EMITTERS, LEVEL]
-    assert told("demo", "--xla_backend_optimization_level=3") == ["--xla_backend_optimization_level=3", EMITTERS]
+def test_a_short_command_compiles_quickly_and_the_user_s_flags_stand(flags_of):
+    assert flags_of("fly") == [EMITTERS, LEVEL]
+    assert flags_of("demo", "--xla_dump_to=x") == ["--xla_dump_to=x", EMITTERS, LEVEL]
+    assert flags_of("demo", "--xla_backend_optimization_level=3") == ["--xla_backend_optimization_level=3", EMITTERS]
 
 
 @pytest.mark.parametrize(
     ("command", "about"),
     [(name, {}) for name in compile_flags.LONG] + [("fly", {"jaxlib": "0.11.0"}), ("fly", {"plugins": ("cuda",)})],
 )
-def test_nothing_changes_for_long_commands_unknown_compilers_and_accelerators(told, command, about):
-    assert told(command, "--xla_dump_to=x", **about) == ["--xla_dump_to=x"]
+def test_nothing_changes_for_long_commands_unknown_compilers_and_accelerators(flags_of, command, about):
+    assert flags_of(command, "--xla_dump_to=x", **about) == ["--xla_dump_to=x"]
 
 
 def test_the_installed_compiler_knows_the_flags():

@@ -12,7 +12,7 @@ from retrim.runtime.flight import Log, States
 DT, G = 0.02, 9.80665
 
 
-def flown(*, n=100, delay=1, lag=0.03, sign=1.0, ringing=None, thrust=1.0, down=False, velocity=1.0, seed=0):
+def fly_once(*, n=100, delay=1, lag=0.03, sign=1.0, ringing=None, thrust=1.0, down=False, velocity=1.0, seed=0):
     """A log of a point that turns and accelerates as it is told, but for its faults."""
     rng = np.random.default_rng(seed)
     knots = rng.normal(size=(n // 10 + 2, 4)) * np.array([1.5, 1.2, 1.2, 0.3])
@@ -23,13 +23,13 @@ def flown(*, n=100, delay=1, lag=0.03, sign=1.0, ringing=None, thrust=1.0, down=
     w, dw = np.zeros(3), np.zeros(3)
     rows = [(p, R.as_matrix(), v)]
     for k in range(1, n + 1):
-        wanted = sign * u[max(0, k - delay), 1:]
+        expected = sign * u[max(0, k - delay), 1:]
         for _ in range(20):
             h = DT / 20
             if ringing is None:
-                w = w + h / lag * (wanted - w)
+                w = w + h / lag * (expected - w)
             else:
-                dw = dw + h * (ringing**2 * (wanted - w) - 2.0 * 0.05 * ringing * dw)
+                dw = dw + h * (ringing**2 * (expected - w) - 2.0 * 0.05 * ringing * dw)
                 w = w + h * dw
             R = R * Rotation.from_rotvec(h * w)
             a = thrust * u[k, 0] * R.as_matrix()[:, 2] - np.array([0.0, 0.0, G])
@@ -44,11 +44,11 @@ def flown(*, n=100, delay=1, lag=0.03, sign=1.0, ringing=None, thrust=1.0, down=
 
 def test_a_vehicle_without_a_fault_has_no_cause():
     for seed in range(5):
-        assert likely_cause(flown(seed=seed), 0.05) is None
+        assert likely_cause(fly_once(seed=seed), 0.05) is None
 
 
 @pytest.mark.parametrize(
-    ("fault", "said"),
+    ("fault", "text"),
     [
         ({"delay": 8}, r"turned with .* 0\.(1[5-9]|2\d) s later, and the policy was trained for 0\.05 s.* rate_lag"),
         ({"lag": 0.3}, r"0\.[23]\d s later, and the policy was trained for 0\.05 s: give its rate_lag"),
@@ -60,16 +60,16 @@ def test_a_vehicle_without_a_fault_has_no_cause():
         ({"velocity": 0.5}, r"the velocity is 0\.5\d? times the derivative"),
     ],
 )  # fmt: skip
-def test_a_fault_is_told_with_its_number(fault, said):
+def test_a_fault_is_told_with_its_number(fault, text):
     for seed in range(3):
-        found = likely_cause(flown(seed=seed, **fault), 0.05)
-        assert found is not None
-        np.testing.assert_string_equal(found, " ".join(found.split()))  # one line
-        assert re.search(said, found), found
+        result = likely_cause(fly_once(seed=seed, **fault), 0.05)
+        assert result is not None
+        np.testing.assert_string_equal(result, " ".join(result.split()))  # one line
+        assert re.search(text, result), result
 
 
 def test_numbers_clock_and_rotation():
-    log = flown()
+    log = fly_once()
     assert "clock stands still" in likely_cause(log._replace(t=0.0 * log.t), 0.05)
     assert "measurements are 0.06 s apart" in likely_cause(log._replace(t=3.0 * log.t), 0.05)
     spoilt = log.measured.v.copy()

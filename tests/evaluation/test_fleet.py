@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import made_up
+import fake_flights
 from helpers import brief_preset, tiny_preset
 from retrim import ConfigError, Fleet, PlantError, Scenario, Setup, enable_compile_cache, load
 from retrim.config.loading import dump
-from retrim.evaluation import batches as lots
+from retrim.evaluation import batches as batching
 from retrim.evaluation import executor as gathering
 from retrim.evaluation import fleet as fleet_module
 from retrim.evaluation import jobs
@@ -39,51 +39,51 @@ def fleet(as_a_user):
     return Fleet(preset, policies, SCENARIOS, starts=1, seconds=1.2)
 
 
-def two_lots(fleet):
+def two_batches(fleet):
     """Flights of two programs: of those that adapt, and of those whose world and measurements are random."""
-    wanted = {("small", "full"), ("gusts", "base")}
-    return [spec for spec in fleet.specs if (spec.scenario.disturbance, spec.method) in wanted]
+    expected = {("small", "full"), ("gusts", "base")}
+    return [spec for spec in fleet.specs if (spec.scenario.disturbance, spec.method) in expected]
 
 
 @pytest.fixture(scope="module")
-def compiled(fleet):
+def programs(fleet):
     """Programs that were compiled in the fleet's first flights, after its warm-up."""
-    found = list[str]()
+    result = list[str]()
 
     def note(name, seconds, **about):
         if name.endswith("backend_compile_duration"):
-            found.append(name)
+            result.append(name)
 
     fleet.warm_up()
     jax.monitoring.register_event_duration_secs_listener(note)
     with ThreadPoolExecutor(2) as pool:
         flights = fleet.run(pool)
     jax.monitoring.unregister_event_duration_listener(note)
-    return flights, found
+    return flights, result
 
 
 @pytest.fixture(scope="module")
-def flights(compiled):
-    return compiled[0]
+def flights(programs):
+    return programs[0]
 
 
-def test_nothing_of_a_tick_is_compiled_after_the_warm_up(compiled, fleet):
+def test_nothing_of_a_tick_is_compiled_after_the_warm_up(programs, fleet):
     """What scores a flight may be; it is compiled once, after the first flights have landed."""
-    assert len(compiled[1]) <= 3
+    assert len(programs[1]) <= 3
 
 
 def test_every_combination_is_flown_once_and_in_order(fleet, flights):
-    assert [flight.spec for flight in flights.flown] == fleet.specs
+    assert [flight.spec for flight in flights.flights] == fleet.specs
     assert len(set(fleet.specs)) == 8
     assert not flights.interrupted
-    found = flights.rows()
-    assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in found] == [
+    result = flights.rows()
+    assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in result] == [
         (name, method, 2, 0) for name in ("small", "gusts") for method in ("base", "full")
     ]
-    assert all(np.isfinite(row["mean"]) for row in found)
-    kinds = {event.kind for flight in flights.flown for event in flight.events}
+    assert all(np.isfinite(row["mean"]) for row in result)
+    kinds = {event.kind for flight in flights.flights for event in flight.events}
     assert {"residual", "policy"} & kinds == {"residual"} | ({"policy"} & kinds)
-    assert all(flight.events == () for flight in flights.flown if flight.spec.method == "base")
+    assert all(flight.events == () for flight in flights.flights if flight.spec.method == "base")
 
 
 def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
@@ -95,25 +95,25 @@ def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
     ]  # fmt: skip
     with ProcessPoolExecutor(2, mp_context=context, initializer=enable_compile_cache) as pool:
         elsewhere = fleet.run(pool, only=part)
-    assert [flight.spec for flight in elsewhere.flown] == part
-    for there, here in zip(elsewhere.flown, (flights.flown[5], flights.flown[7]), strict=True):
+    assert [flight.spec for flight in elsewhere.flights] == part
+    for there, here in zip(elsewhere.flights, (flights.flights[5], flights.flights[7]), strict=True):
         np.testing.assert_array_equal(there.log.p, here.log.p)
         assert there.events == here.events
-        assert (there.learnt is None) == (here.learnt is None)
+        assert (there.learner_state is None) == (here.learner_state is None)
 
 
 @pytest.mark.parametrize("cores", [1, 2, 3, 8, 16, 64])
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 7, 8, 9, 24, 65])
 def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
     """However many cores there are: Python steps a single flight, and that uses one of them."""
-    monkeypatch.setattr(lots, "lanes", lambda: cores)
+    monkeypatch.setattr(batching, "lanes", lambda: cores)
     group = [FlightSpec(Scenario("small"), "base", start) for start in range(n)]
-    found = lots.in_batches([group], lambda specs: "program")
-    assert sorted((spec for lot in found for spec in lot.specs), key=group.index) == group
-    sizes = [len(lot.specs) for lot in found]
+    result = batching.in_batches([group], lambda specs: "program")
+    assert sorted((spec for batch in result for spec in batch.specs), key=group.index) == group
+    sizes = [len(batch.specs) for batch in result]
     assert n == 1 or min(sizes) > 1
     assert max(sizes) <= max(2, -(-n // cores)) + 1
-    assert [len(lot.specs) for lot in lots.in_batches([group], lambda specs: None)] == [1] * n
+    assert [len(batch.specs) for batch in batching.in_batches([group], lambda specs: None)] == [1] * n
 
 
 def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_landed(monkeypatch):
@@ -122,7 +122,7 @@ def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_land
     fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("base",), starts=4, seconds=2.0)
     order, other = [], threading.Event()
 
-    def flown(setup, policies, specs, *_, progress, cold, **__):
+    def fly_once(setup, policies, specs, *_, progress, cold, **__):
         order.append("first" if cold else "other")
         if cold:
             progress(0.1)
@@ -131,44 +131,48 @@ def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_land
             assert other.wait(20.0)
         other.set()
         order.append("first landed" if cold else "other landed")
-        return [made_up.flight(0.1, spec=spec) for spec in specs]
+        return [fake_flights.flight(0.1, spec=spec) for spec in specs]
 
-    monkeypatch.setattr(lots, "lanes", lambda: 2)
+    monkeypatch.setattr(batching, "lanes", lambda: 2)
     monkeypatch.setattr(fleet_module, "lanes", lambda: 2)
-    monkeypatch.setattr(fleet_module, "fly_batch", flown)
+    monkeypatch.setattr(fleet_module, "fly_batch", fly_once)
     fleet.run()
     assert order[:2] == ["first", "other"]
 
 
 def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch):
     """Two flights of a scenario and a method are one program; a third one is left for itself."""
-    monkeypatch.setattr(lots, "LOT", 2)
-    monkeypatch.setattr(lots, "lanes", lambda: 1)
-    assert [len(lot.specs) for lot in fleet.lots(fleet.specs)] == [2, 2, 2, 2]
-    assert [len(lot.specs) for lot in fleet.lots(fleet.specs[:3])] == [2, 1]
-    assert [lot.compiles for lot in fleet.lots(fleet.specs)] == [True] * 4  # other disturbances: other programs
-    on_result, told = [], []
-    together = fleet.run(only=two_lots(fleet), on_result=on_result.append, progress=lambda done, n: told.append(done))
-    alone = {flight.spec: flight for flight in flights.flown}
-    assert [flight.spec for flight in together.flown] == two_lots(fleet)
-    assert sorted(len(lot) for lot in on_result) == [2, 2]
-    assert told == sorted(told)
-    assert told[-1] == 4
-    for flight in together.flown:
+    monkeypatch.setattr(batching, "FULL", 2)
+    monkeypatch.setattr(batching, "lanes", lambda: 1)
+    assert [len(batch.specs) for batch in fleet.make_batches(fleet.specs)] == [2, 2, 2, 2]
+    assert [len(batch.specs) for batch in fleet.make_batches(fleet.specs[:3])] == [2, 1]
+    assert [batch.compiles for batch in fleet.make_batches(fleet.specs)] == [
+        True
+    ] * 4  # other disturbances: other programs
+    on_result, message = [], []
+    together = fleet.run(
+        only=two_batches(fleet), on_result=on_result.append, progress=lambda done, n: message.append(done)
+    )
+    alone = {flight.spec: flight for flight in flights.flights}
+    assert [flight.spec for flight in together.flights] == two_batches(fleet)
+    assert sorted(len(batch) for batch in on_result) == [2, 2]
+    assert message == sorted(message)
+    assert message[-1] == 4
+    for flight in together.flights:
         other = alone[flight.spec]
         np.testing.assert_allclose(flight.log.p, other.log.p, atol=2e-4)
         assert [(e.t, e.kind) for e in flight.events] == [(e.t, e.kind) for e in other.events]
-        assert (flight.learnt is None) == (other.learnt is None)
+        assert (flight.learner_state is None) == (other.learner_state is None)
 
 
 def test_flights_that_are_forgotten_have_landed(fleet, flights, monkeypatch):
-    monkeypatch.setattr(lots, "LOT", 2)
-    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    monkeypatch.setattr(batching, "FULL", 2)
+    monkeypatch.setattr(batching, "lanes", lambda: 1)
     on_result = []
-    gone = fleet.run(only=two_lots(fleet), on_result=on_result.extend, forget=True)
-    assert gone.flown == []
-    assert not gone.interrupted
-    assert {flight.spec for flight in on_result} == set(two_lots(fleet))
+    loss = fleet.run(only=two_batches(fleet), on_result=on_result.extend, forget=True)
+    assert loss.flights == []
+    assert not loss.interrupted
+    assert {flight.spec for flight in on_result} == set(two_batches(fleet))
 
 
 def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
@@ -176,8 +180,8 @@ def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
     scenario = Scenario("push=-8", plant="simple")
     down = Fleet(fleet.preset, fleet.policies, [scenario], methods=("base",), starts=2, seconds=2.0)
     with ThreadPoolExecutor(1) as pool:
-        alone = down.run(pool).flown
-    together = down.run().flown
+        alone = down.run(pool).flights
+    together = down.run().flights
     assert any(flight.log.terminated for flight in alone)
     for flight, other in zip(together, alone, strict=True):
         assert flight.log.terminated == other.log.terminated
@@ -187,41 +191,41 @@ def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
 def test_a_lot_with_an_odd_flight_is_flown_one_by_one(fleet, flights, monkeypatch):
     """The first two of a lot look alike; all of them are looked at before they fly."""
 
-    looked = []
+    look = []
 
     def alike(plants, pilots):
-        looked.append(len(plants))
-        return len(looked) == 1  # when it is planned, not when it is flown
+        look.append(len(plants))
+        return len(look) == 1  # when it is planned, not when it is flown
 
-    monkeypatch.setattr(lots, "lanes", lambda: 1)
+    monkeypatch.setattr(batching, "lanes", lambda: 1)
     monkeypatch.setattr(flying, "can_fly_together", alike)
     part = [spec for spec in fleet.specs if spec.method == "base"][:2]
-    alone = {flight.spec: flight for flight in flights.flown}
-    flown = fleet.run(only=part).flown
-    assert looked == [2, 2]
-    assert [flight.spec for flight in flown] == part
-    for flight in flown:
+    alone = {flight.spec: flight for flight in flights.flights}
+    trajectory = fleet.run(only=part).flights
+    assert look == [2, 2]
+    assert [flight.spec for flight in trajectory] == part
+    for flight in trajectory:
         np.testing.assert_array_equal(flight.log.p, alone[flight.spec].log.p)
 
 
 def test_progress_counts_the_flights_that_are_over(fleet):
-    told = []
+    message = []
     part = fleet.specs[:3]
     with ThreadPoolExecutor(1) as pool:
-        flown = fleet.run(pool, only=part, progress=lambda done, n: told.append((done, n)))
-    assert told == [(1, 3), (2, 3), (3, 3)]
-    assert [flight.spec for flight in flown.flown] == part
+        flight = fleet.run(pool, only=part, progress=lambda done, n: message.append((done, n)))
+    assert message == [(1, 3), (2, 3), (3, 3)]
+    assert [flight.spec for flight in flight.flights] == part
 
 
 def test_progress_of_a_lot_is_told_before_it_lands(fleet, monkeypatch):
     monkeypatch.setattr(gathering, "OFTEN", 0.001)
-    monkeypatch.setattr(lots, "lanes", lambda: 1)
-    told = []
+    monkeypatch.setattr(batching, "lanes", lambda: 1)
+    message = []
     part = [spec for spec in fleet.specs if spec.method == "full"][:2]
-    fleet.run(only=part, progress=lambda done, n: told.append(done))
-    assert told == sorted(told)
-    assert any(0.0 < done < 2.0 for done in told)
-    assert told[-1] == 2
+    fleet.run(only=part, progress=lambda done, n: message.append(done))
+    assert message == sorted(message)
+    assert any(0.0 < done < 2.0 for done in message)
+    assert message[-1] == 2
 
 
 @pytest.mark.parametrize("by", ["event", "ctrl-c"])
@@ -233,20 +237,20 @@ def test_an_interruption_keeps_what_was_flown(fleet, by):
             stop.set() if by == "event" else signal.raise_signal(signal.SIGINT)
 
     with ThreadPoolExecutor(1) as pool:
-        found = fleet.run(pool, stop=stop, progress=progress)
+        result = fleet.run(pool, stop=stop, progress=progress)
     assert stop.is_set()
-    assert found.interrupted
-    assert 2 <= len(found.flown) < 8
-    assert [flight.spec for flight in found.flown] == fleet.specs[: len(found.flown)]
-    assert sum(row["n"] for row in found.rows()) == len(found.flown)
-    assert fleet.run(stop=stop).flown == []
+    assert result.interrupted
+    assert 2 <= len(result.flights) < 8
+    assert [flight.spec for flight in result.flights] == fleet.specs[: len(result.flights)]
+    assert sum(row["n"] for row in result.rows()) == len(result.flights)
+    assert fleet.run(stop=stop).flights == []
 
 
 def test_a_plant_that_fails_ends_the_fleet(fleet, monkeypatch):
-    def broken(setup, policy, spec, *rest, **more):
+    def break_policy(setup, policy, spec, *rest, **more):
         raise PlantError(f"no plant for {spec.method}")
 
-    monkeypatch.setattr(fleet_module, "fly_one", broken)
+    monkeypatch.setattr(fleet_module, "fly_one", break_policy)
     with ThreadPoolExecutor(1) as pool, pytest.raises(PlantError, match="no plant for"):
         fleet.run(pool)
 
@@ -302,24 +306,24 @@ def test_a_crash_says_why(fleet, off, why):
 
 def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
     """Flown by itself, in a lot, or as a job elsewhere."""
-    preset, told = brief_preset(), []
+    preset, message = brief_preset(), []
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(jax.random.key(0))
     state = setup.learner.init(policy, jax.random.key(1))
     fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("full",), starts=2, seconds=1.2, state=state)
 
     def flies(kind, answer):
-        def flown(*_, state=None, **__):
-            told.append((kind, state))
+        def fly_once(*_, state=None, **__):
+            message.append((kind, state))
             return answer
 
-        return flown
+        return fly_once
 
     for module in (fleet_module, jobs):
         monkeypatch.setattr(module, "fly_batch", flies("lot", []))
-        monkeypatch.setattr(module, "fly_one", flies("one", made_up.flight(0.1)))
-    for lot in (*fleet.lots(fleet.specs), *fleet.lots(fleet.specs[:1])):
-        fleet._fly(lot, lambda share: None, threading.Event())
-        jobs.fly_job(fleet._job(lot.specs, True))
-    assert [kind for kind, _ in told] == ["lot", "lot", "one", "one"]
-    assert all(each is state for _, each in told)
+        monkeypatch.setattr(module, "fly_one", flies("one", fake_flights.flight(0.1)))
+    for batch in (*fleet.make_batches(fleet.specs), *fleet.make_batches(fleet.specs[:1])):
+        fleet._fly(batch, lambda share: None, threading.Event())
+        jobs.fly_job(fleet._job(batch.specs, True))
+    assert [kind for kind, _ in message] == ["lot", "lot", "one", "one"]
+    assert all(each is state for _, each in message)

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
+from fake_flights import Watching
 from helpers import brief_preset
-from made_up import Watching
 from retrim import CheckpointError, Scenario, Setup
 from retrim.evaluation.flight_groups import FLIGHTS, clear_flights
 from retrim.evaluation.study import Study, fly_all
@@ -25,11 +25,11 @@ def study():
     return Study(preset, policies, ())
 
 
-def flown(study, folder, *, methods=("base", "indi"), reporter=None, starts=2):
+def fly_once(study, folder, *, methods=("base", "indi"), reporter=None, starts=2):
     """Fly in a folder as a new run; return the flights, and how many groups were there before."""
     run = Run("test", folder)
-    told = Silent() if reporter is None else reporter
-    flights = fly_all(study, [CALM, PUSH], run, told, methods=methods, starts=starts, seconds=1.0)
+    message = Silent() if reporter is None else reporter
+    flights = fly_all(study, [CALM, PUSH], run, message, methods=methods, starts=starts, seconds=1.0)
     return flights, run.reused
 
 
@@ -41,7 +41,7 @@ def bits(flights):
 
 @pytest.fixture(scope="module")
 def whole(study, tmp_path_factory):
-    return flown(study, tmp_path_factory.mktemp("whole"))[0].flown
+    return fly_once(study, tmp_path_factory.mktemp("whole"))[0].flights
 
 
 def test_a_file_of_flights_is_the_flights(whole, tmp_path):
@@ -56,34 +56,34 @@ def test_an_interrupted_table_flies_what_is_left_and_is_the_same(study, whole, t
     stop = Run("test", tmp_path)
     watching = Watching(lambda share: share >= 0.5 and stop.stop.set())
     some = fly_all(study, [CALM, PUSH], stop, watching, methods=("base", "indi"), starts=2, seconds=1.0)
-    kept = list((tmp_path / FLIGHTS).iterdir())
+    rest = list((tmp_path / FLIGHTS).iterdir())
     assert some.interrupted
-    assert 0 < len(kept) < 4
+    assert 0 < len(rest) < 4
     watching = Watching()
-    flights, earlier = flown(study, tmp_path, reporter=watching)
-    assert earlier == len(kept)
+    flights, earlier = fly_once(study, tmp_path, reporter=watching)
+    assert earlier == len(rest)
     assert not flights.interrupted
-    assert bits(flights.flown) == bits(whole)
+    assert bits(flights.flights) == bits(whole)
     watching = Watching()
-    flights, earlier = flown(study, tmp_path, reporter=watching)
-    assert (earlier, watching.told) == (4, [])
-    assert bits(flights.flown) == bits(whole)
+    flights, earlier = fly_once(study, tmp_path, reporter=watching)
+    assert (earlier, watching.messages) == (4, [])
+    assert bits(flights.flights) == bits(whole)
 
 
 def test_only_the_same_is_taken_and_nothing_once_it_is_forgotten(study, tmp_path, monkeypatch):
-    taken = lambda study=study, **how: flown(study, tmp_path, **how)[1]  # noqa: E731
-    assert taken(methods=("base",)) == 0
-    assert taken(methods=("indi", "base")) == 2
-    assert taken(methods=("base", "base")) == 2
-    assert taken(starts=3) == 0
-    assert taken(Study(study.preset, {0: study.policies[0], 1: study.policies[0]}, ())) == 0
-    assert taken(Study(brief_preset(adapt={"update_every": 0.4}), study.policies, ())) == 0
+    extract = lambda study=study, **how: fly_once(study, tmp_path, **how)[1]  # noqa: E731
+    assert extract(methods=("base",)) == 0
+    assert extract(methods=("indi", "base")) == 2
+    assert extract(methods=("base", "base")) == 2
+    assert extract(starts=3) == 0
+    assert extract(Study(study.preset, {0: study.policies[0], 1: study.policies[0]}, ())) == 0
+    assert extract(Study(brief_preset(adapt={"update_every": 0.4}), study.policies, ())) == 0
     for path in (tmp_path / FLIGHTS).iterdir():
         path.write_bytes(path.read_bytes()[:1000])
-    assert taken() == 0
-    assert taken() == 4
+    assert extract() == 0
+    assert extract() == 4
     monkeypatch.setattr(provenance, "code", lambda: "changed")
-    assert taken() == 0
+    assert extract() == 0
     clear_flights(Run("test", tmp_path))
     assert not (tmp_path / FLIGHTS).exists()
-    assert taken() == 0
+    assert extract() == 0

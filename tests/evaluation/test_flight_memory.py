@@ -48,11 +48,13 @@ def state(setup, policy):
     return dataclasses.replace(fresh, residual=residual)
 
 
-def flight(learnt, terminated=False):
+def flight(learner_state, terminated=False):
     """A flight of two rows with a learner state at its end."""
     states = States(np.zeros((2, 3)), np.stack([np.eye(3)] * 2), np.zeros((2, 3)))
     log = Log(np.array([0.0, 0.02]), states, states, np.zeros((2, 4)), 0.02, terminated)
-    return Flight(FlightSpec(Scenario(), "full", 0), "small", log, np.zeros(2), "error", 0.02, learnt=learnt)
+    return Flight(
+        FlightSpec(Scenario(), "full", 0), "small", log, np.zeros(2), "error", 0.02, learner_state=learner_state
+    )
 
 
 def at_goal(setup, state):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from made_up import flight
+from fake_flights import flight
 from retrim.evaluation import rows
 from retrim.evaluation.flight_table import figure_cells, figure_columns, millimetres
 
@@ -35,8 +35,8 @@ def test_the_worst_moment_and_the_settling_time_stand_beside_the_error():
     error[:100], error[300] = 0.5, 0.03  # 2 s to the goal, and a push at 6 s
     assert figure_cells(rows([flight(error)])[0]) == ("1.0", "30.0", "2.0")
     assert figure_cells(rows([flight(0.2)])[0]) == ("200", "200", "never")
-    crashed = figure_cells(rows([flight(0.2, terminated=True)])[0])
-    assert crashed == ("crashed, 1 of 1", "-", "-")
+    crashes = figure_cells(rows([flight(0.2, terminated=True)])[0])
+    assert crashes == ("crashed, 1 of 1", "-", "-")
 
 
 def test_the_columns_state_the_time_of_the_worst_moment():

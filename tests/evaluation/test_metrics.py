@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from made_up import DT, flight, log
+from fake_flights import DT, flight, log
 from retrim import Scenario
 from retrim.evaluation import rows
 from retrim.evaluation.metrics import cell, interval, mean_and_deviation, metres
@@ -26,7 +26,7 @@ def test_the_error_is_over_the_last_seconds_and_no_others():
 def test_the_last_seconds_are_by_time_also_where_ticks_were_missed():
     t = np.delete(DT * np.arange(501), np.arange(410, 460))  # a second without measurements
     error = np.where(t > 8.0 + 1e-6, 1.0, 100.0)
-    assert flight(error, flown=log(t=t)).steady == pytest.approx(1.0)
+    assert flight(error, flight=log(t=t)).steady == pytest.approx(1.0)
 
 
 def test_the_peak_is_the_largest_error_after_five_seconds():
@@ -48,27 +48,27 @@ def test_a_flight_has_settled_once_its_error_stays_small():
 
 
 def test_a_terminated_flight_has_no_score():
-    crashed = flight(0.001, terminated=True)
-    assert np.isnan(crashed.steady)
-    assert crashed.peak == np.inf
-    assert crashed.settle_s == np.inf
+    crashes = flight(0.001, terminated=True)
+    assert np.isnan(crashes.steady)
+    assert crashes.peak == np.inf
+    assert crashes.settle_s == np.inf
 
 
 def test_the_mean_is_over_whole_flights_and_the_median_counts_a_terminated_one_as_infinite():
-    found = [flight(0.1), flight(0.3), flight(0.01, terminated=True)]
-    (row,) = rows(found)
+    result = [flight(0.1), flight(0.3), flight(0.01, terminated=True)]
+    (row,) = rows(result)
     assert (row["n"], row["crashes"]) == (3, 1)
     assert row["mean"] == pytest.approx(0.2)
     assert row["std"] == pytest.approx(np.std([0.1, 0.3], ddof=1))
     assert row["median"] == pytest.approx(0.3)  # of 0.1, 0.3, infinity
     assert row["errors"] == [pytest.approx(0.1), pytest.approx(0.3), None]
     assert cell(row) == "0.200 ± 0.141, 1 of 3 crashed"
-    (row,) = rows([found[0], found[2], found[2]])
+    (row,) = rows([result[0], result[2], result[2]])
     assert row["median"] is None
     assert row["peak_after_5s"] is None
-    (row,) = rows(found[2:])
+    (row,) = rows(result[2:])
     assert (row["mean"], row["std"], cell(row)) == (None, None, "crashed, 1 of 1")
-    (row,) = rows(found[:1])
+    (row,) = rows(result[:1])
     assert (row["std"], cell(row)) == (None, "0.100")
 
 
@@ -79,11 +79,11 @@ def test_one_row_for_each_scenario_and_method_and_for_each_seed_if_asked():
         for method in ("base", "full")
         for seed in (4, 5)
     ]
-    found = [flight(float(i), spec=spec) for i, spec in enumerate(specs)]
-    assert [(row["disturbance"], row["method"], row["mean"]) for row in rows(found)] == [
+    result = [flight(float(i), spec=spec) for i, spec in enumerate(specs)]
+    assert [(row["disturbance"], row["method"], row["mean"]) for row in rows(result)] == [
         ("none", "base", 0.5), ("none", "full", 2.5), ("wind=3", "base", 4.5), ("wind=3", "full", 6.5)
     ]  # fmt: skip
-    by_seed = rows(found, by_seed=True)
+    by_seed = rows(result, by_seed=True)
     assert [(row["seed"], row["mean"]) for row in by_seed] == [(4 + i % 2, float(i)) for i in range(8)]
 
 
@@ -95,21 +95,21 @@ def test_cross_track_is_a_mean_over_the_last_seconds_too():
 
 
 def test_rows_become_a_table_where_pandas_is_installed(monkeypatch):
-    found = rows([flight(0.1), flight(0.3)])
+    result = rows([flight(0.1), flight(0.3)])
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pandas"):
-        found.to_pandas()
+        result.to_pandas()
     monkeypatch.undo()
     pytest.importorskip("pandas")
-    table = found.to_pandas()
+    table = result.to_pandas()
     assert list(table["mean"]) == [pytest.approx(0.2)]
-    assert list(table.columns) == list(found[0])
+    assert list(table.columns) == list(result[0])
 
 
 @pytest.mark.parametrize(
-    ("late_s", "lap", "found"), [(0.1, 6.0, 0.1), (2.2, 6.0, 2.2), (-0.4, 6.0, -0.4), (1.9, 2.0, -0.1)]
+    ("late_s", "lap", "result"), [(0.1, 6.0, 0.1), (2.2, 6.0, 2.2), (-0.4, 6.0, -0.4), (1.9, 2.0, -0.1)]
 )
-def test_a_flight_that_is_late_is_found_to_be_late(late_s, lap, found):
+def test_a_flight_that_is_late_is_found_to_be_late(late_s, lap, result):
     """A circle flown late: nothing is left of the error but for that; of shifts a lap apart the smallest is told."""
     t = DT * np.arange(1001)
 
@@ -117,34 +117,34 @@ def test_a_flight_that_is_late_is_found_to_be_late(late_s, lap, found):
         angle = 2.0 * np.pi * t / lap
         return np.stack([np.cos(angle), np.sin(angle), np.ones_like(t)], axis=1)
 
-    flown = log(20.0)
-    true = States(path(t - late_s), *flown.true[1:])
-    late = flight(1.0, flown=flown._replace(true=true), cross=np.zeros(1001), steady_seconds=10.0)
+    trajectory = log(20.0)
+    true = States(path(t - late_s), *trajectory.true[1:])
+    late = flight(1.0, flight=trajectory._replace(true=true), cross=np.zeros(1001), steady_seconds=10.0)
     late = dataclasses.replace(late, target=path(t))
     behind, error = late.behind
-    assert behind == pytest.approx(found)
+    assert behind == pytest.approx(result)
     assert error == pytest.approx(0.0, abs=1e-9)
     assert dataclasses.replace(late, cross=None).behind is None  # it follows nothing
 
 
 def test_of_shifts_a_lap_apart_the_smallest_is_told_whatever_else_the_flight_is_off():
     """A flight in step, and off by what repeats with each lap: a shift by a lap is no better."""
-    t, flown = DT * np.arange(1001), log(20.0)
+    t, trajectory = DT * np.arange(1001), log(20.0)
     angle = 2.0 * np.pi * t / 3.0
     path = np.stack([np.cos(angle), np.sin(angle), np.ones_like(t)], axis=1)
     off = np.stack([np.zeros_like(t), np.zeros_like(t), 0.2 + 0.1 * np.sin(angle + 0.4)], axis=1)
-    true = States(path + off, *flown.true[1:])
-    made = flight(1.0, flown=flown._replace(true=true), cross=np.zeros(1001), steady_seconds=10.0)
-    behind, error = dataclasses.replace(made, target=path).behind
+    true = States(path + off, *trajectory.true[1:])
+    setup = flight(1.0, flight=trajectory._replace(true=true), cross=np.zeros(1001), steady_seconds=10.0)
+    behind, error = dataclasses.replace(setup, target=path).behind
     assert behind == 0.0
-    assert error == made.steady  # over all of the last seconds, not over those that can be compared
+    assert error == setup.steady  # over all of the last seconds, not over those that can be compared
 
 
 def test_effort_is_that_of_the_commands():
-    flown = log(10.0)
-    u = np.array(flown.u)
+    trajectory = log(10.0)
+    u = np.array(trajectory.u)
     u[::2, 1], u[1::2, 1] = 0.3, -0.3
-    rates, change = flight(0.0, flown=flown._replace(u=u)).effort
+    rates, change = flight(0.0, flight=trajectory._replace(u=u)).effort
     assert (rates, change) == pytest.approx((0.3, 0.6))
 
 

@@ -13,9 +13,9 @@ from retrim.runkit.run import Run
 
 @pytest.fixture
 def outlet(tmp_path):
-    made = Outlet(tmp_path / "out")
-    made.spare = tmp_path / "full", tmp_path / "spare"
-    return made
+    setup = Outlet(tmp_path / "out")
+    setup.spare = tmp_path / "full", tmp_path / "spare"
+    return setup
 
 
 def test_what_can_be_written_is_where_it_should_be(outlet):
@@ -67,6 +67,6 @@ def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left on device") as raised:
+    with pytest.raises(OSError, match="No space left on device") as error_info:
         write_whole(tmp_path / "a", "1")
-    assert raised.value.filename == str(tmp_path / "a")
+    assert error_info.value.filename == str(tmp_path / "a")

@@ -8,12 +8,12 @@ import jax
 import numpy as np
 import pytest
 
+from fake_flights import DT, flight, log
 from helpers import brief_preset
-from made_up import DT, flight, log
 from retrim import Event, LoraPolicy, Scenario, Setup
 from retrim.evaluation.metrics import failed_record, notes, summary
 from retrim.io.logs.viewers import can_record
-from retrim.io.trained import load_learner_state, load_policy
+from retrim.io.policies import load_learner_state, load_policy
 from retrim.runkit import FlightSpec, Run, outputs
 
 SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full") for start in (0, 1)]
@@ -24,7 +24,7 @@ def setup():
     return Setup.from_preset(brief_preset())
 
 
-def learnt(setup, seed, low_rank=False):
+def make_learner_state(setup, seed, low_rank=False):
     policy = setup.new_policy(jax.random.key(seed))
     if low_rank:
         policy = setup.low_rank(policy, jax.random.key(seed))
@@ -52,31 +52,34 @@ def test_events_are_lines_that_tell_their_flight(tmp_path):
 def test_a_recording_shows_the_command_that_followed_a_measurement(tmp_path):
     """Row i of a log has the command of the tick that ended there; a recording has that which began there."""
     t = DT * np.arange(6)
-    flown = log(t=t)
+    trajectory = log(t=t)
     u = np.arange(24.0).reshape(6, 4)
-    true = flown.true._replace(p=np.arange(18.0).reshape(6, 3))
-    made = flight(0.1, flown=flown._replace(u=u, true=true, age=0.01, terminated=True))
-    made = dataclasses.replace(made, target=np.ones((6, 3)))
-    found = outputs.recording_of(made)
-    np.testing.assert_array_equal(found.command, [*u[1:], u[-1]])
-    np.testing.assert_array_equal(found.true[:, :3], true.p)
-    np.testing.assert_array_equal(found.measured[:, :3], 0.0)
-    np.testing.assert_array_equal(found.true[:, 3:12].reshape(-1, 3, 3), np.tile(np.eye(3), (6, 1, 1)))
-    np.testing.assert_array_equal(found.age, 0.01)
-    np.testing.assert_array_equal(found.error, 0.1)
-    np.testing.assert_array_equal(found.target, 1.0)
-    assert found.terminated
+    true = trajectory.true._replace(p=np.arange(18.0).reshape(6, 3))
+    setup = flight(0.1, flight=trajectory._replace(u=u, true=true, age=0.01, terminated=True))
+    setup = dataclasses.replace(setup, target=np.ones((6, 3)))
+    result = outputs.recording_of(setup)
+    np.testing.assert_array_equal(result.command, [*u[1:], u[-1]])
+    np.testing.assert_array_equal(result.true[:, :3], true.p)
+    np.testing.assert_array_equal(result.measured[:, :3], 0.0)
+    np.testing.assert_array_equal(result.true[:, 3:12].reshape(-1, 3, 3), np.tile(np.eye(3), (6, 1, 1)))
+    np.testing.assert_array_equal(result.age, 0.01)
+    np.testing.assert_array_equal(result.error, 0.1)
+    np.testing.assert_array_equal(result.target, 1.0)
+    assert result.terminated
 
 
 def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
     """Not of one that crashed, nor of one that does not learn; a low-rank policy leaves its delta."""
-    states = [learnt(setup, seed) for seed in range(4)]
+    states = [make_learner_state(setup, seed) for seed in range(4)]
     brief = partial(flight, 0.1, seconds=0.2)
     flights = [
         brief(spec=SPECS[0]), brief(spec=SPECS[2], terminated=True), brief(spec=SPECS[3]),
         brief(spec=dataclasses.replace(SPECS[3], start=2)),
     ]  # fmt: skip
-    flights = [flights[0], *(dataclasses.replace(f, learnt=s) for f, s in zip(flights[1:], states, strict=False))]
+    flights = [
+        flights[0],
+        *(dataclasses.replace(f, learner_state=s) for f, s in zip(flights[1:], states, strict=False)),
+    ]
     outputs.write_flights(flights, setup.preset, tmp_path)
     policy, preset = load_policy(tmp_path / "adapted.safetensors")
     assert preset == setup.preset
@@ -88,8 +91,8 @@ def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
     assert names == ["base_seed4_start0.npz", "full_seed4_start0.npz", "full_seed4_start1.npz", "full_seed4_start2.npz"]
     if can_record(tmp_path / "flight.mcap"):
         assert len(list((tmp_path / "logs").glob("*.mcap"))) == 4
-    low = dataclasses.replace(flights[2], learnt=learnt(setup, 0, low_rank=True))
-    assert isinstance(low.learnt.policy.policy, LoraPolicy)
+    low = dataclasses.replace(flights[2], learner_state=make_learner_state(setup, 0, low_rank=True))
+    assert isinstance(low.learner_state.policy.policy, LoraPolicy)
     outputs.write_flights([low], setup.preset, tmp_path)
     assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [
         "delta.safetensors",
@@ -106,35 +109,37 @@ def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
 def test_a_trained_policy_is_written_with_its_results(setup, tmp_path):
     policy = setup.new_policy(jax.random.key(7))
     for error, more in ((None, {}), (0.25, {"nominal_error_m": 0.25})):
-        path = outputs.write_trained(Run("test", tmp_path), setup, policy, [3.0, 2.0, 1.5], seed=7, error_m=error)
+        path = outputs.write_trained_policy(
+            Run("test", tmp_path), setup, policy, [3.0, 2.0, 1.5], seed=7, error_m=error
+        )
         assert path == tmp_path / "policy.safetensors"
-        found = json.loads((tmp_path / "results.json").read_text())
-        assert found["rows"] == [
+        result = json.loads((tmp_path / "results.json").read_text())
+        assert result["rows"] == [
             {"task": "hover", "preset": setup.preset.name, "updates": 3, "envs": 2, "loss": 1.5} | more
         ]
-        assert (found["seeds"], found["losses"]) == ([7], [3.0, 2.0, 1.5])
-    loaded, _ = load_policy(path)
-    np.testing.assert_array_equal(weights(loaded)[0], weights(policy)[0])
+        assert (result["seeds"], result["losses"]) == ([7], [3.0, 2.0, 1.5])
+    loaded_policy, _ = load_policy(path)
+    np.testing.assert_array_equal(weights(loaded_policy)[0], weights(policy)[0])
 
 
 def test_notes_tell_crashes_and_that_nothing_took_effect(setup):
     """With the time at which the first update could have."""
     last = Event(3.0, "terminated", "below -0.5 m")
-    crashed = flight(3.0, spec=SPECS[1], terminated=True, seconds=3.0, events=[last])
-    assert notes([flight(0.1), crashed], setup.preset) == ["crashed: base, start 1, after 3.00 s: below -0.5 m"]
-    idle = dataclasses.replace(flight(0.1, spec=SPECS[2]), learnt=learnt(setup, 0))
+    crashes = flight(3.0, spec=SPECS[1], terminated=True, seconds=3.0, events=[last])
+    assert notes([flight(0.1), crashes], setup.preset) == ["crashed: base, start 1, after 3.00 s: below -0.5 m"]
+    idle = dataclasses.replace(flight(0.1, spec=SPECS[2]), learner_state=make_learner_state(setup, 0))
     a = setup.preset.adapt
-    said = f"no policy update took effect; with fixed latencies the first one comes at {a.update_every + 0.2:g} s"
-    assert notes([idle], setup.preset) == [said]
-    swapped = flight(0.1, spec=SPECS[2], events=[Event(1.0, "policy", "")])
-    assert notes([dataclasses.replace(swapped, learnt=idle.learnt), idle], setup.preset) == []
+    text = f"no policy update took effect; with fixed latencies the first one comes at {a.update_every + 0.2:g} s"
+    assert notes([idle], setup.preset) == [text]
+    swap = flight(0.1, spec=SPECS[2], events=[Event(1.0, "policy", "")])
+    assert notes([dataclasses.replace(swap, learner_state=idle.learner_state), idle], setup.preset) == []
 
 
 def test_a_flight_whose_job_failed_is_counted_and_says_nothing_of_the_method():
-    lost = failed_record(SPECS[0], "small", "steady_error_m", "OSError: gone")
-    assert (lost["method"], lost["start"], lost["seed"], lost["vehicle"]) == ("base", 0, 4, "small")
-    assert (lost["crashed"], lost["failed"], lost["error"]) == (False, "OSError: gone", None)
-    row = summary([lost, lost])
+    gap = failed_record(SPECS[0], "small", "steady_error_m", "OSError: gone")
+    assert (gap["method"], gap["start"], gap["seed"], gap["vehicle"]) == ("base", 0, 4, "small")
+    assert (gap["crashed"], gap["failed"], gap["error"]) == (False, "OSError: gone", None)
+    row = summary([gap, gap])
     assert (row["n"], row["crashes"], row["failures"], row["mean"]) == (2, 0, ["OSError: gone"] * 2, None)
     assert (row["disturbance"], row["plant"], row["metric"]) == ("none", "bem", "steady_error_m")
     assert "reference" not in row  # a hover flight has none

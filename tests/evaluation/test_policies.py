@@ -11,70 +11,70 @@ from retrim.evaluation.policies import train_policies
 from retrim.evaluation.study import train_all
 from retrim.runkit import Run, provenance
 from retrim.runkit.reporter import Silent
-from retrim.runkit.training import Trained
+from retrim.runkit.training import TrainingResult
 
 
 @pytest.fixture
-def asked(monkeypatch):
+def requests(monkeypatch):
     """What was trained, in place of training it: preset and seed."""
-    found = []
+    result = []
 
     def train(setup, seed, *, reporter, stop):
-        found.append((setup.preset.name, seed))
-        return Trained(setup.new_policy(jax.random.key(seed)), [])
+        result.append((setup.preset.name, seed))
+        return TrainingResult(setup.new_policy(jax.random.key(seed)), [])
 
     monkeypatch.setattr(policies, "train", train)
-    return found
+    return result
 
 
 def same(one, other):
     return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
 
 
-def test_a_policy_is_trained_once_for_a_folder(tmp_path, asked, monkeypatch):
+def test_a_policy_is_trained_once_for_a_folder(tmp_path, requests, monkeypatch):
     preset = tiny_preset()
-    first = train_policies(preset, (3, 0), Run("test", tmp_path / "a", trained=tmp_path), Silent())
-    again = train_policies(preset, (0, 1, 3), Run("test", tmp_path / "b", trained=tmp_path), Silent())
+    first = train_policies(preset, (3, 0), Run("test", tmp_path / "a", policy_folder=tmp_path), Silent())
+    again = train_policies(preset, (0, 1, 3), Run("test", tmp_path / "b", policy_folder=tmp_path), Silent())
     assert (list(first), list(again)) == ([3, 0], [0, 1, 3])
-    assert asked == [(preset.name, seed) for seed in (3, 0, 1)]
+    assert requests == [(preset.name, seed) for seed in (3, 0, 1)]
     assert all(same(first[seed], again[seed]) for seed in first)
     assert not same(again[0], again[1])
     train_policies(tiny_preset(pretrain={"learning_rate": 0.5}), (0,), Run("test", tmp_path), Silent())
     monkeypatch.setattr(provenance, "code", lambda: "changed")
     train_policies(preset, (0,), Run("test", tmp_path), Silent())
-    assert asked[3:] == [(preset.name, 0)] * 2
+    assert requests[3:] == [(preset.name, 0)] * 2
     assert len(list((tmp_path / "policies").glob("*-seed0.safetensors"))) == 3
 
 
-def test_what_is_kept_is_flown_with_its_preset_and_what_is_damaged_is_trained_again(tmp_path, asked):
-    preset, run, reporter, said = tiny_preset(), Run("test", tmp_path), Silent(), []
-    reporter.say = said.append
-    trained = train_policies(preset, (0,), run, reporter)
+def test_what_is_kept_is_flown_with_its_preset_and_what_is_damaged_is_trained_again(tmp_path, requests):
+    preset, run, reporter, text = tiny_preset(), Run("test", tmp_path), Silent(), []
+    reporter.say = text.append
+    trained_policy = train_policies(preset, (0,), run, reporter)
     (path,) = (tmp_path / "policies").iterdir()
-    policy, flown = load_policy(path)
-    assert flown == preset
-    assert same(policy, trained[0])
+    policy, flight = load_policy(path)
+    assert flight == preset
+    assert same(policy, trained_policy[0])
     path.write_bytes(path.read_bytes()[:-40])
     assert same(train_policies(preset, (0,), run, reporter)[0], policy)
     assert same(load_policy(path)[0], policy)
-    assert len(asked) == 2
-    assert sum("made again" in line for line in said) == 1
+    assert len(requests) == 2
+    assert sum("made again" in line for line in text) == 1
 
 
-def test_an_interruption_keeps_what_was_complete(tmp_path, asked, monkeypatch):
+def test_an_interruption_keeps_what_was_complete(tmp_path, requests, monkeypatch):
     preset, run, whole = tiny_preset(), Run("test", tmp_path), policies.train
 
-    def stopped(setup, seed, *, reporter, stop):
+    def stop_run(setup, seed, *, reporter, stop):
         if seed == 1:
             stop.set()
         return whole(setup, seed, reporter=reporter, stop=stop)
 
-    monkeypatch.setattr(policies, "train", stopped)
+    monkeypatch.setattr(policies, "train", stop_run)
     assert list(train_policies(preset, (0, 1, 2), run, Silent())) == [0]
     monkeypatch.setattr(policies, "train", whole)
-    asked.clear()
+    requests.clear()
     study = train_all(preset, (0, 1, 2), Run("test", tmp_path), Silent())
-    assert asked == [(preset.name, 1), (preset.name, 2)]
+    assert requests == [(preset.name, 1), (preset.name, 2)]
     assert list(study.policies) == [0, 1, 2]
     assert all(np.isfinite(study.errors))
     assert len(study.errors) == 3

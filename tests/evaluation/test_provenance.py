@@ -18,7 +18,7 @@ from retrim.runkit.stopwatch import Stopwatch
 
 
 @pytest.mark.parametrize(
-    ("words", "kept"),
+    ("words", "rest"),
     [
         ("reproduce plants --out {here}/results --starts 2", "reproduce plants --starts 2"),
         ("demo --out={here}/d --seed=3", "demo --seed=3"),
@@ -27,15 +27,15 @@ from retrim.runkit.stopwatch import Stopwatch
         ("demo --out", "demo"),
     ],
 )
-def test_no_place_on_this_machine_is_recorded(words, kept, tmp_path):
-    assert command_line(words.format(here=tmp_path).split()) == f"retrim {kept}"
+def test_no_place_on_this_machine_is_recorded(words, rest, tmp_path):
+    assert command_line(words.format(here=tmp_path).split()) == f"retrim {rest}"
 
 
 def test_versions_are_those_of_what_is_installed():
-    found = versions()
-    assert {"retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python"} <= found.keys()
-    for name in found.keys() - {"python"}:
-        assert importlib.metadata.version(name) == found[name]
+    result = versions()
+    assert {"retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python"} <= result.keys()
+    for name in result.keys() - {"python"}:
+        assert importlib.metadata.version(name) == result[name]
 
 
 def test_programs_traced_inside_others_count_once():
@@ -50,17 +50,22 @@ def test_a_run_leaves_no_folder_until_it_writes(tmp_path, monkeypatch):
     run = Run("demo", tmp_path / "a" / "b")
     assert not list(tmp_path.iterdir())
     path = run.write_results([{"x": 1}], seeds=[3], losses=[0.5])
-    found = json.loads(path.read_text())
-    assert (found["command"], found["rows"], found["seeds"], found["losses"]) == ("retrim demo", [{"x": 1}], [3], [0.5])
-    assert (found["interrupted"], run.exit_code) == (False, 0)
+    result = json.loads(path.read_text())
+    assert (result["command"], result["rows"], result["seeds"], result["losses"]) == (
+        "retrim demo",
+        [{"x": 1}],
+        [3],
+        [0.5],
+    )
+    assert (result["interrupted"], run.exit_code) == (False, 0)
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="file: results cannot be written there"):
         Run("demo", tmp_path / "file")
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    Run("demo", kept)
-    assert kept.is_dir()
-    assert not list(kept.iterdir())
+    rest = tmp_path / "kept"
+    rest.mkdir()
+    Run("demo", rest)
+    assert rest.is_dir()
+    assert not list(rest.iterdir())
 
 
 def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
@@ -81,28 +86,28 @@ def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
 
 def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
     status = "status --porcelain -- :/src :/pyproject.toml"
-    said = {"rev-parse --short=12 HEAD": "abc", status: ""}
+    text = {"rev-parse --short=12 HEAD": "abc", status: ""}
 
     def run(words, **_):
-        asked = " ".join(words[3:])
+        calls = " ".join(words[3:])
         root = str(provenance.Path(provenance.__file__).resolve().parents[3])
-        if asked == "rev-parse --show-toplevel":
-            return subprocess.CompletedProcess(words, 0, stdout=f"{root if 'elsewhere' not in said else '/'}\n")
-        return subprocess.CompletedProcess(words, 0, stdout=f"{said[asked]}\n")
+        if calls == "rev-parse --show-toplevel":
+            return subprocess.CompletedProcess(words, 0, stdout=f"{root if 'elsewhere' not in text else '/'}\n")
+        return subprocess.CompletedProcess(words, 0, stdout=f"{text[calls]}\n")
 
     monkeypatch.setattr(provenance.subprocess, "run", run)
-    asked = provenance.commit.__wrapped__
-    assert asked() == "abc"
-    said[status] = " M file"
-    assert asked() == "abc-dirty"
-    said["elsewhere"] = ""
-    assert asked() == "unknown"  # a checkout of something else around an installed package
+    calls = provenance.commit.__wrapped__
+    assert calls() == "abc"
+    text[status] = " M file"
+    assert calls() == "abc-dirty"
+    text["elsewhere"] = ""
+    assert calls() == "unknown"  # a checkout of something else around an installed package
 
     def nothing(*_, **__):
         raise FileNotFoundError("git")
 
     monkeypatch.setattr(provenance.subprocess, "run", nothing)
-    assert asked() == "unknown"
+    assert calls() == "unknown"
 
 
 def test_code_is_told_apart_wherever_it_lies(tmp_path, monkeypatch):
@@ -118,12 +123,12 @@ def test_code_is_told_apart_wherever_it_lies(tmp_path, monkeypatch):
     (here / "__pycache__" / "one.pyc").write_bytes(b"1")
     (tmp_path / "beside.py").touch()
     assert code() == first
-    found = {first}
+    result = {first}
     for path, text in ((here / "one.py", "a = 2\n"), (tmp_path / "retrim" / "data.toml", "x = 2\n")):
         path.write_text(text)
-        found.add(code())
+        result.add(code())
     (here / "one.py").rename(here / "two.py")
-    assert len(found | {code()}) == 4
+    assert len(result | {code()}) == 4
 
 
 def test_a_page_says_what_it_was_made_by(monkeypatch):

@@ -16,7 +16,7 @@ from retrim_paper.tables.gauntlet import METRICS
 HOME = jnp.array([0.0, 0.0, 1.0])
 
 
-def found(error, changes, limit, **more):
+def find(error, changes, limit, **more):
     return recoveries(0.02 * np.arange(len(error)), np.asarray(error), changes, limit, **more)
 
 
@@ -43,15 +43,15 @@ def test_recovery_is_from_the_last_time_outside():
     """Outside until 1 s, and once more at 1.5 s; then a change at 2 s that lasts for half a second."""
     error = np.zeros(200)
     error[:50] = error[75] = error[100:125] = 0.1
-    np.testing.assert_allclose(found(error, [0.0, 2.0], 0.05), [1.52, 0.5])
-    np.testing.assert_allclose(found(error, [0.0, 2.0], 0.2), [0.0, 0.0])
-    np.testing.assert_allclose(found(error, [], 0.05), [2.5])
+    np.testing.assert_allclose(find(error, [0.0, 2.0], 0.05), [1.52, 0.5])
+    np.testing.assert_allclose(find(error, [0.0, 2.0], 0.2), [0.0, 0.0])
+    np.testing.assert_allclose(find(error, [], 0.05), [2.5])
 
 
 def test_who_stays_outside_or_crashes_has_not_recovered():
-    assert found(np.full(100, 0.1), [0.0, 1.0], 0.05) == [np.inf, np.inf]
-    assert found(np.zeros(100), [0.5], 0.05, terminated=True) == [np.inf]
-    assert found(np.zeros(10), [5.0], 0.05) == [np.inf]  # the flight ended before
+    assert find(np.full(100, 0.1), [0.0, 1.0], 0.05) == [np.inf, np.inf]
+    assert find(np.zeros(100), [0.5], 0.05, terminated=True) == [np.inf]
+    assert find(np.zeros(10), [5.0], 0.05) == [np.inf]  # the flight ended before
 
 
 def test_the_gauntlet_by_its_command(tmp_path, as_a_user, monkeypatch):

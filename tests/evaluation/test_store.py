@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fake_flights import flight
 from helpers import tiny_preset
-from made_up import flight
 from retrim import Scenario, Setup
 from retrim.runkit import FlightSpec
 from retrim.runkit.codecs import json_codec, policy_codec, rows_codec, section_codec, tree_codec
@@ -41,12 +41,12 @@ def leaves(value):
         return [*value]
     if isinstance(value, list) and hasattr(value[0], "log"):
         value = [(f.spec, f.vehicle, f.metric, f.log, f.error) for f in value]
-    found = []
+    result = []
     for leaf in jax.tree.leaves(value):
         if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.random.key_data(leaf)
-        found.append(np.asarray(leaf).tobytes() if isinstance(leaf, np.ndarray | jax.Array) else leaf)
-    return found
+        result.append(np.asarray(leaf).tobytes() if isinstance(leaf, np.ndarray | jax.Array) else leaf)
+    return result
 
 
 @pytest.fixture
@@ -67,9 +67,9 @@ def case(request, tmp_path):
 
 
 def store_in(folder, stop=None):
-    said, reporter = [], Silent()
-    reporter.say = said.append
-    return Store(folder, reporter=reporter, stop=stop), said
+    text, reporter = [], Silent()
+    reporter.say = text.append
+    return Store(folder, reporter=reporter, stop=stop), text
 
 
 every_kind = pytest.mark.parametrize("case", list(OTHERS), indirect=True)
@@ -78,11 +78,11 @@ every_kind = pytest.mark.parametrize("case", list(OTHERS), indirect=True)
 @every_kind
 def test_a_value_is_made_once_and_is_the_same_to_the_bit(case, tmp_path):
     codec, value = case
-    store, said = store_in(tmp_path / "store")
+    store, text = store_in(tmp_path / "store")
     first = store.get_or_make("folder/key", lambda: value, codec)
     again = store_in(tmp_path / "store")[0].get_or_make("folder/key", lambda: pytest.fail("made again"), codec)
     assert leaves(first) == leaves(again) == leaves(value)
-    assert said == []
+    assert text == []
     assert [path.name for path in (tmp_path / "store" / "folder").iterdir()] == [f"key{codec.suffix}"]
     assert store.get("folder/other", codec) is None
     store.remove("folder/key", codec)
@@ -98,7 +98,7 @@ class Executed:
 @every_kind
 def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_made_again(case, tmp_path, request):
     codec, value = case
-    store, said = store_in(tmp_path / "store")
+    store, text = store_in(tmp_path / "store")
     store.put("key", value, codec)
     path = store.path("key", codec)
     whole = path.read_bytes()
@@ -108,32 +108,32 @@ def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_made_again(case, t
     flipped = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
     for data in (whole[:-9], whole[:40], b"", flipped, pickle.dumps(Executed()), npz.read_bytes(), b"\xff\xfe{}\n"):
         path.write_bytes(data)
-        said.clear()
+        text.clear()
         assert leaves(store.get_or_make("key", lambda: value, codec)) == leaves(value)
         assert path.read_bytes() == whole
-        (line,) = said
+        (line,) = text
         assert str(path) in line
         assert line.endswith("made again")
         assert "\n" not in line
     kind = request.node.callspec.params["case"]
     foreign = {"flights": [flight(0.1, spec=spec) for spec in OTHER_SPECS], "json": {}, "section": {}}.get(kind, value)
     OTHERS[kind].write(path, foreign)
-    said.clear()
+    text.clear()
     assert store.get("key", codec) is None
-    assert len(said) == 1
+    assert len(text) == 1
 
 
 def test_a_section_is_made_again_if_its_picture_is_another(tmp_path):
     picture, codec = tmp_path / "x.png", section_codec(tmp_path)
     picture.write_bytes(b"drawn")
-    store, said = store_in(tmp_path)
+    store, text = store_in(tmp_path)
     store.put("key", (TableSection((), (), picture=picture), []), codec)
     assert store.get("key", codec) is not None
     picture.write_bytes(b"of another table")
     assert store.get("key", codec) is None
     picture.unlink()
     assert store.get("key", codec) is None
-    assert len(said) == 2
+    assert len(text) == 2
 
 
 def test_what_a_stop_leaves_incomplete_is_returned_but_not_stored(tmp_path):
@@ -160,10 +160,10 @@ def test_a_folder_of_an_earlier_version_is_no_obstacle(tmp_path):
     for name in ("sections/0123456789abcdef.json", "sections/0123456789abcdef.done", "sections/flights/k.npz"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(json.dumps({"section": {}, "rows": []}))
-    store, said = store_in(tmp_path)
+    store, text = store_in(tmp_path)
     assert store.get("sections/0123456789abcdef", section_codec(tmp_path)) is None
     assert store.get("sections/flights/k", flight_codec(SPECS)) is None
-    assert len(said) == 2
+    assert len(text) == 2
     store.clear("sections/flights")
     assert {path.name for path in (tmp_path / "sections").iterdir()} == {"0123456789abcdef.json",
                                                                          "0123456789abcdef.done"}  # fmt: skip

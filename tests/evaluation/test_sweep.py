@@ -8,9 +8,9 @@ from pathlib import Path
 import jax
 import pytest
 
-from commands import OVERLAY, results, retrim, started
+from commands import OVERLAY, results, retrim, start_process
+from fake_flights import flight
 from helpers import brief_preset
-from made_up import flight
 from retrim import ConfigError, Fleet, Scenario, Setup
 from retrim.evaluation import policies, sweep
 from retrim.evaluation.executor import Flights
@@ -51,33 +51,33 @@ def folder(tmp_path_factory, as_a_user):
     return here
 
 
-def flown(folder):
+def fly_once(folder):
     path = folder / "flights.jsonl"
     return path.read_text().splitlines() if path.exists() else []
 
 
 def test_a_sweep_leaves_a_table_json_a_picture_policies_and_rows(folder):
-    found = results(folder / "whole", "sweep.json")
-    assert [(row["disturbance"], row["method"], row["n"]) for row in found["rows"]] == [
+    result = results(folder / "whole", "sweep.json")
+    assert [(row["disturbance"], row["method"], row["n"]) for row in result["rows"]] == [
         (*each, 2) for each in COMBINATIONS
     ]
-    assert found["seeds"] == [0, 1]
-    assert found["sweep"]["seconds"] == 1.2
+    assert result["seeds"] == [0, 1]
+    assert result["sweep"]["seconds"] == 1.2
     text = (folder / "whole" / "sweep.md").read_text()
     assert "| disturbance | method | error at the end [mm] | median [mm] | maximum [mm] | worst after 0.6" in text
     assert all(f"| {name} | {method} | {millimetres(row['mean'])} ±" in text
-               for (name, method), row in zip(COMBINATIONS, found["rows"], strict=True))  # fmt: skip
+               for (name, method), row in zip(COMBINATIONS, result["rows"], strict=True))  # fmt: skip
     assert "![sweep](sweep.png)" in text
     assert (folder / "whole" / "sweep.png").stat().st_size > 10_000
     assert len(list((folder / "whole" / "policies").iterdir())) == 2
-    assert len(flown(folder / "whole")) == 8
+    assert len(fly_once(folder / "whole")) == 8
 
 
 def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
-    process = started(("sweep", "sweep.toml", "--out", "cut"), folder, KILLED)
+    process = start_process(("sweep", "sweep.toml", "--out", "cut"), folder, KILLED)
     out, _ = process.communicate(timeout=180)
-    kept = flown(folder / "cut")
-    assert (process.returncode, 0 < len(kept) < 8) == (-signal.SIGKILL, True), out.decode()
+    rest = fly_once(folder / "cut")
+    assert (process.returncode, 0 < len(rest) < 8) == (-signal.SIGKILL, True), out.decode()
     assert not (folder / "cut" / "sweep.json").exists()
     policies = {path: path.stat().st_mtime_ns for path in (folder / "cut" / "policies").iterdir()}
     with (folder / "cut" / "flights.jsonl").open("a") as file:
@@ -88,9 +88,9 @@ def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
     assert out.count("flights.jsonl: unusable lines, 1;") == 1
     assert {path: path.stat().st_mtime_ns for path in (folder / "cut" / "policies").iterdir()} == policies
     assert results(folder / "cut", "sweep.json")["rows"] == results(folder / "whole", "sweep.json")["rows"]
-    again = flown(folder / "cut")
-    assert again[: len(kept)] == kept  # not flown twice
-    assert sorted(again) == sorted(flown(folder / "whole"))
+    again = fly_once(folder / "cut")
+    assert again[: len(rest)] == rest  # not flown twice
+    assert sorted(again) == sorted(fly_once(folder / "whole"))
 
 
 def test_a_sweep_that_is_done_flies_nothing_and_a_smaller_one_reports_its_own_flights(folder):
@@ -102,30 +102,30 @@ def test_a_sweep_that_is_done_flies_nothing_and_a_smaller_one_reports_its_own_fl
     (folder / "smaller.toml").write_text(smaller)
     out = retrim("sweep", "smaller.toml", "--out", "whole", cwd=folder)
     assert "flying" not in out
-    found = results(folder / "whole", "sweep.json")["rows"]
-    assert [(row["disturbance"], row["method"], row["n"]) for row in found] == [
+    result = results(folder / "whole", "sweep.json")["rows"]
+    assert [(row["disturbance"], row["method"], row["n"]) for row in result] == [
         ("wind=3", "base", 1), ("wind=3", "indi", 1)
     ]  # fmt: skip
-    rows = [json.loads(line) for line in flown(folder / "whole")]
+    rows = [json.loads(line) for line in fly_once(folder / "whole")]
     (mine,) = [r["error"] for r in rows if (r["seed"], r["disturbance"], r["method"]) == (1, "wind=3", "base")]
-    assert found[0]["mean"] == pytest.approx(mine)
+    assert result[0]["mean"] == pytest.approx(mine)
 
 
 def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_path, monkeypatch):
     """Those of other code, or of a file that has changed since, are made again."""
     monkeypatch.chdir(tmp_path)
     overlay = tomllib.loads(OVERLAY)["overlay"]
-    asked = Sweep(methods=("indi",), disturbances=("none",), plants=("simple",), seconds=1.0, overlay=overlay)
-    trained = []
+    calls = Sweep(methods=("indi",), disturbances=("none",), plants=("simple",), seconds=1.0, overlay=overlay)
+    trained_policy = []
     monkeypatch.setattr(sweep, "bars", lambda *_: None)
     monkeypatch.setattr(sweep, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / f"{stem}.svg"))
-    made = policies.train
-    monkeypatch.setattr(policies, "train", lambda *a, **k: trained.append(0) or made(*a, **k))
+    setup = policies.train
+    monkeypatch.setattr(policies, "train", lambda *a, **k: trained_policy.append(0) or setup(*a, **k))
 
     def fly():
-        trained.clear()
-        run_sweep(asked, Run("sweep", tmp_path / "out"), Silent())
-        return len(trained), len(flown(tmp_path / "out"))
+        trained_policy.clear()
+        run_sweep(calls, Run("sweep", tmp_path / "out"), Silent())
+        return len(trained_policy), len(fly_once(tmp_path / "out"))
 
     assert [fly(), fly()] == [(1, 1), (0, 1)]
     assert "An earlier run had made 1 of the parts" in (tmp_path / "out" / "sweep.md").read_text()
@@ -143,9 +143,9 @@ def test_a_vehicle_file_is_looked_up_beside_that_of_the_sweep(tmp_path):
     text = (Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml").read_text()
     (studies / "my.toml").write_text(text)
     (studies / "s.toml").write_text('vehicles = ["my.toml", "large"]\n[overlay]\nvehicle = "my.toml"\n')
-    found = read_sweep(studies / "s.toml")
-    assert [s.vehicle if isinstance(s.vehicle, str) else s.vehicle.mass for s in found.scenarios()] == [1.2, "large"]
-    assert found.overlay["vehicle"]["mass"] == 1.2
+    result = read_sweep(studies / "s.toml")
+    assert [s.vehicle if isinstance(s.vehicle, str) else s.vehicle.mass for s in result.scenarios()] == [1.2, "large"]
+    assert result.overlay["vehicle"]["mass"] == 1.2
     (studies / "s.toml").write_text('vehicles = ["none_such.toml"]\n')
     with pytest.raises(ConfigError, match=r"none_such\.toml"):
         read_sweep(studies / "s.toml")
@@ -153,34 +153,34 @@ def test_a_vehicle_file_is_looked_up_beside_that_of_the_sweep(tmp_path):
 
 def test_a_sweep_is_every_combination():
     sweep = Sweep(disturbances=("none", "wind"), plants=("bem", "simple"), sensors=("ideal", "mocap"))
-    found = sweep.scenarios()
-    assert len(set(found)) == 8
-    assert Scenario("wind", "simple", None, "mocap") in found
+    result = sweep.scenarios()
+    assert len(set(result)) == 8
+    assert Scenario("wind", "simple", None, "mocap") in result
 
 
 def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_path, monkeypatch):
     """Crashes are infinite in the bars and counted in the cells; a flight that failed elsewhere is in no bar."""
-    shown = []
+    display = []
 
     def draw(title, groups):
-        shown.append(groups)
+        display.append(groups)
 
     monkeypatch.setattr(sweep, "bars", draw)
     monkeypatch.setattr(sweep, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / f"{stem}.svg"))
-    asked = Sweep(seeds=(0, 1), methods=("base", "indi"), disturbances=("none", "large"), starts=2)
-    kept = []
-    for scenario in asked.scenarios():
-        for method in asked.methods:
+    calls = Sweep(seeds=(0, 1), methods=("base", "indi"), disturbances=("none", "large"), starts=2)
+    rest = []
+    for scenario in calls.scenarios():
+        for method in calls.methods:
             for k, error in enumerate((0.1, 0.2, 0.4, 0.1 if scenario.disturbance == "none" else None)):
                 spec = FlightSpec(scenario, method, k % 2, k // 2)
-                crashed = method == "base" and error is None
-                row = record(flight(0.1 if error is None else error, spec=spec, terminated=crashed))
+                crashes = method == "base" and error is None
+                row = record(flight(0.1 if error is None else error, spec=spec, terminated=crashes))
                 row |= {"error": error}  # a mean is one to rounding
                 if method == "indi" and error is None:
                     row |= {"failed": "OSError: gone"}
-                kept.append({"preset": "p", **row})
-    found = sweep._report(asked, kept, Run("test", tmp_path), Silent())
-    assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in found] == [
+                rest.append({"preset": "p", **row})
+    result = sweep._report(calls, rest, Run("test", tmp_path), Silent())
+    assert [(row["disturbance"], row["method"], row["n"], row["crashes"]) for row in result] == [
         ("none", "base", 4, 0), ("none", "indi", 4, 0), ("large", "base", 4, 1), ("large", "indi", 4, 0)
     ]  # fmt: skip
     text = (tmp_path / "sweep.md").read_text()
@@ -188,42 +188,42 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
     assert "| none | base | 200 ± 141 | 150 | 400 |" in text
     assert "| large | base | 233 ± 153, 1 of 4 crashed | 300 | crashed |" in text
     assert "| large | indi | 233 ± 153, 1 of 4 failed | 200 | 400 |" in text
-    assert results(tmp_path, "sweep.json")["rows"] == found
-    (bars,) = shown
+    assert results(tmp_path, "sweep.json")["rows"] == result
+    (bars,) = display
     assert bars == {
         "none": {"base": [0.1, 0.2, 0.4, 0.1], "indi": [0.1, 0.2, 0.4, 0.1]},
         "large": {"base": [0.1, 0.2, 0.4, float("inf")], "indi": [0.1, 0.2, 0.4]},
     }
-    one = [row for row in kept if row["disturbance"] == "large"]
+    one = [row for row in rest if row["disturbance"] == "large"]
     run = Run("test", tmp_path)
     run.reused = 3
-    sweep._report(asked, one, run, Silent())
+    sweep._report(calls, one, run, Silent())
     assert "An earlier run had made 3 of the parts" in (tmp_path / "sweep.md").read_text()
-    assert list(shown[1]) == ["large"]  # where nothing varies, the disturbance is the label
+    assert list(display[1]) == ["large"]  # where nothing varies, the disturbance is the label
 
 
 def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
     """The others of a sweep land; the run's exit code says that some did not."""
-    preset, said = brief_preset(), []
+    preset, text = brief_preset(), []
     policies = {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}
     fleet = Fleet(preset, policies, [Scenario(plant="simple")], methods=("base",), starts=2, seconds=1.2)
     reporter, run = Silent(), Run("test", tmp_path)
-    kept = sweep._FlightRows(run, reporter)
-    reporter.say = said.append
-    asked = []
+    rest = sweep._FlightRows(run, reporter)
+    reporter.say = text.append
+    calls = []
 
-    def flies(executor, *, stop, only, on_result, progress, by_lot, forget):
-        asked.append((executor, list(only), by_lot, forget))
+    def flies(executor, *, stop, only, on_result, progress, by_batch, forget):
+        calls.append((executor, list(only), by_batch, forget))
         on_result([flight(0.1, spec=spec) for spec in only[:1]])
         return Flights([], interrupted=False, failed=dict.fromkeys(only[1:], "OSError: gone"))
 
     monkeypatch.setattr(fleet, "run", flies)
     sweep._fly(
-        fleet, {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}, kept, run, reporter
+        fleet, {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}, rest, run, reporter
     )
     assert (run.failed, run.exit_code) == (True, 1)
-    assert said == ["1 flights failed elsewhere, the first by OSError: gone; the same command flies them"]
-    rows = [json.loads(line) for line in flown(tmp_path)]
+    assert text == ["1 flights failed elsewhere, the first by OSError: gone; the same command flies them"]
+    rows = [json.loads(line) for line in fly_once(tmp_path)]
     assert [(row["start"], row["failed"], row["preset"], row["vehicle"]) for row in rows] == [
         (0, None, preset.name, "small"), (1, "OSError: gone", preset.name, "small")
     ]  # fmt: skip
@@ -234,4 +234,4 @@ def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
         run,
         reporter,
     )
-    assert asked == [(None, fleet.specs, True, True), (None, fleet.specs[1:], True, True)]
+    assert calls == [(None, fleet.specs, True, True), (None, fleet.specs[1:], True, True)]

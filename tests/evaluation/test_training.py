@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fake_flights import Watching
 from helpers import brief_preset, tiny_preset
-from made_up import Watching
 from retrim import Setup
 from retrim.config.loading import changed
 from retrim.errors import JobError
@@ -29,9 +29,9 @@ def setup(as_a_user):
 def test_progress_is_told_by_chunks_and_a_stop_keeps_what_was_reached(setup):
     reporter = Watching()
     whole = training.train(setup, 4, reporter=reporter)
-    assert {title for title, *_ in reporter.told} == {"pretraining, 30 x 2 x 20"}
+    assert {title for title, *_ in reporter.messages} == {"pretraining, 30 x 2 x 20"}
     assert reporter.shares == pytest.approx([0.0, 1 / 3, 2 / 3, 1.0])
-    assert reporter.told[-1][2] == f"loss {whole.losses[-1]:.3f}"
+    assert reporter.messages[-1][2] == f"loss {whole.losses[-1]:.3f}"
     assert len(whole.losses) == 30
     stop = threading.Event()
     part = training.train(setup, 4, reporter=Watching(lambda share: share > 0.3 and stop.set()), stop=stop)
@@ -53,39 +53,39 @@ def test_the_error_in_the_own_model_is_that_of_the_last_half_second_of_six(setup
     policy, n = setup.new_policy(jax.random.key(0)), 3
     env = training._long(setup).env
     assert env.task.horizon == 300
-    flown = eqx.filter_jit(lambda key: rollout(env, policy, env.task.reset(key)).x.p)
-    ends = [np.asarray(flown(key))[-25:] for key in jax.random.split(jax.random.key(7), n)]
+    flight = eqx.filter_jit(lambda key: rollout(env, policy, env.task.reset(key)).x.p)
+    ends = [np.asarray(flight(key))[-25:] for key in jax.random.split(jax.random.key(7), n)]
     by_hand = np.mean([np.linalg.norm(p - np.array(setup.preset.goal), axis=1).mean() for p in ends])
-    found = training.nominal_error(setup, policy, n=n, seed=7)
-    assert found == pytest.approx(by_hand, rel=1e-4)
-    assert found != training.nominal_error(setup, policy, n=n, seed=8)
+    result = training.nominal_error(setup, policy, n=n, seed=7)
+    assert result == pytest.approx(by_hand, rel=1e-4)
+    assert result != training.nominal_error(setup, policy, n=n, seed=8)
     nothing = setup.learner.init(policy, jax.random.key(1)).residual
     residual = training.FittedResidual(setup.learner.residual_model, nothing)
     assert training.model_error(setup, policy, residual, n=n, seed=7) == pytest.approx(
-        found, rel=1e-4
+        result, rel=1e-4
     )  # nothing is learnt
 
 
 def test_seeds_are_trained_elsewhere_at_once_and_come_back_in_order(setup, monkeypatch):
-    asked, on_result, gate = [], [], threading.Barrier(2)
+    calls, on_result, gate = [], [], threading.Barrier(2)
 
     def job(preset, seed):
-        asked.append((preset, seed))
+        calls.append((preset, seed))
         gate.wait(20.0)  # both are at work
         return setup.new_policy(jax.random.key(seed))
 
     monkeypatch.setattr(training, "train_job", job)
     reporter = Watching()
     with ThreadPoolExecutor(2) as pool:
-        found = training.trained_elsewhere(
+        result = training.train_elsewhere(
             setup.preset, (5, 2), pool, reporter=reporter, stop=threading.Event(),
             on_result=lambda seed, policy: on_result.append((seed, policy)),
         )  # fmt: skip
-    assert {preset for preset, _ in asked} == {training.dump(setup.preset)}
-    assert list(found) == [5, 2]
+    assert {preset for preset, _ in calls} == {training.dump(setup.preset)}
+    assert list(result) == [5, 2]
     assert sorted(seed for seed, _ in on_result) == [2, 5]
-    assert all(policy is found[seed] for seed, policy in on_result)
-    assert reporter.told[-1][1:] == (1.0, "2 of 2 seeds")
+    assert all(policy is result[seed] for seed, policy in on_result)
+    assert reporter.messages[-1][1:] == (1.0, "2 of 2 seeds")
 
 
 def test_a_training_that_fails_elsewhere_is_told_once_the_others_have_come(setup, monkeypatch):
@@ -100,7 +100,7 @@ def test_a_training_that_fails_elsewhere_is_told_once_the_others_have_come(setup
     with ThreadPoolExecutor(1) as pool, pytest.raises(
         JobError, match=f"1 of 3 trainings of {setup.preset.name} failed: seed 1: disk is full"
     ):  # fmt: skip
-        training.trained_elsewhere(
+        training.train_elsewhere(
             setup.preset,
             (1, 0, 3),
             pool,
@@ -111,19 +111,19 @@ def test_a_training_that_fails_elsewhere_is_told_once_the_others_have_come(setup
     assert sorted(on_result) == [0, 3]
     stop.set()
     with ThreadPoolExecutor(1) as pool:
-        assert training.trained_elsewhere(setup.preset, (0,), pool, reporter=Silent(), stop=stop) == {}
+        assert training.train_elsewhere(setup.preset, (0,), pool, reporter=Silent(), stop=stop) == {}
 
 
 def test_a_job_trains_what_it_is_told(setup, monkeypatch):
-    asked = []
+    calls = []
 
-    def train(made, seed):
-        asked.append((made.preset, seed))
-        return training.Trained(made.new_policy(jax.random.key(seed)), [])
+    def train(setup, seed):
+        calls.append((setup.preset, seed))
+        return training.TrainingResult(setup.new_policy(jax.random.key(seed)), [])
 
     monkeypatch.setattr(training, "train", train)
     policy = training.train_job(training.dump(setup.preset), 6)
-    assert asked == [(setup.preset, 6)]
+    assert calls == [(setup.preset, 6)]
     assert bool(jnp.array_equal(policy.layers[0].weight, setup.new_policy(jax.random.key(6)).layers[0].weight))
 
 

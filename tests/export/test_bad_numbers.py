@@ -18,7 +18,7 @@ from retrim.export import runner
 from retrim.export.checking import FLAGS
 from retrim.export.export import export
 from retrim.export.runner import Runner
-from retrim.io.trained import save_policy
+from retrim.io.policies import save_policy
 from retrim.physics import State
 from retrim.physics.so3 import exp
 from retrim.runkit.reporter import Silent
@@ -87,11 +87,11 @@ def sequence(good, kind, ticks, place):
 
 
 def commands(controller, rows):
-    return jax.tree.map(np.asarray, scanned(controller, jnp.asarray(rows)))
+    return jax.tree.map(np.asarray, scan(controller, jnp.asarray(rows)))
 
 
 @eqx.filter_jit
-def scanned(controller, rows):
+def scan(controller, rows):
     def tick(memory, row):
         u, memory = controller(memory, jnp.array(0.0), State(row[:3], row[3:12].reshape(3, 3), row[12:]))
         return memory, (u.vector(), getattr(memory, "is_finite", jnp.array(True)))
@@ -120,36 +120,36 @@ CASES = [(kind, ticks, place) for kind in NUMBERS for ticks, place in ((1, 0), (
 @pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
 def test_jax_goes_on_as_if_the_bad_ticks_had_not_been(kind, ticks, place, plain, good):
     rows, fine = sequence(good, kind, ticks, place)
-    found, told = commands(FiniteController(plain), rows)
-    np.testing.assert_array_equal(told, fine)
-    wanted, _ = commands(plain, rows[fine])
-    np.testing.assert_allclose(found[fine], wanted, rtol=1e-12)
+    result, message = commands(FiniteController(plain), rows)
+    np.testing.assert_array_equal(message, fine)
+    expected, _ = commands(plain, rows[fine])
+    np.testing.assert_allclose(result[fine], expected, rtol=1e-12)
     for tick in np.flatnonzero(~fine):
-        np.testing.assert_array_equal(found[tick], found[tick - 1])
+        np.testing.assert_array_equal(result[tick], result[tick - 1])
 
 
 @pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
 def test_c_and_numpy_do_what_jax_does(kind, ticks, place, plain, good, folder, programs, setup):
     """Also under -ffast-math, and without a word of the sanitizers."""
     rows, fine = sequence(good, kind, ticks, place)
-    wanted, _ = commands(FiniteController(plain), rows)
+    expected, _ = commands(FiniteController(plain), rows)
     low, high = (np.asarray(u.vector()) for u in (plain.policy.u_min, plain.policy.u_max))
-    assert np.all(np.ptp(wanted, axis=0) > 0.05 * (high - low))
-    loaded, counts = Runner(folder / "quad.npz"), []
-    found = {"NumPy": []}
+    assert np.all(np.ptp(expected, axis=0) > 0.05 * (high - low))
+    loaded_policy, counts = Runner(folder / "quad.npz"), []
+    result = {"NumPy": []}
     for row in rows:
-        found["NumPy"].append(loaded.step(row[:3], row[3:12].reshape(3, 3), row[12:]))
-        counts.append(loaded.repeats)
+        result["NumPy"].append(loaded_policy.step(row[:3], row[3:12].reshape(3, 3), row[12:]))
+        counts.append(loaded_policy.repeats)
     assert max(counts) == np.sum(~fine)
     np.testing.assert_array_equal(np.array(counts) == 0, fine)
     for program in programs:
-        ran = subprocess.run([program], input=rows.astype(np.float32).tobytes(), capture_output=True, check=True)
-        assert ran.stderr == b""
-        given = np.frombuffer(ran.stdout, np.float32).reshape(-1, 5)
-        np.testing.assert_array_equal(given[:, 4], fine)
-        found[program.name] = given[:, :4]
-    for name, given in found.items():
-        assert np.max(np.abs(np.array(given) - wanted) / (high - low)) <= SHARE, name
+        process = subprocess.run([program], input=rows.astype(np.float32).tobytes(), capture_output=True, check=True)
+        assert process.stderr == b""
+        argument = np.frombuffer(process.stdout, np.float32).reshape(-1, 5)
+        np.testing.assert_array_equal(argument[:, 4], fine)
+        result[program.name] = argument[:, :4]
+    for name, argument in result.items():
+        assert np.max(np.abs(np.array(argument) - expected) / (high - low)) <= SHARE, name
 
 
 def test_the_controller_keeps_every_law(plain):
@@ -159,28 +159,28 @@ def test_the_controller_keeps_every_law(plain):
 def test_a_flight_may_begin_with_numbers_that_are_not_finite(plain, good, folder, programs):
     """Hover is the last command then."""
     rows = np.concatenate([np.full((2, 15), np.nan), good[:3]])
-    wanted, _ = commands(FiniteController(plain), rows)
-    np.testing.assert_allclose(wanted[:2], [[9.81, 0.0, 0.0, 0.0]] * 2)
-    loaded = Runner(folder / "quad.npz")
-    numpy = [loaded.step(row[:3], row[3:12].reshape(3, 3), row[12:]) for row in rows]
-    np.testing.assert_allclose(numpy, wanted, atol=1e-4)
+    expected, _ = commands(FiniteController(plain), rows)
+    np.testing.assert_allclose(expected[:2], [[9.81, 0.0, 0.0, 0.0]] * 2)
+    loaded_policy = Runner(folder / "quad.npz")
+    numpy = [loaded_policy.step(row[:3], row[3:12].reshape(3, 3), row[12:]) for row in rows]
+    np.testing.assert_allclose(numpy, expected, atol=1e-4)
     for program in programs:
-        ran = subprocess.run([program], input=rows.astype(np.float32).tobytes(), capture_output=True, check=True)
-        np.testing.assert_allclose(np.frombuffer(ran.stdout, np.float32).reshape(-1, 5)[:, :4], wanted, atol=1e-4)
+        process = subprocess.run([program], input=rows.astype(np.float32).tobytes(), capture_output=True, check=True)
+        np.testing.assert_allclose(np.frombuffer(process.stdout, np.float32).reshape(-1, 5)[:, :4], expected, atol=1e-4)
 
 
 def test_without_memory_a_bad_row_gives_nan_and_says_so(folder, good):
-    loaded = Runner(folder / "quad.npz")
-    rows = np.tile(loaded._arrays["test_observations"][:1], (4, 1))
+    loaded_policy = Runner(folder / "quad.npz")
+    rows = np.tile(loaded_policy._arrays["test_observations"][:1], (4, 1))
     rows[1, 5], rows[2, 20], rows[3, 0] = np.nan, np.inf, LARGEST
-    np.testing.assert_array_equal(np.isnan(loaded.command(rows)).all(axis=1), [False, True, True, True])
+    np.testing.assert_array_equal(np.isnan(loaded_policy.command(rows)).all(axis=1), [False, True, True, True])
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
     export(folder / "policy.safetensors", "onnx", folder / "quad.onnx", None, Silent())
     session = runtime.InferenceSession(str(folder / "quad.onnx"), providers=["CPUExecutionProvider"])
-    commanded, finite = session.run(["command", "finite"], {"observation": rows})
+    commands, finite = session.run(["command", "finite"], {"observation": rows})
     np.testing.assert_array_equal(finite[:, 0], [True, False, False, False])
-    np.testing.assert_allclose(commanded, loaded.command(rows), atol=1e-4)
+    np.testing.assert_allclose(commands, loaded_policy.command(rows), atol=1e-4)
 
 
 def test_the_limit_is_the_same_everywhere(folder):

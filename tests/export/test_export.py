@@ -24,7 +24,7 @@ from retrim.export.export import FORMATS, PARITY, export
 from retrim.export.portable import commands, observations, portable_of
 from retrim.export.runner import Runner
 from retrim.io.checkpoint import save_delta
-from retrim.io.trained import save_policy
+from retrim.io.policies import save_policy
 from retrim.physics import Command, State
 from retrim.physics.so3 import exp
 from retrim.runkit.reporter import Silent
@@ -42,12 +42,12 @@ def setup():
 def policy(setup):
     """Weights large enough that commands reach their limits."""
     fresh = setup.new_policy(random.key(0))
-    grown = jax.tree.map(lambda leaf: jnp.asarray(6.0 * np.asarray(leaf)), fresh.layers)
-    return fresh.with_params(grown)
+    growth = jax.tree.map(lambda leaf: jnp.asarray(6.0 * np.asarray(leaf)), fresh.layers)
+    return fresh.with_params(growth)
 
 
 @pytest.fixture(scope="module")
-def saved(policy, setup, tmp_path_factory):
+def policy_file(policy, setup, tmp_path_factory):
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
     save_policy(path, policy, setup.preset)
     return path
@@ -62,26 +62,26 @@ class Said(Silent):
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_every_format_computes_what_jax_computes(to, policy, setup, saved, tmp_path):
+def test_every_format_computes_what_jax_computes(to, policy, setup, policy_file, tmp_path):
     for name in NEEDS[to]:
         pytest.importorskip(name)
     if to == "c" and shutil.which("gcc") is None:
         pytest.skip("there is no C compiler")
-    said = Said()
-    written = export(saved, to, tmp_path / f"p{FORMATS[to].suffix}", None, said)
-    assert "µs a step" in said.lines[0]
+    text = Said()
+    paths = export(policy_file, to, tmp_path / f"p{FORMATS[to].suffix}", None, text)
+    assert "µs a step" in text.lines[0]
     portable = portable_of(policy, setup)
     rows = 2.0 * observations(portable.sizes[0], 500, seed=3)
-    wanted = commands(policy, rows)
-    assert np.all(np.ptp(wanted, axis=0) > 0.1 * (portable.high - portable.low))  # commands of all sizes
-    found = FORMATS[to].check(written[0], portable, rows, wanted)
-    assert found.worst <= PARITY
-    shifted = FORMATS[to].check(written[0], portable, rows, wanted + 1e-3 * (portable.high - portable.low))
-    assert shifted.worst > 9e-4
+    expected = commands(policy, rows)
+    assert np.all(np.ptp(expected, axis=0) > 0.1 * (portable.high - portable.low))  # commands of all sizes
+    result = FORMATS[to].check(paths[0], portable, rows, expected)
+    assert result.worst <= PARITY
+    shift_check = FORMATS[to].check(paths[0], portable, rows, expected + 1e-3 * (portable.high - portable.low))
+    assert shift_check.worst > 9e-4
 
 
-def test_a_file_that_computes_something_else_is_refused(saved, tmp_path):
-    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+def test_a_file_that_computes_something_else_is_refused(policy_file, tmp_path):
+    export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     with np.load(tmp_path / "p.npz") as file:
         arrays = dict(file)
     arrays["w1"] = arrays["w1"] * 1.01
@@ -99,7 +99,7 @@ def states():
 
 
 @pytest.fixture(scope="module")
-def flown(policy, setup, states):
+def sample_flight(policy, setup, states):
     """What the controller of a flight commands, tick by tick."""
 
     @eqx.filter_jit
@@ -115,19 +115,19 @@ def flown(policy, setup, states):
     return np.asarray(fly(PolicyController(setup.env.task.observation, policy), *map(jnp.asarray, states)))
 
 
-def test_the_runner_flies_as_the_controller_does(setup, saved, states, flown, tmp_path):
-    export(saved, "npz", tmp_path / "p.npz", None, Silent())
-    loaded = Runner(tmp_path / "p.npz")
+def test_the_runner_flies_as_the_controller_does(setup, policy_file, states, sample_flight, tmp_path):
+    export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
+    loaded_policy = Runner(tmp_path / "p.npz")
     for _ in range(2):  # the second flight begins as the first
-        found = np.array([loaded.step(*(x[k] for x in states)) for k in range(12)])
-        np.testing.assert_allclose(found, flown, atol=2e-4)
-        loaded.reset()
-    assert loaded.dt == setup.preset.dt
+        result = np.array([loaded_policy.step(*(x[k] for x in states)) for k in range(12)])
+        np.testing.assert_allclose(result, sample_flight, atol=2e-4)
+        loaded_policy.reset()
+    assert loaded_policy.dt == setup.preset.dt
 
 
 @HAS_C
-def test_c_flies_as_the_controller_does(saved, states, flown, tmp_path):
-    export(saved, "c", tmp_path / "my-quad.h", None, Silent())
+def test_c_flies_as_the_controller_does(policy_file, states, sample_flight, tmp_path):
+    export(policy_file, "c", tmp_path / "my-quad.h", None, Silent())
     p, R, v = (x.astype(np.float32) for x in states)
     rows = np.concatenate([p, R.reshape(12, 9), v], axis=1)
     (tmp_path / "main.c").write_text("""
@@ -145,65 +145,65 @@ int main(void) {
 }
 """)
     subprocess.run(["gcc", *FLAGS, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
-    ran = subprocess.run([tmp_path / "main"], input=rows.tobytes(), capture_output=True, check=True)
-    found = np.frombuffer(ran.stdout, np.float32).reshape(-1, 4)
-    np.testing.assert_allclose(found, flown, atol=2e-4)
+    process = subprocess.run([tmp_path / "main"], input=rows.tobytes(), capture_output=True, check=True)
+    result = np.frombuffer(process.stdout, np.float32).reshape(-1, 4)
+    np.testing.assert_allclose(result, sample_flight, atol=2e-4)
     text = (tmp_path / "my-quad.h").read_text()
     assert not any(word in text for word in ("malloc", "double", "static float"))
 
 
-def test_the_runner_needs_numpy_only(saved, tmp_path):
+def test_the_runner_needs_numpy_only(policy_file, tmp_path):
     tree = ast.parse(Path(runner.__file__).read_text())
-    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
-    imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert imported == {"json", "numpy", "pathlib", "typing"}
-    export(saved, "npz", tmp_path / "p.npz", None, Silent())
+    imports = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    imports |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert imports == {"json", "numpy", "pathlib", "typing"}
+    export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     code = "import sys; sys.modules['jax'] = sys.modules['retrim'] = None; import runner, numpy as np\n" \
         "print(*runner.Runner('p.npz').step(np.zeros(3), np.eye(3), np.zeros(3)))"  # fmt: skip
-    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert len(ran.stdout.split()) == 4
+    process = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert len(process.stdout.split()) == 4
 
 
-def test_a_delta_travels_alone(policy, setup, saved, tmp_path):
+def test_a_delta_travels_alone(policy, setup, policy_file, tmp_path):
     low = LoraPolicy.of(policy, key=random.key(1), ranks=(2, 2, 1))
     low = low.with_params(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), low.delta)).shifted(
         jnp.array([0.1, 0.0, -0.1, 0.0])
     )
     save_delta(tmp_path / "delta.safetensors", low)
-    export(saved, "npz", tmp_path / "p.npz", None, Silent())
-    export(saved, "delta", tmp_path / "d.npz", tmp_path / "delta.safetensors", Silent())
+    export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
+    export(policy_file, "delta", tmp_path / "d.npz", tmp_path / "delta.safetensors", Silent())
     rows = observations(portable_of(policy, setup).sizes[0], 500, seed=2)
-    wanted = commands(low.merged(), rows)
-    np.testing.assert_allclose(Runner(tmp_path / "p.npz", tmp_path / "d.npz").command(rows), wanted, atol=5e-4)
-    assert np.abs(Runner(tmp_path / "p.npz").command(rows) - wanted).max() > 0.1
-    export(saved, "npz", tmp_path / "merged.npz", tmp_path / "delta.safetensors", Silent())
-    np.testing.assert_allclose(Runner(tmp_path / "merged.npz").command(rows), wanted, atol=5e-4)
+    expected = commands(low.merged(), rows)
+    np.testing.assert_allclose(Runner(tmp_path / "p.npz", tmp_path / "d.npz").command(rows), expected, atol=5e-4)
+    assert np.abs(Runner(tmp_path / "p.npz").command(rows) - expected).max() > 0.1
+    export(policy_file, "npz", tmp_path / "merged.npz", tmp_path / "delta.safetensors", Silent())
+    np.testing.assert_allclose(Runner(tmp_path / "merged.npz").command(rows), expected, atol=5e-4)
     with pytest.raises(ValueError, match="made for another policy"):
         Runner(tmp_path / "merged.npz", tmp_path / "d.npz")
 
 
 @pytest.mark.parametrize(
-    ("to", "out", "delta", "said"),
+    ("to", "out", "delta", "text"),
     [
         ("rust", None, None, "must be npz, onnx, c or delta"),
         ("c", "policy.txt", None, "must end with .h"),
         ("delta", None, None, "give it as --delta"),
     ],
 )
-def test_what_cannot_be_asked_is_named(to, out, delta, said, saved, tmp_path, monkeypatch):
+def test_what_cannot_be_asked_is_named(to, out, delta, text, policy_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=said):
-        export(saved, to, out and Path(out), delta, Silent())
+    with pytest.raises(ConfigError, match=text):
+        export(policy_file, to, out and Path(out), delta, Silent())
     assert not list(tmp_path.iterdir())
 
 
-def test_a_runner_of_somebody_else_is_left_alone(saved, tmp_path):
+def test_a_runner_of_somebody_else_is_left_alone(policy_file, tmp_path):
     """One's own is written again."""
-    export(saved, "npz", tmp_path / "p.npz", None, Silent())
-    export(saved, "npz", tmp_path / "q.npz", None, Silent())
+    export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
+    export(policy_file, "npz", tmp_path / "q.npz", None, Silent())
     (tmp_path / "runner.py").write_text("print('mine')\n")
     with pytest.raises(ConfigError, match=r"runner\.py is there already") as error:
-        export(saved, "npz", tmp_path / "r.npz", None, Silent())
+        export(policy_file, "npz", tmp_path / "r.npz", None, Silent())
     assert "\n" not in str(error.value)
     assert (tmp_path / "runner.py").read_text() == "print('mine')\n"
     assert not (tmp_path / "r.npz").exists()
@@ -214,8 +214,8 @@ def test_a_missing_policy_is_named(tmp_path):
         export(tmp_path / "nowhere.safetensors", "c", None, None, Silent())
 
 
-def test_hover_is_what_the_first_command_remembers(saved, tmp_path):
-    export(saved, "npz", tmp_path / "p.npz", None, Silent())
-    loaded = Runner(tmp_path / "p.npz")
-    np.testing.assert_array_equal(loaded.observe(np.zeros(3), np.eye(3), np.zeros(3))[15:], 0.0)
-    assert Command.hover().vector()[0] == pytest.approx(loaded._last[0])
+def test_hover_is_what_the_first_command_remembers(policy_file, tmp_path):
+    export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
+    loaded_policy = Runner(tmp_path / "p.npz")
+    np.testing.assert_array_equal(loaded_policy.observe(np.zeros(3), np.eye(3), np.zeros(3))[15:], 0.0)
+    assert Command.hover().vector()[0] == pytest.approx(loaded_policy._last[0])

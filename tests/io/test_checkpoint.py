@@ -32,7 +32,7 @@ def file(tmp_path, policy):
     return path
 
 
-def edited(file, change=None, **header):
+def edit(file, change=None, **header):
     """Rewrite the file with other tensors or another header, without the checksum's consent."""
     tensors, data = load_file(file), file.read_bytes()
     save_file(change(tensors) if change else tensors, file, metadata=message._header(data, "test") | header)
@@ -40,8 +40,8 @@ def edited(file, change=None, **header):
 
 def test_round_trip_is_exact(file, policy):
     for place in (file, file.parent, str(file)):
-        found, header = read_policy(place)
-        jax.tree.map(np.testing.assert_array_equal, found, policy)
+        result, header = read_policy(place)
+        jax.tree.map(np.testing.assert_array_equal, result, policy)
         assert header["made by"] == "a test"
     assert not list(file.parent.glob("*.partial"))
 
@@ -90,36 +90,36 @@ def test_another_kind_of_message(file):
     "sizes", ["", "23-32-32", "23-4", "23-32-32-5", "23-0-32-4", "23-x-4", "-".join(["9"] * 40), "23-99999999-4"]
 )
 def test_architectures_that_are_none(file, sizes):
-    edited(file, architecture=sizes)
+    edit(file, architecture=sizes)
     with pytest.raises(CheckpointError, match=rf"architecture '{sizes}', expected sizes as 15-512-512-4"):
         read_policy(file)
 
 
 def test_wrong_shape_is_named_with_both_shapes(file):
-    edited(file, lambda t: t | {"layers.1.weight": np.zeros((32, 31))})
+    edit(file, lambda t: t | {"layers.1.weight": np.zeros((32, 31))})
     with pytest.raises(CheckpointError, match=r"'layers\.1\.weight' has shape \(32, 31\), expected \(32, 32\)"):
         read_policy(file)
 
 
 def test_missing_and_unexpected_tensors(file):
-    edited(file, lambda t: {k: v for k, v in t.items() if k != "layers.2.bias"})
+    edit(file, lambda t: {k: v for k, v in t.items() if k != "layers.2.bias"})
     with pytest.raises(CheckpointError, match=r"tensor 'layers\.2\.bias' is missing"):
         read_policy(file)
-    edited(file, lambda t: t | {"layers.2.bias": np.zeros(4), "layers.9.bias": np.zeros(4)})
+    edit(file, lambda t: t | {"layers.2.bias": np.zeros(4), "layers.9.bias": np.zeros(4)})
     with pytest.raises(CheckpointError, match=r"unexpected tensor 'layers\.9\.bias'"):
         read_policy(file)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_weights_that_are_not_finite(tmp_path, policy, value):
-    broken = eqx.tree_at(lambda p: p.layers[0].bias, policy, policy.layers[0].bias.at[7].set(value))
-    write_policy(tmp_path / "p.safetensors", broken, {})
+    bad = eqx.tree_at(lambda p: p.layers[0].bias, policy, policy.layers[0].bias.at[7].set(value))
+    write_policy(tmp_path / "p.safetensors", bad, {})
     with pytest.raises(CheckpointError, match=r"'layers\.0\.bias' has 1 weights that are not finite"):
         read_policy(tmp_path / "p.safetensors")
 
 
 def test_integers_are_refused(file):
-    edited(file, lambda t: t | {"layers.0.bias": np.zeros(32, dtype=np.int32)})
+    edit(file, lambda t: t | {"layers.0.bias": np.zeros(32, dtype=np.int32)})
     with pytest.raises(CheckpointError, match=r"'layers\.0\.bias' has type int32, expected floating point"):
         read_policy(file)
 
@@ -135,11 +135,11 @@ def test_limits_that_do_not_enclose_hover(tmp_path, policy):
 
 def test_a_changed_weight_or_header_breaks_the_checksum(file):
     whole = file.read_bytes()
-    edited(file, lambda t: t | {"layers.0.bias": t["layers.0.bias"] + 1e-3})
+    edit(file, lambda t: t | {"layers.0.bias": t["layers.0.bias"] + 1e-3})
     with pytest.raises(CheckpointError, match="checksum does not match"):
         read_policy(file)
     file.write_bytes(whole)
-    edited(file, task="track")
+    edit(file, task="track")
     with pytest.raises(CheckpointError, match="checksum does not match"):
         read_policy(file)
 
@@ -151,20 +151,20 @@ def test_flipped_bytes_never_load_silently(file, policy, data):
     whole = bytearray(file.read_bytes())
     place = data.draw(st.integers(0, len(whole) - 1))
     whole[place] ^= data.draw(st.integers(1, 255))
-    damaged = file.with_name("damaged.safetensors")
-    damaged.write_bytes(whole)
+    bad_file = file.with_name("damaged.safetensors")
+    bad_file.write_bytes(whole)
     with contextlib.suppress(CheckpointError):
-        found, header = read_policy(damaged)
-        jax.tree.map(np.testing.assert_array_equal, found, policy)
+        result, header = read_policy(bad_file)
+        jax.tree.map(np.testing.assert_array_equal, result, policy)
         assert header == read_policy(file)[1]
 
 
 def test_float32_files_load_in_double_precision_and_back(tmp_path, policy):
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), policy)
     write_policy(tmp_path / "p.safetensors", single, {})
-    found, _ = read_policy(tmp_path / "p.safetensors")
-    assert found.layers[0].weight.dtype == jnp.float64
-    jax.tree.map(np.testing.assert_array_equal, found, jax.tree.map(lambda leaf: leaf.astype(jnp.float64), single))
+    result, _ = read_policy(tmp_path / "p.safetensors")
+    assert result.layers[0].weight.dtype == jnp.float64
+    jax.tree.map(np.testing.assert_array_equal, result, jax.tree.map(lambda leaf: leaf.astype(jnp.float64), single))
 
 
 def test_an_interrupted_write_leaves_the_old_file(file, policy, monkeypatch):

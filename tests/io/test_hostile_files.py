@@ -48,52 +48,52 @@ def folder(tmp_path, monkeypatch):
 
 def outcome(case, watch):
     """What a case came to: ``refused``, ``read``, or a fault in words."""
-    watch.seen.clear()
+    watch.events.clear()
     watch.on = True
     try:
         case.read()
-        found = "read" if case.may_be_read else f"{case.name}: it was read"
+        result = "read" if case.may_be_read else f"{case.name}: it was read"
     except RetrimError as error:
         line = str(error)
         fine = line and line.isprintable() and len(line) < LONGEST
-        found = "refused" if fine else f"{case.name}: a message of {len(line)} characters: {line[:100]!r}"
+        result = "refused" if fine else f"{case.name}: a message of {len(line)} characters: {line[:100]!r}"
     except BaseException as error:
-        found = f"{case.name}: {type(error).__name__}: {str(error)[:200]}"
+        result = f"{case.name}: {type(error).__name__}: {str(error)[:200]}"
     finally:
         watch.on = False
-    return f"{case.name}: {watch.seen[:3]}" if watch.seen else found
+    return f"{case.name}: {watch.events[:3]}" if watch.events else result
 
 
 def read_all(folder, watch, every):
     """Read each ``every``-th case twice: what is imported the first time, once and for all, is not the case's doing."""
-    maker, found = Maker(folder), list[str]()
+    maker, result = Maker(folder), list[str]()
 
-    def chosen(each):
+    def choose(each):
         return (case for i, case in enumerate(maker.cases()) if i % each == 0)
 
-    for case in chosen(50 * every):
+    for case in choose(50 * every):
         outcome(case, watch)
         maker.clear()
     modules = set(sys.modules)
-    for case in chosen(every):
-        found.append(outcome(case, watch))
+    for case in choose(every):
+        result.append(outcome(case, watch))
         maker.clear()
-    faults = [each for each in found if each not in ("refused", "read")]
-    assert not faults, f"{len(faults)} of {len(found)}:\n" + "\n".join(faults[:100])
+    faults = [each for each in result if each not in ("refused", "read")]
+    assert not faults, f"{len(faults)} of {len(result)}:\n" + "\n".join(faults[:100])
     assert not {name for name in set(sys.modules) - modules if "stranger" in name}
     assert not list(folder.glob("**/OWNED"))
-    return Counter(found)
+    return Counter(result)
 
 
 def test_some_hostile_files_run_nothing_and_are_one_line_each(folder, watch):
-    found = read_all(folder, watch, FEW)
-    assert found["refused"] > found["read"]
+    result = read_all(folder, watch, FEW)
+    assert result["refused"] > result["read"]
 
 
 @pytest.mark.slow
 def test_all_hostile_files_run_nothing_and_are_one_line_each(folder, watch):
-    found = read_all(folder, watch, 1)
-    assert found["refused"] >= 10_000
+    result = read_all(folder, watch, 1)
+    assert result["refused"] >= 10_000
 
 
 # ---- files that are large, or unpack to much
@@ -158,18 +158,18 @@ def test_rows_of_a_sweep_that_are_none_are_flown_again(folder):
     wrong = [{**row, "key": "a", "error": "x"}, {**row, "key": "b", "plant": 3}, {"key": "c"}, {**row, "key": 4}, [], 1]
     lines = [json.dumps(each).encode() for each in (*wrong, row)]
     (folder / "flights.jsonl").write_bytes(b"\n".join([b"\xff\xfe", *lines, b'{"key": "torn']))
-    said, reporter = [], Silent()
-    reporter.say = said.append
+    text, reporter = [], Silent()
+    reporter.say = text.append
     assert list(sweep._FlightRows(Run("test", folder), reporter).by_key) == ["good"]
-    assert said == [f"{folder / 'flights.jsonl'}: unusable lines, 8; their flights are flown again"]
+    assert text == [f"{folder / 'flights.jsonl'}: unusable lines, 8; their flights are flown again"]
 
 
 def test_a_host_that_cannot_be_is_one_line():
     for host in ("a\x1b[2J", "a\x00b", 300 * "a" + ".b", "\ud800", "..", "é" * 100):
-        with pytest.raises(ConfigError, match="neither an address nor the name of a host") as caught:
+        with pytest.raises(ConfigError, match="neither an address nor the name of a host") as error:
             free_port(host, 8080)
-        assert str(caught.value).isprintable()
-        assert len(str(caught.value)) < LONGEST
+        assert str(error.value).isprintable()
+        assert len(str(error.value)) < LONGEST
 
 
 # ---- formats whose reader makes code of what a file says of its messages
@@ -197,10 +197,10 @@ def test_types_of_messages_in_a_bag_are_no_code(folder, encoding):
             channel = bag.register_channel(topic="/t", message_encoding="cdr", schema_id=schema)
             bag.add_message(channel, log_time=0, data=b"\0\1\0\0" + bytes(8), publish_time=0)
             bag.finish()
-        with pytest.raises(LogError) as caught:
+        with pytest.raises(LogError) as error:
             read_flight_log(folder / "log.mcap")
-        assert str(caught.value).isprintable()
-        assert len(str(caught.value)) < LONGEST
+        assert str(error.value).isprintable()
+        assert len(str(error.value)) < LONGEST
         assert not (folder / "OWNED").exists(), name
 
 

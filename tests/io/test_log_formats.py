@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from made_up_log import G, flown, turned_frames
+from fake_log import G, fly_once, turned_frames
 from retrim.errors import LogError, RetrimError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.recording import Recording, write_mcap, write_npz
 
-FLIGHT = flown(6.0)
+FLIGHT = fly_once(6.0)
 N = len(FLIGHT.t)
 
 
 def agrees(log, places=1e-6):
     shift = round((log.t[0] - 0.0) / 0.02)
-    for found, true in ((log.p, FLIGHT.p), (log.R, FLIGHT.R), (log.v, FLIGHT.v), (log.c, FLIGHT.c)):
-        np.testing.assert_allclose(found, true[shift : shift + len(found)], atol=places)
+    for result, true in ((log.p, FLIGHT.p), (log.R, FLIGHT.R), (log.v, FLIGHT.v), (log.c, FLIGHT.c)):
+        np.testing.assert_allclose(result, true[shift : shift + len(result)], atol=places)
     np.testing.assert_allclose(log.command, FLIGHT.omega[: len(log.command)], atol=places)
     assert log.valid[3:-3].all()
 
@@ -51,15 +51,15 @@ def test_our_own_recordings_of_old_states(write, ms, ages, tmp_path):
     """Older than a tick, logged twice, or come late; and what says how old is wrong by tenths of a millisecond."""
     if write is write_mcap:
         pytest.importorskip("rosbags")
-    fine, before = flown(6.0, dt=1e-3), 100  # ms of flight before the recording
+    fine, before = fly_once(6.0, dt=1e-3), 100  # ms of flight before the recording
     ticks = np.arange(before, len(fine.t), ms)
     age = np.resize(ages, len(ticks))
     states = np.concatenate([fine.p, fine.R.reshape(-1, 9), fine.v], axis=1)
     command = np.concatenate([fine.c[:, None], fine.omega], axis=1)[ticks]
     jitter = np.random.default_rng(0).uniform(-3e-4, 3e-4, len(ticks))
-    t, shown = 1e-3 * (ticks - before), states[ticks - age]
+    t, display = 1e-3 * (ticks - before), states[ticks - age]
     path = tmp_path / ("flight.npz" if write is write_npz else "flight.mcap")
-    write(path, Recording(t, shown, states[ticks], 1e-3 * age + jitter, command, np.zeros(len(t))))
+    write(path, Recording(t, display, states[ticks], 1e-3 * age + jitter, command, np.zeros(len(t))))
     log = read_flight_log(path, dt=1e-3 * ms)
     assert log.valid[3:-3].all()
     assert any("not newer than the one before" in note for note in log.notes) == (len(ages) > 1)
@@ -70,11 +70,11 @@ def test_our_own_recordings_of_old_states(write, ms, ages, tmp_path):
         return np.stack([np.interp(start + log.t[5:-5], fine.t, column) for column in columns], axis=1)
 
     # The log's clock begins with its first state, and nobody tells when that was.
-    found = np.concatenate([log.p, log.v, log.c[:, None]], axis=1)[5:-5]
-    missed = min((np.abs(found - true(1e-3 * start)).max(axis=0) for start in range(50, 200)), key=np.sum)
-    assert missed[:3].max() < 3e-3
-    assert missed[3:6].max() < 0.03
-    assert missed[6] < 0.1
+    result = np.concatenate([log.p, log.v, log.c[:, None]], axis=1)[5:-5]
+    error = min((np.abs(result - true(1e-3 * start)).max(axis=0) for start in range(50, 200)), key=np.sum)
+    assert error[:3].max() < 3e-3
+    assert error[3:6].max() < 0.03
+    assert error[6] < 0.1
 
 
 @pytest.mark.parametrize("name", ["flight.bag", "flight.db3", "flight"])
@@ -113,7 +113,7 @@ def test_bags_of_ros(name, tmp_path):
             make["geometry_msgs/msg/TwistWithCovariance"](twist, nothing),
         )  # fmt: skip
 
-    def told(k):
+    def capture(k):
         fields = {
             "header": header(FLIGHT.t[k]),
             "body_rate": vector(*FLIGHT.omega[k]),
@@ -127,7 +127,7 @@ def test_bags_of_ros(name, tmp_path):
             (writer.add_connection(topic, kind, typestore=types), kind, message)
             for topic, kind, message in (
                 ("/mavros/local_position/odom", "nav_msgs/msg/Odometry", odometry),
-                ("/mavros/setpoint_raw/attitude", name_of, told),
+                ("/mavros/setpoint_raw/attitude", name_of, capture),
             )
         ]
         for k in range(N):

@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from made_up_bytes import px4_topics, ulog
-from made_up_log import G, columns, flown, write_csv, write_map
+from fake_bytes import px4_topics, ulog
+from fake_log import G, columns, fly_once, write_csv, write_map
 from retrim.errors import LogError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.replay import rows_of
 
-FLIGHT = flown(16.0)
+FLIGHT = fly_once(16.0)
 
 
-def missed(log):
+def miss(log):
     """Root mean square and largest error of the residual, whose true value is zero."""
     wrong = np.abs(np.asarray(rows_of(log).a_res)[log.valid])
     return float(np.sqrt(np.mean(wrong**2))), float(wrong.max())
@@ -37,7 +37,7 @@ def test_samples_that_px4_calls_invalid_are_left_out(tmp_path):
     log = read_ulog(tmp_path, topics, stamps)
     assert "velocity was not valid for 6.0 s, which are left out" in log.notes
     assert not any("jumps" in note for note in log.notes)
-    assert missed(log)[1] < 0.03
+    assert miss(log)[1] < 0.03
     assert log.seconds == pytest.approx(10.0, abs=0.3)
     assert log.full_thrust == pytest.approx(2.0 * G[2], rel=0.05)
 
@@ -62,7 +62,7 @@ def test_resets_of_the_velocity_are_left_out(counter, step, tmp_path):
     log = read_ulog(tmp_path, topics, stamps)
     (note,) = [note for note in log.notes if "jumps" in note]
     assert f"velocity jumps 2 times ({2 * counter} resets by its counter)" in note
-    assert missed(log)[1] < 0.03
+    assert miss(log)[1] < 0.03
     assert log.seconds > 15.5
 
 
@@ -72,7 +72,7 @@ def test_isolated_wrong_velocities_are_left_out(tmp_path):
     table["vy"][100::50] += 1.5
     path = write_csv(tmp_path / "log.csv", table)
     log = read_flight_log(path, read_map(write_map(tmp_path / "map.toml")))
-    assert missed(log)[1] < 0.05
+    assert miss(log)[1] < 0.05
     assert log.seconds > 11.0
 
 
@@ -127,7 +127,7 @@ def test_standing_on_the_ground_is_no_flight(unit, lift, tmp_path):
     assert log.valid[: n - 3].sum() + log.valid[-n + 3 :].sum() == 0
     assert log.valid[n + 10 : -n - 10].mean() > 0.97
     assert any("on the ground are left out" in note for note in log.notes)
-    assert missed(log)[0] < (0.05 if unit == "m/s^2" else 0.4)
+    assert miss(log)[0] < (0.05 if unit == "m/s^2" else 0.4)
     if unit == "share":
         assert G[2] / log.full_thrust == pytest.approx(0.5, rel=0.04)
 
@@ -172,7 +172,7 @@ def test_a_position_that_is_never_valid_is_not_used(tmp_path):
         place[name] = ("float", np.zeros(len(stamps)))
     log = read_ulog(tmp_path, topics, stamps)
     assert "position is never valid, and is not used" in log.notes
-    assert missed(log)[1] < 0.03
+    assert miss(log)[1] < 0.03
     assert log.valid[3:-3].all()
 
 
@@ -181,18 +181,18 @@ def test_marks_may_be_compared_with_a_number(tmp_path):
     t = FLIGHT.t
     table = columns(FLIGHT) | {"state": np.where(t < 3.0, 1.0, 2.0), "fix": np.where((t > 8.0) & (t < 10.0), 1.0, 3.0)}
     table["vx"] = np.where((t > 8.0) & (t < 10.0), 0.0, table["vx"])
-    chosen = write_map(tmp_path / "map.toml", landed__fields='["state==1"]', velocity__valid='["fix==3"]')
-    log = read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(chosen))
+    choice = write_map(tmp_path / "map.toml", landed__fields='["state==1"]', velocity__valid='["fix==3"]')
+    log = read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(choice))
     assert not log.valid[log.t < 2.9].any()
     assert not log.valid[(log.t > 7.99) & (log.t < 9.99)].any()
     assert log.valid[((log.t > 3.1) & (log.t < 7.9)) | ((log.t > 10.1) & (log.t < 15.9))].all()
     assert "velocity was not valid for 2.0 s, which are left out" in log.notes
-    assert missed(log)[1] < 0.03
+    assert miss(log)[1] < 0.03
 
 
 def test_marks_that_a_log_does_not_have_are_passed_over(tmp_path):
-    chosen = write_map(
+    choice = write_map(
         tmp_path / "map.toml", landed__fields='["ground"]', velocity__valid='["ok"]', attitude__resets='["n"]'
     )
-    log = read_flight_log(write_csv(tmp_path / "log.csv", columns(FLIGHT)), read_map(chosen))
+    log = read_flight_log(write_csv(tmp_path / "log.csv", columns(FLIGHT)), read_map(choice))
     assert log.valid[3:-3].all()

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from made_up_log import MAP, columns, flown, write_csv, write_map
+from fake_log import MAP, columns, fly_once, write_csv, write_map
 from retrim.errors import ConfigError, LogError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.axes import to_body, to_world
 from retrim.replay import rows_of
 
 PUSH = (0.4, -0.3, 0.1)
-FLIGHT = flown(11.0, wind=PUSH, size=1.5)
+FLIGHT = fly_once(11.0, wind=PUSH, size=1.5)
 ANGLES = dict(zip(("yaw", "pitch", "roll"), Rotation.from_matrix(FLIGHT.R).as_euler("ZYX").T, strict=True))
 GYRO = 0.5 * (FLIGHT.omega + np.concatenate([FLIGHT.omega[:1], FLIGHT.omega[:-1]]))
 TABLE = columns(FLIGHT) | ANGLES | {f"g{axis}": GYRO[:, i] for i, axis in enumerate("xyz")}
@@ -29,8 +29,8 @@ def is_the_flight(log):
     np.testing.assert_allclose(log.v, FLIGHT.v, atol=1e-6)
     np.testing.assert_allclose(log.p, FLIGHT.p, atol=1e-6)
     np.testing.assert_allclose(log.command, FLIGHT.omega, atol=1e-6)
-    missed = np.asarray(rows_of(log).a_res)[log.valid]
-    np.testing.assert_allclose(missed, np.broadcast_to(PUSH, missed.shape), atol=5e-3)
+    error = np.asarray(rows_of(log).a_res)[log.valid]
+    np.testing.assert_allclose(error, np.broadcast_to(PUSH, error.shape), atol=5e-3)
 
 
 AXES = {
@@ -77,11 +77,11 @@ def test_a_wrong_sign_is_named_and_the_map_can_say_it(table, names, tmp_path):
     fields = FIELDS[table]
     table = table.partition("_q")[0]
     wrong = TABLE | {name: -TABLE[name] for name in names}
-    mended = "[" + ", ".join(f'"-{name}"' if name in names else f'"{name}"' for name in fields) + "]"
-    with pytest.raises(LogError) as caught:
+    correction = "[" + ", ".join(f'"-{name}"' if name in names else f'"{name}"' for name in fields) + "]"
+    with pytest.raises(LogError) as error:
         read(tmp_path, wrong, **changes)
-    assert f"{table}.fields = {mended} they would" in str(caught.value)
-    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": mended}))
+    assert f"{table}.fields = {correction} they would" in str(error.value)
+    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": correction}))
 
 
 @pytest.mark.parametrize(
@@ -96,19 +96,19 @@ def test_a_wrong_order_is_named_and_the_map_can_say_it(table, order, tmp_path):
     wrong = dict(TABLE)
     for name, place in zip(fields, order, strict=True):
         wrong[place.removeprefix("-")] = -TABLE[name] if place.startswith("-") else TABLE[name]
-    mended = "[" + ", ".join(f'"{name}"' for name in order) + "]"
-    with pytest.raises(LogError) as caught:
+    correction = "[" + ", ".join(f'"{name}"' for name in order) + "]"
+    with pytest.raises(LogError) as error:
         read(tmp_path, wrong, **changes)
-    assert f"{table}.fields = {mended} they would" in str(caught.value)
-    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": mended}))
+    assert f"{table}.fields = {correction} they would" in str(error.value)
+    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": correction}))
 
 
 @pytest.mark.parametrize(("world", "body"), [("NWU", "FLU"), ("SEU", "FLU"), ("ENU", "LBU"), ("ENU", "RFU")])
 def test_an_attitude_that_is_turned_about_z_is_named(world, body, tmp_path):
     own = np.swapaxes(to_world(world)[None], 1, 2) @ FLIGHT.R @ to_body(body)
     table = columns(dataclasses.replace(FLIGHT, R=own))
-    said = f'attitude.world = "{world}"' if world != "ENU" else f'attitude.body = "{body}"'
-    with pytest.raises(LogError, match=f"with {said} they would"):
+    text = f'attitude.world = "{world}"' if world != "ENU" else f'attitude.body = "{body}"'
+    with pytest.raises(LogError, match=f"with {text} they would"):
         read(tmp_path, table)
     is_the_flight(read(tmp_path, table, attitude__world=f'"{world}"', attitude__body=f'"{body}"'))
 
@@ -116,8 +116,8 @@ def test_an_attitude_that_is_turned_about_z_is_named(world, body, tmp_path):
 @pytest.mark.parametrize("degrees", [-150.0, -40.0, 30.0, 100.0])
 def test_a_heading_of_the_attitude_that_differs_is_named(degrees, tmp_path):
     """As that of a compass beside the axes of motion capture."""
-    turned = Rotation.from_euler("z", -degrees, degrees=True) * Rotation.from_matrix(FLIGHT.R)
-    table = columns(dataclasses.replace(FLIGHT, R=turned.as_matrix()))
+    rotation = Rotation.from_euler("z", -degrees, degrees=True) * Rotation.from_matrix(FLIGHT.R)
+    table = columns(dataclasses.replace(FLIGHT, R=rotation.as_matrix()))
     with pytest.raises(LogError, match=rf"with attitude.heading = {degrees:.0f} they would"):
         read(tmp_path, table)
     is_the_flight(read(tmp_path, table, attitude__heading=f"{degrees:.0f}"))
@@ -142,10 +142,10 @@ def test_axes_of_any_kind(world, body, tmp_path):
     """Right-handed and left-handed, as those of game engines; y upwards, as motion capture has it."""
     W, B = to_world(world), to_body(body)
     spin = np.linalg.det(B) * B
-    turned = dataclasses.replace(
+    rotation = dataclasses.replace(
         FLIGHT, p=FLIGHT.p @ W, v=FLIGHT.v @ W, R=np.swapaxes(W[None], 1, 2) @ FLIGHT.R @ B, omega=FLIGHT.omega @ spin
     )
-    is_the_flight(read(tmp_path, columns(turned), frames__world=f'"{world}"', frames__body=f'"{body}"'))
+    is_the_flight(read(tmp_path, columns(rotation), frames__world=f'"{world}"', frames__body=f'"{body}"'))
 
 
 def test_an_attitude_may_have_axes_of_its_own(tmp_path):
@@ -170,7 +170,7 @@ def test_alternatives_and_names_in_other_letters(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "text"),
     [
         ({"frames__world": '"ENN"'}, "no three axes"),
         ({"frames__world": '"FLU"'}, "no three axes"),
@@ -181,16 +181,16 @@ def test_alternatives_and_names_in_other_letters(tmp_path):
         ({"thrust__full": "65535.0"}, 'full goes with unit = "share"'),
     ],
 )
-def test_axes_that_are_none_are_named(changes, said, tmp_path):
-    with pytest.raises(ConfigError, match=said):
+def test_axes_that_are_none_are_named(changes, text, tmp_path):
+    with pytest.raises(ConfigError, match=text):
         read_map(write_map(tmp_path / "map.toml", **changes))
 
 
 def test_an_attitude_that_explains_little_is_read_with_a_warning(tmp_path):
     """A tilt that wanders: no statement of the map mends it."""
     off = 0.9 * np.sin(np.stack([2.3 * FLIGHT.t, 1.7 * FLIGHT.t + 1.0, 0.0 * FLIGHT.t], axis=1))
-    shaken = Rotation.from_matrix(FLIGHT.R) * Rotation.from_rotvec(off)
-    table = columns(dataclasses.replace(FLIGHT, R=shaken.as_matrix()))
+    noise = Rotation.from_matrix(FLIGHT.R) * Rotation.from_rotvec(off)
+    table = columns(dataclasses.replace(FLIGHT, R=noise.as_matrix()))
     text = MAP.partition("[rates]")[0]
     log = read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(write_map(tmp_path / "map.toml", text)))
     assert 0.0 < log.agreement["lift"] < 0.5

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from made_up_log import MAP, G, columns, flown, turned_frames, write_csv, write_map
+from fake_log import MAP, G, columns, fly_once, turned_frames, write_csv, write_map
 from retrim.errors import ConfigError, LogError, RetrimError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.flight_part import ENDS
 from retrim.io.logs.series import Series
 from retrim.io.logs.times import in_order
 
-FLIGHT = flown(12.0)
+FLIGHT = fly_once(12.0)
 
 
 def read(tmp_path, table, text=MAP, **changes):
@@ -27,8 +27,8 @@ def read(tmp_path, table, text=MAP, **changes):
 def agrees(log, flight, places=1e-6):
     """The log is the flight, but for the two ticks at each end that have no derivative."""
     assert len(log.t) == len(flight.t)
-    for found, true in ((log.p, flight.p), (log.R, flight.R), (log.v, flight.v), (log.c, flight.c)):
-        np.testing.assert_allclose(found, true, atol=places)
+    for result, true in ((log.p, flight.p), (log.R, flight.R), (log.v, flight.v), (log.c, flight.c)):
+        np.testing.assert_allclose(result, true, atol=places)
     np.testing.assert_allclose(log.command, flight.omega, atol=places)
     np.testing.assert_allclose(log.a[2:-2], flight.a[2:-2], atol=1e-3)
     assert log.valid[2:-2].all()
@@ -44,11 +44,11 @@ def test_a_plain_log_is_the_flight(tmp_path):
 
 def in_other_units(table):
     q = Rotation.from_quat(np.stack([table[f"q{a}"] for a in "xyzw"], axis=1))
-    changed = dict(table, t=1e6 * table["t"], c=table["c"] / 9.80665)
-    changed |= {f"p{a}": 1000.0 * table[f"p{a}"] for a in "xyz"} | {f"v{a}": 3.6 * table[f"v{a}"] for a in "xyz"}
-    changed |= {f"w{a}": np.degrees(table[f"w{a}"]) for a in "xyz"}
+    changes = dict(table, t=1e6 * table["t"], c=table["c"] / 9.80665)
+    changes |= {f"p{a}": 1000.0 * table[f"p{a}"] for a in "xyz"} | {f"v{a}": 3.6 * table[f"v{a}"] for a in "xyz"}
+    changes |= {f"w{a}": np.degrees(table[f"w{a}"]) for a in "xyz"}
     angles = q.as_euler("ZYX", degrees=True)
-    return changed | {"roll": angles[:, 2], "pitch": angles[:, 1], "yaw": angles[:, 0]}
+    return changes | {"roll": angles[:, 2], "pitch": angles[:, 1], "yaw": angles[:, 0]}
 
 
 def test_units_are_converted(tmp_path):
@@ -74,29 +74,29 @@ def test_velocities_in_body_axes_and_inverse_attitudes(tmp_path):
 def test_a_share_of_the_thrust_is_found_from_the_flight_or_told(tmp_path):
     table = columns(FLIGHT)
     table["c"] = -0.5 * table["c"] / G[2]
-    found = read(tmp_path, table, thrust__unit='"share"', thrust__positive='"down"')
-    assert found.full_thrust == pytest.approx(2 * G[2], rel=1e-3)
-    np.testing.assert_allclose(found.c, FLIGHT.c, rtol=1e-3)
-    told = read(tmp_path, table, thrust__unit='"share"', thrust__positive='"down"', thrust__hover="0.5")
-    np.testing.assert_allclose(told.c, FLIGHT.c, rtol=1e-6)
+    result = read(tmp_path, table, thrust__unit='"share"', thrust__positive='"down"')
+    assert result.full_thrust == pytest.approx(2 * G[2], rel=1e-3)
+    np.testing.assert_allclose(result.c, FLIGHT.c, rtol=1e-3)
+    message = read(tmp_path, table, thrust__unit='"share"', thrust__positive='"down"', thrust__hover="0.5")
+    np.testing.assert_allclose(message.c, FLIGHT.c, rtol=1e-6)
     newton = columns(FLIGHT) | {"c": 1.3 * FLIGHT.c}
     np.testing.assert_allclose(read(tmp_path, newton, thrust__unit='"N"', thrust__mass="1.3").c, FLIGHT.c, rtol=1e-6)
 
 
 def test_an_accelerometer_is_the_derivative_of_the_velocity(tmp_path):
-    felt = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.a + G)
-    table = columns(FLIGHT) | {f"f{a}": felt[:, i] for i, a in enumerate("xyz")}
+    specific_force = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.a + G)
+    table = columns(FLIGHT) | {f"f{a}": specific_force[:, i] for i, a in enumerate("xyz")}
     log = read(tmp_path, table, acceleration__fields='["fx", "fy", "fz"]')
     np.testing.assert_allclose(log.a, FLIGHT.a, atol=1e-5)
 
 
 def test_a_faster_log_is_interpolated_and_a_slower_one_has_its_own_tick(tmp_path):
-    fast = read(tmp_path, columns(flown(6.0, dt=0.004)))
-    slow = flown(6.0, dt=0.02)
+    fast = read(tmp_path, columns(fly_once(6.0, dt=0.004)))
+    slow = fly_once(6.0, dt=0.02)
     assert fast.dt == 0.02
     np.testing.assert_allclose(fast.p[: len(slow.p)], slow.p, atol=1e-4)
     np.testing.assert_allclose(fast.R[: len(slow.p)], slow.R, atol=1e-4)
-    rare = read(tmp_path, columns(flown(12.0, dt=0.05)))
+    rare = read(tmp_path, columns(fly_once(12.0, dt=0.05)))
     assert rare.dt == pytest.approx(0.05)
 
 
@@ -147,10 +147,10 @@ def test_commands_that_overtake_each_other_are_left_out(back, tmp_path):
     """Stamps are taken in two threads; what is commanded is held over the place of what came late."""
     series = Series(EPOCH + FLIGHT.t.copy(), FLIGHT.c[:, None])
     series.t[7::50] -= back
-    found, notes = in_order(series, "thrust", Path("log"))
+    result, notes = in_order(series, "thrust", Path("log"))
     assert notes == ["thrust: 12 of 601 samples are not newer than the one before, and are left out"] or back == 0.01
-    assert np.all(np.diff(found.t) > 0.0)
-    assert len(found.t) == 601 - (12 if back > 0.02 else 0)
+    assert np.all(np.diff(result.t) > 0.0)
+    assert len(result.t) == 601 - (12 if back > 0.02 else 0)
 
 
 def test_times_that_go_back_are_told_since_the_beginning():
@@ -161,12 +161,12 @@ def test_times_that_go_back_are_told_since_the_beginning():
 
 @pytest.mark.parametrize("dt", [0.096, 0.1016, 0.104])
 def test_ten_samples_a_second_are_enough(dt, tmp_path):
-    log = read(tmp_path, columns(flown(40.0, dt=dt)))
+    log = read(tmp_path, columns(fly_once(40.0, dt=dt)))
     assert log.dt == pytest.approx(dt, rel=1e-3)
     assert log.seconds > 39.0
 
 
-WINDY = flown(12.0, wind=(6.0, -2.0, 1.0))
+WINDY = fly_once(12.0, wind=(6.0, -2.0, 1.0))
 """Pushed so hard that it does not accelerate along its thrust axis: every other map is tried, and none is better."""
 
 
@@ -188,8 +188,8 @@ def test_a_strong_wind_is_no_mistake_of_the_map(factor, changes, tmp_path):
 
 @pytest.mark.parametrize("form", ["matrix", "roll pitch yaw"])
 def test_a_strong_wind_is_no_mistake_of_other_attitudes(form, tmp_path):
-    turned, table = Rotation.from_matrix(WINDY.R), columns(WINDY)
-    values = WINDY.R.reshape(-1, 9) if form == "matrix" else turned.as_euler("ZYX")[:, ::-1]
+    rotation, table = Rotation.from_matrix(WINDY.R), columns(WINDY)
+    values = WINDY.R.reshape(-1, 9) if form == "matrix" else rotation.as_euler("ZYX")[:, ::-1]
     table |= {f"r{i}": values[:, i] for i in range(values.shape[1])}
     fields = str([f"r{i}" for i in range(values.shape[1])]).replace("'", '"')
     log = read(
@@ -222,20 +222,20 @@ def back(x):
     return x
 
 
-def negated(*names):
+def negate(*names):
     return lambda table: table | {name: -table[name] for name in names}
 
 
-def scaled(factor, *names):
+def scale(factor, *names):
     return lambda table: table | {name: factor * table[name] for name in names}
 
 
-def swapped(table):
+def swap(table):
     return table | {"qx": table["qw"], "qy": table["qx"], "qz": table["qy"], "qw": table["qz"]}
 
 
 def inverse(table):
-    return negated("qx", "qy", "qz")(table)
+    return negate("qx", "qy", "qz")(table)
 
 
 def in_body_axes(table):
@@ -258,8 +258,8 @@ def ned(table):
 
 
 def frd(table):
-    turned = turned_frames(FLIGHT)
-    return columns(dataclasses.replace(FLIGHT, R=FLIGHT.R @ np.diag([1.0, -1.0, -1.0]), omega=turned.omega))
+    rotation = turned_frames(FLIGHT)
+    return columns(dataclasses.replace(FLIGHT, R=FLIGHT.R @ np.diag([1.0, -1.0, -1.0]), omega=rotation.omega))
 
 
 DAMAGED_TABLES = {
@@ -267,8 +267,8 @@ DAMAGED_TABLES = {
     "nothing finite": (spoil("vx", with_nan), "velocity has no finite sample"),
     "time stands still": (spoil("t", lambda t: 0 * t), "all at one time"),
     "time goes back": (spoil("t", back), "goes back 1 times.*several flights"),
-    "time in ms": (scaled(1000.0, "t"), "every 20 s.*is time in ms"),
-    "time too fine": (scaled(1e-6, "t"), "is time in ms, us or ns"),
+    "time in ms": (scale(1000.0, "t"), "every 20 s.*is time in ms"),
+    "time too fine": (scale(1e-6, "t"), "is time in ms, us or ns"),
     "two flights": (
         spoil("t", lambda t: np.concatenate([t[:300], t[: len(t) - 300]])),
         "back 1 times, first by 5.980 s",
@@ -276,20 +276,23 @@ DAMAGED_TABLES = {
     "too short": (lambda table: {n: x[:20] for n, x in table.items()}, "of flight are left, at least 1 s"),
     "one sample": (lambda table: {n: x[:1] for n, x in table.items()}, "1 samples, all at one time"),
     "too rare": (lambda table: {n: x[::20] for n, x in table.items()}, "every 0.4 s; accelerations need"),
-    "slower than any tick": (lambda table: columns(flown(12.0, dt=0.105)), "every 0.105 s; accelerations need.* 0.1 s"),
-    "quaternions not of norm one": (scaled(0.7, "qx", "qy", "qz", "qw"), "not of norm one"),
-    "quaternions in another order": (swapped, 'with attitude.form = "wxyz" they would'),
+    "slower than any tick": (
+        lambda table: columns(fly_once(12.0, dt=0.105)),
+        "every 0.105 s; accelerations need.* 0.1 s",
+    ),
+    "quaternions not of norm one": (scale(0.7, "qx", "qy", "qz", "qw"), "not of norm one"),
+    "quaternions in another order": (swap, 'with attitude.form = "wxyz" they would'),
     "inverse attitudes": (inverse, 'attitude.turns = "world to body" they would'),
     "NED and FRD": (ned, 'frames.world = "NED" and frames.body = "FRD"'),
     "FRD": (frd, 'frames.body = "FRD" they would'),
     "velocity in body axes": (in_body_axes, 'velocity.axes = "body" they would'),
-    "velocity in km/h": (scaled(3.6, "vx", "vy", "vz"), 'velocity.unit = "km/h" they would'),
-    "position in mm": (scaled(1000.0, "px", "py", "pz"), "position.*units"),
-    "rates in deg/s": (scaled(57.3, "wx", "wy", "wz"), 'rates.unit = "deg/s" they would'),
-    "rates against": (negated("wx", "wy", "wz"), "does not turn as it is told"),
-    "thrust downwards": (negated("c"), 'thrust is never above zero.*positive = "down"'),
-    "thrust in g": (scaled(1 / 9.80665, "c"), 'thrust.unit = "g" they would'),
-    "thrust of nothing": (scaled(0.0, "c"), "thrust is 0 throughout; thrust.fields must name"),
+    "velocity in km/h": (scale(3.6, "vx", "vy", "vz"), 'velocity.unit = "km/h" they would'),
+    "position in mm": (scale(1000.0, "px", "py", "pz"), "position.*units"),
+    "rates in deg/s": (scale(57.3, "wx", "wy", "wz"), 'rates.unit = "deg/s" they would'),
+    "rates against": (negate("wx", "wy", "wz"), "does not turn as it is told"),
+    "thrust downwards": (negate("c"), 'thrust is never above zero.*positive = "down"'),
+    "thrust in g": (scale(1 / 9.80665, "c"), 'thrust.unit = "g" they would'),
+    "thrust of nothing": (scale(0.0, "c"), "thrust is 0 throughout; thrust.fields must name"),
     "position does not change": (still, "position"),
     "positions of another time": (other_time, "position"),
 }
@@ -297,17 +300,17 @@ DAMAGED_TABLES = {
 
 @pytest.mark.parametrize("kind", DAMAGED_TABLES)
 def test_damaged_tables_are_named(kind, tmp_path):
-    damage, said = DAMAGED_TABLES[kind]
-    with pytest.raises(LogError, match=f"(?s)log.csv.*{said}") as caught:
+    damage, text = DAMAGED_TABLES[kind]
+    with pytest.raises(LogError, match=f"(?s)log.csv.*{text}") as error:
         read(tmp_path, damage(columns(FLIGHT)))
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error.value)
 
 
 WHOLE = None
 
 
 def text_of(tmp_path):
-    return write_csv(tmp_path / "whole.csv", columns(flown(3.0))).read_text()
+    return write_csv(tmp_path / "whole.csv", columns(fly_once(3.0))).read_text()
 
 
 def cut_line(text, number, line):
@@ -330,10 +333,10 @@ DAMAGED_FILES = {
 
 @pytest.mark.parametrize("kind", DAMAGED_FILES)
 def test_damaged_files_are_named(kind, tmp_path):
-    damage, said = DAMAGED_FILES[kind]
+    damage, text = DAMAGED_FILES[kind]
     path = tmp_path / "log.csv"
     path.write_text(damage(text_of(tmp_path)))
-    with pytest.raises(LogError, match=said):
+    with pytest.raises(LogError, match=text):
         read_flight_log(path, read_map(write_map(tmp_path / "map.toml")))
 
 
@@ -360,16 +363,16 @@ def test_time_on_the_ground_is_left_out(tmp_path):
     n, table = 200, columns(FLIGHT)
     before = {name: np.full(n, x[0]) for name, x in table.items()}
     before |= {"t": 0.02 * np.arange(-n, 0), "c": np.zeros(n)} | {f"v{a}": np.zeros(n) for a in "xyz"}
-    joined = {name: np.concatenate([before[name], x]) for name, x in table.items()}
-    joined["px"] += 1e-9 * np.arange(len(joined["px"]))
-    log = read(tmp_path, joined)
+    whole = {name: np.concatenate([before[name], x]) for name, x in table.items()}
+    whole["px"] += 1e-9 * np.arange(len(whole["px"]))
+    log = read(tmp_path, whole)
     assert any("on the ground" in note for note in log.notes)
     assert not log.valid[: n - 50].any()
     assert log.valid[n + 50 : -ENDS].all()
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "text"),
     [
         ({"position__unit": '"furlong"'}, "position.unit"),
         ({"position__feilds": '["x"]'}, "unknown key; did you mean 'fields'"),
@@ -380,13 +383,13 @@ def test_time_on_the_ground_is_left_out(tmp_path):
         ({"altitude__fields": '["z"]'}, "unknown key; "),
     ],
 )
-def test_wrong_maps_are_named(change, said, tmp_path):
-    with pytest.raises(ConfigError, match=said):
+def test_wrong_maps_are_named(change, text, tmp_path):
+    with pytest.raises(ConfigError, match=text):
         read_map(write_map(tmp_path / "map.toml", **change))
 
 
 def test_what_is_no_log_is_named(tmp_path):
-    for name, data, said in (
+    for name, data, text in (
         ("log.xyz", b"1", "no log that is known"),
         ("log.npz", b"PK junk", "not a whole NPZ"),
         ("log.csv", bytes(range(256)), "not a text file|no field|header"),
@@ -397,10 +400,10 @@ def test_what_is_no_log_is_named(tmp_path):
     ):
         path = tmp_path / name
         path.write_bytes(data)
-        named = "retrim-mcap" if "bag" in said else "px4" if name == "log.ulg" else "retrim-npz"
-        with pytest.raises(LogError, match=said):
-            read_flight_log(path, read_map(named))
-    path = write_csv(tmp_path / "log.csv", columns(flown(2.0)))
+        names = "retrim-mcap" if "bag" in text else "px4" if name == "log.ulg" else "retrim-npz"
+        with pytest.raises(LogError, match=text):
+            read_flight_log(path, read_map(names))
+    path = write_csv(tmp_path / "log.csv", columns(fly_once(2.0)))
     with pytest.raises(
         LogError, match=r"no field 'x0'.*without a map it is read as 'retrim-csv' or 'crazyflie'.*: give --map"
     ):
@@ -410,9 +413,9 @@ def test_what_is_no_log_is_named(tmp_path):
     (tmp_path / "log.txt").write_text("t\n1\n")
     with pytest.raises(LogError, match=r"say what is where.* maps by name: crazyflie, "):
         read_flight_log(tmp_path / "log.txt")
-    for name, said in (("a.bbl", "blackbox_decode"), ("a.BIN", "mavlogdump.py"), ("a.px4log", "sdlog2_dump.py")):
+    for name, text in (("a.bbl", "blackbox_decode"), ("a.BIN", "mavlogdump.py"), ("a.px4log", "sdlog2_dump.py")):
         (tmp_path / name).write_bytes(b"1")
-        with pytest.raises(LogError, match=rf"is not read; {said} .* makes a CSV.*--map map.toml"):
+        with pytest.raises(LogError, match=rf"is not read; {text} .* makes a CSV.*--map map.toml"):
             read_flight_log(tmp_path / name)
     with pytest.raises(LogError, match="cannot be read as a bag"):
         read_flight_log(tmp_path)
@@ -422,7 +425,7 @@ def test_what_is_no_log_is_named(tmp_path):
 
 def test_noise_is_never_a_flight(tmp_path):
     """Any bytes in any format give one line, and no other error."""
-    rng, chosen = np.random.default_rng(0), read_map(write_map(tmp_path / "map.toml"))
+    rng, choice = np.random.default_rng(0), read_map(write_map(tmp_path / "map.toml"))
     whole = text_of(tmp_path).encode()
     for k in range(60):
         data = bytearray(whole)
@@ -431,7 +434,7 @@ def test_noise_is_never_a_flight(tmp_path):
         path = tmp_path / f"log{['.csv', '.npz', '.ulg', '.mcap', '.bag', '.db3'][k % 6 if k > 30 else 0]}"
         path.write_bytes(bytes(data[: rng.integers(1, len(data))]))
         with contextlib.suppress(RetrimError):
-            log = read_flight_log(path, chosen)
+            log = read_flight_log(path, choice)
             assert np.isfinite(np.concatenate([log.p, log.v, log.c[:, None]], axis=1)).all()
 
 
@@ -441,7 +444,7 @@ DAMAGED = (0.0, np.nan, np.inf, 1e308, -1e308, 1e-308, 1e30, -1.0, 1e9)
 @pytest.mark.parametrize("missing", ["nothing", "velocity", "position"])
 def test_damaged_numbers_are_one_line_or_a_flight_that_is_finite(missing, tmp_path):
     """Any number in any column, once, for a while or throughout."""
-    rng, short = np.random.default_rng(1), columns(flown(3.0))
+    rng, short = np.random.default_rng(1), columns(fly_once(3.0))
     text = MAP if missing == "nothing" else re.sub(rf"\[{missing}\]\n.*\n", "", MAP)
     maps = [read_map(write_map(tmp_path / "map.toml", text, thrust__unit=unit)) for unit in ('"m/s^2"', '"share"')]
     for k in range(24):
@@ -450,12 +453,12 @@ def test_damaged_numbers_are_one_line_or_a_flight_that_is_finite(missing, tmp_pa
             first = rng.integers(0, len(table["t"]))
             table[name][first : first + rng.choice([1, 30, 500])] = rng.choice(DAMAGED)
         path = write_csv(tmp_path / "log.csv", table)
-        said = ""
+        message = ""
         try:
             log = read_flight_log(path, maps[k % 2])
         except RetrimError as error:
-            said = str(error)
-        assert "\n" not in said
-        assert len(said) < 1000
-        for column in () if said else (log.p, log.v, log.a, log.R, log.rates, log.c):
+            message = str(error)
+        assert "\n" not in message
+        assert len(message) < 1000
+        for column in () if message else (log.p, log.v, log.a, log.R, log.rates, log.c):
             assert np.isfinite(column[log.valid]).all()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from made_up_bytes import PX4_ODOMETRY, PX4_OLD_ODOMETRY, bag2, px4_messages, px4_topics, ulog
-from made_up_log import G, flown, write_csv
+from fake_bytes import PX4_ODOMETRY, PX4_OLD_ODOMETRY, bag2, px4_messages, px4_topics, ulog
+from fake_log import G, fly_once, write_csv
 from retrim.errors import LogError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.log_map import Time
@@ -15,7 +15,7 @@ from retrim.io.logs.message_times import evenly
 from retrim.io.logs.named_maps import USUAL, names
 from retrim.replay import rows_of
 
-FLIGHT = flown(8.0)
+FLIGHT = fly_once(8.0)
 Q = Rotation.from_matrix(FLIGHT.R).as_quat()
 
 
@@ -85,8 +85,8 @@ def test_the_map_names_the_time_of_messages(tmp_path):
 
     def messages():
         for k, t in enumerate(FLIGHT.t):
-            received = int(1.7e18 + 1e9 * t + 3e6 * abs(rng.normal())) + k
-            yield "/state", kind, received, {
+            arrival = int(1.7e18 + 1e9 * t + 3e6 * abs(rng.normal())) + k
+            yield "/state", kind, arrival, {
                 "at": 1000.0 * (t + 5.0), "p": FLIGHT.p[k], "v": FLIGHT.v[k], "q": Q[k], "w": FLIGHT.omega[k],
                 "c": 0.5 * FLIGHT.c[k] / G[2]}  # fmt: skip
 
@@ -121,7 +121,7 @@ def test_mavros(pose, tmp_path):
 
     def messages():
         for k, t in enumerate(FLIGHT.t):
-            at, received = header(t), round(1e9 * (t + 5.0))
+            at, arrival = header(t), round(1e9 * (t + 5.0))
             place = make["geometry_msgs/msg/Pose"](
                 make["geometry_msgs/msg/Point"](*FLIGHT.p[k]), make["geometry_msgs/msg/Quaternion"](*Q[k])
             )
@@ -129,15 +129,15 @@ def test_mavros(pose, tmp_path):
             if pose:
                 for topic, kind, inner in (("pose", "PoseStamped", place), ("velocity_local", "TwistStamped", twist)):
                     full = f"geometry_msgs/msg/{kind}"
-                    yield f"/uav1/mavros/local_position/{topic}", full, received, make[full](at, inner)
+                    yield f"/uav1/mavros/local_position/{topic}", full, arrival, make[full](at, inner)
             else:
                 odometry = make["nav_msgs/msg/Odometry"](
                     at, "base_link", make["geometry_msgs/msg/PoseWithCovariance"](place, np.zeros(36)),
                     make["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36)))  # fmt: skip
-                yield "/mavros/local_position/odom", "nav_msgs/msg/Odometry", received, odometry
-            told = {"header": at, "type_mask": 128, "body_rate": vector(*FLIGHT.omega[k]),
+                yield "/mavros/local_position/odom", "nav_msgs/msg/Odometry", arrival, odometry
+            message = {"header": at, "type_mask": 128, "body_rate": vector(*FLIGHT.omega[k]),
                     "thrust": 0.5 * FLIGHT.c[k] / G[2]}  # fmt: skip
-            yield f"{'/uav1' * pose}/mavros/setpoint_raw/attitude", target, received, told
+            yield f"{'/uav1' * pose}/mavros/setpoint_raw/attitude", target, arrival, message
 
     definition = {target: "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Vector3 body_rate\nfloat32 thrust\n"}
     log = read_flight_log(bag2(tmp_path / "bag", definition, messages(), store))
@@ -149,11 +149,11 @@ def test_px4_before_1_10(kind, tmp_path):
     pytest.importorskip("pyulog")
     topics, stamps = px4_topics(FLIGHT)
     share = 0.5 * FLIGHT.c / G[2]
-    told = topics["vehicle_rates_setpoint"]
-    del told["thrust_body"]
+    message = topics["vehicle_rates_setpoint"]
+    del message["thrust_body"]
     topics["sensor_combined"] = {"gyro_rad": ("float[3]", topics.pop("vehicle_angular_velocity")["xyz"][1])}
     if kind == "thrust":
-        told["thrust"] = ("float", share)
+        message["thrust"] = ("float", share)
     else:
         topics["actuator_controls_0"] = {"control": ("float[8]", np.repeat(share[:, None], 8, axis=1))}
     (tmp_path / "old.ulg").write_bytes(ulog(topics, stamps))
@@ -168,14 +168,14 @@ def test_a_ulog_may_have_another_time(tmp_path):
         fields["sampled"] = ("uint64_t", stamps)
     late = stamps + np.random.default_rng(0).integers(0, 8000, len(stamps))
     (tmp_path / "late.ulg").write_bytes(ulog(topics, late))
-    chosen = dataclasses.replace(read_map("px4"), time=Time("sampled", "us"))
-    is_the_flight(read_flight_log(tmp_path / "late.ulg", chosen), 1e-4)
+    choice = dataclasses.replace(read_map("px4"), time=Time("sampled", "us"))
+    is_the_flight(read_flight_log(tmp_path / "late.ulg", choice), 1e-4)
 
 
 def crazyflie(compressed, quaternion):
     """Columns of its log variables; pitch and its rates are positive nose up."""
     yaw, pitch, roll = Rotation.from_matrix(FLIGHT.R).as_euler("ZYX", degrees=True).T
-    told = np.degrees(FLIGHT.omega)
+    message = np.degrees(FLIGHT.omega)
     table = {"timestamp": 1000.0 * FLIGHT.t + 4000.0}
     group, unit = ("stateEstimateZ", 1000.0) if compressed else ("stateEstimate", 1.0)
     for i, axis in enumerate("xyz"):
@@ -184,13 +184,17 @@ def crazyflie(compressed, quaternion):
         table |= {f"stateEstimate.q{axis}": Q[:, i] for i, axis in enumerate("xyzw")}
     else:
         table |= {"stateEstimate.roll": roll, "stateEstimate.pitch": -pitch, "stateEstimate.yaw": yaw}
-    table |= {"controller.rollRate": told[:, 0], "controller.pitchRate": -told[:, 1], "controller.yawRate": told[:, 2]}
+    table |= {
+        "controller.rollRate": message[:, 0],
+        "controller.pitchRate": -message[:, 1],
+        "controller.yawRate": message[:, 2],
+    }
     if compressed:
         w = 1000.0 * FLIGHT.omega
         table |= {f"stateEstimateZ.rate{name}": s * w[:, i]
                   for i, (name, s) in enumerate((("Roll", 1), ("Pitch", -1), ("Yaw", 1)))}  # fmt: skip
     else:
-        table |= {f"gyro.{axis}": told[:, i] for i, axis in enumerate("xyz")}
+        table |= {f"gyro.{axis}": message[:, i] for i, axis in enumerate("xyz")}
     return table | {"stabilizer.thrust": 65535.0 * 0.5 * FLIGHT.c / G[2]}
 
 
@@ -207,7 +211,7 @@ def test_crazyswarm_has_poses_without_velocities(tmp_path):
     pytest.importorskip("rosbags")
     from rosbags.typesys import Stores, get_typestore
 
-    store, fine = get_typestore(Stores.ROS2_HUMBLE), flown(8.0, dt=0.01)
+    store, fine = get_typestore(Stores.ROS2_HUMBLE), fly_once(8.0, dt=0.01)
     make, q = store.types, Rotation.from_matrix(fine.R).as_quat()
     vector = make["geometry_msgs/msg/Vector3"]
     thrust = 65535.0 * 0.5 * fine.c / G[2]
@@ -221,8 +225,8 @@ def test_crazyswarm_has_poses_without_velocities(tmp_path):
             )
             pose = make["geometry_msgs/msg/PoseStamped"](make["std_msgs/msg/Header"](stamp, "world"), place)
             yield "/cf7/pose", "geometry_msgs/msg/PoseStamped", now, pose
-            told = make["geometry_msgs/msg/Twist"](vector(0.0, 0.0, thrust[k]), vector(0.0, 0.0, 0.0))
-            yield "/cf7/cmd_vel_legacy", "geometry_msgs/msg/Twist", now + 100, told
+            message = make["geometry_msgs/msg/Twist"](vector(0.0, 0.0, thrust[k]), vector(0.0, 0.0, 0.0))
+            yield "/cf7/cmd_vel_legacy", "geometry_msgs/msg/Twist", now + 100, message
 
     log = read_flight_log(bag2(tmp_path / "bag", {}, messages(), store))
     is_the_flight(log, 1e-3, command=False)
@@ -231,8 +235,8 @@ def test_crazyswarm_has_poses_without_velocities(tmp_path):
 
 def test_four_motors_are_no_thrust(tmp_path):
     table = crazyflie(False, False) | {f"motor.m{i}": 0.0 * FLIGHT.t for i in range(1, 5)}
-    chosen = tmp_path / "map.toml"
-    chosen.write_text("""
+    choice = tmp_path / "map.toml"
+    choice.write_text("""
     time = { field = "timestamp", unit = "ms" }
     position.fields = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z"]
     attitude.fields = ["stateEstimate.roll", "-stateEstimate.pitch", "stateEstimate.yaw"]
@@ -241,31 +245,31 @@ def test_four_motors_are_no_thrust(tmp_path):
     thrust = { fields = ["motor.m1", "motor.m2", "motor.m3", "motor.m4"], unit = "share" }
     """)
     with pytest.raises(LogError, match="thrust needs 1 number, its fields hold 4; add the motors' thrusts up"):
-        read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(chosen))
+        read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(choice))
 
 
 @pytest.mark.parametrize(("period", "jitter"), [(0.02, 0.006), (0.004, 0.003)])
 def test_messages_of_an_even_rate_are_not_as_late_as_they_are_received(period, jitter):
     rng = np.random.default_rng(0)
-    sent = 1.7e9 + period * np.arange(1200)
-    received = np.maximum.accumulate(sent + 0.003 + np.abs(rng.normal(0.0, jitter, 1200)))
-    found, even = evenly(received)
+    sending = 1.7e9 + period * np.arange(1200)
+    arrival = np.maximum.accumulate(sending + 0.003 + np.abs(rng.normal(0.0, jitter, 1200)))
+    result, even = evenly(arrival)
     assert even
-    assert np.all(np.diff(found) > 0.0)
-    np.testing.assert_allclose(found, sent + 0.003, atol=5e-4)
+    assert np.all(np.diff(result) > 0.0)
+    np.testing.assert_allclose(result, sending + 0.003, atol=5e-4)
 
 
 @pytest.mark.parametrize("kind", ["uneven", "lost", "few"])
 def test_messages_of_no_even_rate_have_the_time_of_reception(kind):
     rng = np.random.default_rng(0)
-    received = {
+    arrival = {
         "uneven": np.cumsum(rng.uniform(0.0, 0.04, 1000)),
         "lost": np.delete(0.02 * np.arange(1000), 500),
         "few": 0.02 * np.arange(20),
     }[kind]
-    found, even = evenly(received)
+    result, even = evenly(arrival)
     assert not even
-    np.testing.assert_array_equal(found, received)
+    np.testing.assert_array_equal(result, arrival)
 
 
 def test_thrust_without_a_header_beside_odometry_with_one(tmp_path):
@@ -276,7 +280,7 @@ def test_thrust_without_a_header_beside_odometry_with_one(tmp_path):
     store = get_typestore(Stores.ROS2_HUMBLE)
     make, rng, last = store.types, np.random.default_rng(0), 0
     vector = make["geometry_msgs/msg/Vector3"]
-    flight = flown(12.0, size=2.0)
+    flight = fly_once(12.0, size=2.0)
     q = Rotation.from_matrix(flight.R).as_quat()
 
     def messages():

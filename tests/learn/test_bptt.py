@@ -9,7 +9,7 @@ import pytest
 from jax import random
 from jax.flatten_util import ravel_pytree
 
-from helpers import GOAL, draw_starts, hover_env, hover_task, random_starts, replaced
+from helpers import GOAL, draw_starts, hover_env, hover_task, random_starts, replace_fields
 from retrim import learn
 from retrim.control import Policy
 from retrim.learn import Env, PolicyState, pretrain
@@ -71,7 +71,7 @@ def models(key):
 def test_perturbations_equal_plain_gradient(which, delay, jump_cost, key):
     """Whatever the model; a cost of jumps is in the gradient."""
     env = flown_env(models(key)[which], delay_ticks=delay)
-    env = env if jump_cost is None else replaced(env, jump_cost=jnp.array(jump_cost))
+    env = env if jump_cost is None else replace_fields(env, jump_cost=jnp.array(jump_cost))
     policy, x0 = awake(key), draw_starts(env.task, key, 3)
     value, gradient = policy_gradient(policy, env, x0)
 
@@ -80,8 +80,8 @@ def test_perturbations_equal_plain_gradient(which, delay, jump_cost, key):
 
     expected_value, expected = jax.jit(jax.value_and_grad(plain))(policy.layers)
     assert value == pytest.approx(float(expected_value), rel=1e-14)
-    for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(found, wanted, atol=1e-13 * max(np.abs(wanted).max(), 1e-12))
+    for result, target in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(result, target, atol=1e-13 * max(np.abs(target).max(), 1e-12))
     assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(gradient)) > 1e-4
 
 
@@ -90,8 +90,8 @@ def test_gradient_against_finite_differences(key):
     env, policy = flown_env(), awake(key)
     x0 = draw_starts(env.task, key, 3)
     _, gradient = policy_gradient(policy, env, x0)
-    flat, shaped = ravel_pytree(policy.layers)
-    losses = jax.jit(jax.vmap(lambda w: policy_loss(eqx.tree_at(lambda p: p.layers, policy, shaped(w)), env, x0)))
+    flat, unravel = ravel_pytree(policy.layers)
+    losses = jax.jit(jax.vmap(lambda w: policy_loss(eqx.tree_at(lambda p: p.layers, policy, unravel(w)), env, x0)))
     ways, step = np.random.default_rng(0).normal(size=(4, flat.size)), 1e-5
     ahead, behind = (np.asarray(losses(np.asarray(flat) + sign * step * ways)) for sign in (1.0, -1.0))
     slopes = ways @ np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradient)])
@@ -103,27 +103,29 @@ def test_delay_holds_commands_back(key):
     policy = awake(key)
 
     @eqx.filter_jit
-    def issued_at_first(task, x):
+    def first_commands(task, x):
         o, _ = task.observation(task.observation.init(x), jnp.array(0.0), x, policy.u_hover)
         return policy(o).c
 
     for delay in (1, 3):
         env = flown_env(delay_ticks=delay)
-        flown = jax.tree.map(np.asarray, rollout(env, policy, reset(env.task, key)))
-        np.testing.assert_allclose(flown.u.c[:delay], 9.81)
-        first = issued_at_first(env.task, jax.tree.map(lambda leaf: leaf[0], flown.x))
-        np.testing.assert_allclose(flown.u.c[delay], first, rtol=1e-12)
+        flight = jax.tree.map(np.asarray, rollout(env, policy, reset(env.task, key)))
+        np.testing.assert_allclose(flight.u.c[:delay], 9.81)
+        first = first_commands(env.task, jax.tree.map(lambda leaf: leaf[0], flight.x))
+        np.testing.assert_allclose(flight.u.c[delay], first, rtol=1e-12)
 
 
 @pytest.mark.parametrize("delay", [0, 3])
 def test_a_jump_costs_its_square_when_it_is_issued(key, delay):
     env, policy = flown_env(delay_ticks=delay), awake(key)
     start = reset(env.task, key)
-    free, charged = (rollout(each, policy, start) for each in (env, replaced(env, jump_cost=jnp.array(0.3))))
-    jax.tree.map(np.testing.assert_array_equal, (free.x, free.u), (charged.x, charged.u))
-    issued = np.column_stack([free.u.c, free.u.omega])[delay:]  # it acts so much later
-    jumps = np.diff(issued, axis=0, prepend=[policy.u_hover.vector()])
-    cost = (np.asarray(free.reward) - np.asarray(charged.reward))[: len(issued)]
+    free, cost_of_charge = (
+        rollout(each, policy, start) for each in (env, replace_fields(env, jump_cost=jnp.array(0.3)))
+    )
+    jax.tree.map(np.testing.assert_array_equal, (free.x, free.u), (cost_of_charge.x, cost_of_charge.u))
+    commands = np.column_stack([free.u.c, free.u.omega])[delay:]  # it acts so much later
+    jumps = np.diff(commands, axis=0, prepend=[policy.u_hover.vector()])
+    cost = (np.asarray(free.reward) - np.asarray(cost_of_charge.reward))[: len(commands)]
     np.testing.assert_allclose(cost, 0.3 * np.sum(jumps**2, axis=1), rtol=1e-9)
     assert np.max(cost) > 1e-3
 
@@ -131,24 +133,24 @@ def test_a_jump_costs_its_square_when_it_is_issued(key, delay):
 def test_a_residual_reaches_the_rollout(key):
     policy, x0 = fresh(key), Start(jnp.array(0.0), State.at(jnp.array(GOAL)))
     env = flown_env()
-    pushed = rollout(env.with_residual(lambda x, u: jnp.array([2.0, 0.0, 0.0])), policy, x0)
+    with_push = rollout(env.with_residual(lambda x, u: jnp.array([2.0, 0.0, 0.0])), policy, x0)
     assert np.asarray(rollout(env, policy, x0).x.v)[1, 0] == pytest.approx(0.0, abs=1e-2)
-    assert np.asarray(pushed.x.v)[1, 0] == pytest.approx(0.04, rel=1e-2)
+    assert np.asarray(with_push.x.v)[1, 0] == pytest.approx(0.04, rel=1e-2)
 
 
 def test_the_terminated_are_frozen_charged_and_give_finite_gradients(key):
     """Pushed out of a small box: terminated goes true for good, the state stays, the worst reward is charged."""
     env, policy = flown_env(box=1.05), awake(key)
     x0 = Start(jnp.array(0.0), State(jnp.array([1.0, 0.0, 1.0]), jnp.eye(3), jnp.array([1.0, 0.0, 0.0])))
-    flown = jax.tree.map(np.asarray, rollout(env, policy, x0))
-    end = int(np.argmax(flown.terminated))
+    flight = jax.tree.map(np.asarray, rollout(env, policy, x0))
+    end = int(np.argmax(flight.terminated))
     assert 1 <= end < 6
-    assert flown.terminated[end:].all()
-    np.testing.assert_array_equal(flown.x.p[end:], np.broadcast_to(flown.x.p[end], flown.x.p[end:].shape))
-    np.testing.assert_allclose(flown.reward[end:], flown.reward[:end].min())
+    assert flight.terminated[end:].all()
+    np.testing.assert_array_equal(flight.x.p[end:], np.broadcast_to(flight.x.p[end], flight.x.p[end:].shape))
+    np.testing.assert_allclose(flight.reward[end:], flight.reward[:end].min())
     batch = jax.tree.map(lambda leaf: jnp.asarray(np.stack(3 * [leaf])), x0)
     _, gradient = policy_gradient(policy, env, batch)
-    assert flown.reward[0] < 0.0  # a start outside the box is charged too, from its first tick
+    assert flight.reward[0] < 0.0  # a start outside the box is charged too, from its first tick
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
@@ -157,8 +159,8 @@ def test_a_gradient_that_is_not_finite_changes_nothing(key):
     env, policy, optimiser = flown_env(), awake(key), optax.adam(1e-2)
     state = PolicyState(policy, jax.jit(optimiser.init)(policy.layers))
     x0 = random_starts(env.task, key, 1, 2)
-    broken = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
-    after, losses = bptt(state, env, broken, optimiser=optimiser)
+    bad = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
+    after, losses = bptt(state, env, bad, optimiser=optimiser)
     assert not np.isfinite(losses).all()
     jax.tree.map(np.testing.assert_array_equal, after, state)
 
@@ -171,11 +173,13 @@ def test_training_lowers_the_loss_and_leaves_limits_alone(key):
     run = pretrain(policy, env, key, optimiser=optimiser, num_updates=40, num_envs=8, chunk=20)
     history = list(run)
     assert np.concatenate([losses for _, losses in history]).shape == (40,)
-    trained = history[-1][0].policy
+    trained_policy = history[-1][0].policy
     x0 = draw_starts(env.task, random.key(9), 32)
-    before, after = (float(policy_loss(p, env, x0)) for p in (policy, trained))
+    before, after = (float(policy_loss(p, env, x0)) for p in (policy, trained_policy))
     assert after < 0.5 * before
-    jax.tree.map(np.testing.assert_array_equal, (trained.u_min, trained.u_max), (policy.u_min, policy.u_max))
+    jax.tree.map(
+        np.testing.assert_array_equal, (trained_policy.u_min, trained_policy.u_max), (policy.u_min, policy.u_max)
+    )
 
 
 def test_chunks_do_not_change_the_program(key):

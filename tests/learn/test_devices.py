@@ -36,8 +36,8 @@ for policy, some in setup.pretraining(0):
     losses += [float(loss) for loss in some]
 pushed = Scenario("small", plant="simple", sensors="mocap")
 fleet = Fleet(preset, policy, [pushed], methods=("full",), starts=8, seconds=1.0)
-fleet.lots(fleet.specs)
-flights = fleet.run().flown
+fleet.make_batches(fleet.specs)
+flights = fleet.run().flights
 low_rank = setup.low_rank(policy, jax.random.key(0))
 state = setup.learner.init(low_rank, jax.random.key(1))
 window = RollingBuffer(preset.adapt.window)
@@ -46,7 +46,7 @@ workers = [PolicyWorker(setup.learner, state, jax.random.key(i)) for i in range(
 base = learn_base(workers, [window.window()] * 4, shared_base(workers[0]), jax.random.key(4))
 if {devices} > 1:
     learn_together(workers[:3], [window.window()] * 3, base)  # another number of vehicles, other devices
-learnt = [jax.tree.leaves(flight.learnt)[0] for flight in flights]
+learnt = [jax.tree.leaves(flight.learner_state)[0] for flight in flights]
 np.savez(
     "{out}",
     losses=losses,
@@ -61,7 +61,7 @@ np.savez(
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def devices(tmp_path_factory):
     """What one device and eight devices have computed, each in a process of its own, at the same time."""
     folder = tmp_path_factory.mktemp("devices")
 
@@ -72,38 +72,38 @@ def found(tmp_path_factory):
         return subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.PIPE, text=True)
 
     processes = [start(1), start(8)]
-    said = [process.communicate(timeout=400)[1] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], said
+    text = [process.communicate(timeout=400)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], text
     return [dict(np.load(folder / f"{devices}.npz")) for devices in (1, 8)]
 
 
 @pytest.mark.slow
-def test_pretraining_is_that_of_one_device(found):
-    one, eight = found
+def test_pretraining_is_that_of_one_device(devices):
+    one, eight = devices
     assert len(one["losses"]) == 4
     np.testing.assert_allclose(eight["losses"], one["losses"], rtol=1e-9)
     np.testing.assert_allclose(eight["weights"], one["weights"], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_flights_of_a_batch_are_those_of_one_device(found):
-    one, eight = found
+def test_flights_of_a_batch_are_those_of_one_device(devices):
+    one, eight = devices
     assert one["flown"].shape == (8, 51, 3)
     np.testing.assert_allclose(eight["flown"], one["flown"], atol=1e-7)
     np.testing.assert_allclose(eight["commands"], one["commands"], atol=1e-6)
 
 
 @pytest.mark.slow
-def test_what_a_fleet_learns_is_that_of_one_device(found):
-    one, eight = found
+def test_what_a_fleet_learns_is_that_of_one_device(devices):
+    one, eight = devices
     np.testing.assert_array_equal(eight["swaps"], one["swaps"])
     assert one["swaps"].sum() > 0
     np.testing.assert_allclose(eight["learnt"], one["learnt"], atol=1e-6)
 
 
 @pytest.mark.slow
-def test_a_shared_base_is_that_of_one_device(found):
-    one, eight = found
+def test_a_shared_base_is_that_of_one_device(devices):
+    one, eight = devices
     np.testing.assert_allclose(eight["base"], one["base"], atol=1e-7)
 
 

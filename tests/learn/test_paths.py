@@ -8,12 +8,12 @@ import optax
 import pytest
 from jax import random
 
-from helpers import first_order, hover_env, hover_task, random_command, stacked
+from helpers import first_order, hover_env, hover_task, random_command, stack_trees
 from retrim.control import Policy
 from retrim.learn import Env, PolicyState, rollout
 from retrim.learn.bptt import bptt
 from retrim.learn.pretrain import random_starts
-from retrim.physics import ActuatorResponse, Command, CommandPath, Hybrid, Lagged, PointMass, small
+from retrim.physics import ActuatorResponse, Command, CommandPath, Hybrid, LaggedModel, PointMass, small
 from retrim.physics.actuators import with_response
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -30,16 +30,16 @@ def policy_of(key):
     return eqx.tree_at(lambda p: p.layers[-1].weight, policy, 0.3 * random.normal(key, policy.layers[-1].weight.shape))
 
 
-def flown(env, key):
+def fly_once(env, key):
     return eqx.filter_jit(rollout)(env, policy_of(key), env.task.reset(key))
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 7])
 def test_whole_ticks_are_the_roll_out_of_old(ticks, key):
     """Commands wait in a list, and the first-order lag is the one of before: to the last digits, tick by tick."""
-    env = hover_env(Lagged(PointMass(DT), first_order(0.033)), delay_ticks=ticks, horizon=15)
+    env = hover_env(LaggedModel(PointMass(DT), first_order(0.033)), delay_ticks=ticks, horizon=15)
     policy, start = policy_of(key), env.task.reset(key)
-    found = flown(env, key)
+    result = fly_once(env, key)
     x, acting, queue = start.x, Command.hover(float), [Command.hover(float)] * ticks
     step, decay = eqx.filter_jit(PointMass(DT).step), np.exp(-DT / 0.033)
     left = 0.033 / DT * (1.0 - decay)
@@ -49,9 +49,9 @@ def test_whole_ticks_are_the_roll_out_of_old(ticks, key):
         last = policy(o)
         queue.append(last)
         u = queue.pop(0)
-        np.testing.assert_allclose(found.u.omega[k], u.omega, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(found.x.p[k], x.p, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(found.x.R[k], x.R, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(result.u.omega[k], u.omega, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(result.x.p[k], x.p, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(result.x.R[k], x.R, rtol=1e-12, atol=1e-13)
         mean, acting = (
             jax.tree.map(lambda old, new, share=share: new + share * (old - new), acting, u) for share in (left, decay)
         )
@@ -61,20 +61,20 @@ def test_whole_ticks_are_the_roll_out_of_old(ticks, key):
 def test_a_fractional_delay_is_a_mean_of_two_commands(key):
     """What was issued is what acts at the delay of zero; the vehicle is frozen, so that both fly the same states."""
     policy, task = policy_of(key), hover_task(horizon=12)
-    env = Env(Lagged(PointMass(DT), first_order(1e6)), task)  # actuators that never move: commands do not matter
+    env = Env(LaggedModel(PointMass(DT), first_order(1e6)), task)  # actuators that never move: commands do not matter
     start = task.reset(key)
-    issued, late = (
+    commands, late = (
         eqx.filter_jit(rollout)(env.with_path(CommandPath.of(d, first_order(1e6))), policy, start).u
         for d in (0.0, 0.026)
     )
-    c = np.concatenate([np.full(2, 9.81), issued.c])
+    c = np.concatenate([np.full(2, 9.81), commands.c])
     np.testing.assert_allclose(late.c, (0.7 * c[1:] + 0.3 * c[:-1])[:12], rtol=1e-9)
 
 
 def test_one_program_trains_for_every_path(key):
     """Another delay, lag or damping is another number; so it is for a task with another queue of the same length."""
     optimiser, traces = optax.adam(1e-3), []
-    env = hover_env(Lagged(PointMass(DT), first_order(0.03)), horizon=6)
+    env = hover_env(LaggedModel(PointMass(DT), first_order(0.03)), horizon=6)
 
     @eqx.filter_jit
     def train(state, env, starts):
@@ -90,19 +90,19 @@ def test_one_program_trains_for_every_path(key):
 
 
 def test_a_batch_of_vehicles_equals_its_members(key):
-    env = hover_env(Lagged(PointMass(DT), first_order(0.03)), horizon=12)
+    env = hover_env(LaggedModel(PointMass(DT), first_order(0.03)), horizon=12)
     policy, start = policy_of(key), env.task.reset(key)
     fly = eqx.filter_jit(lambda paths: jax.vmap(lambda path: rollout(env.with_path(path), policy, start))(paths))
-    together = fly(stacked(PATHS))
+    together = fly(stack_trees(PATHS))
     for i, path in enumerate(PATHS):
-        alone = flown(env.with_path(path), key)
+        alone = fly_once(env.with_path(path), key)
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-11, atol=1e-12)
 
 
 def test_gradients_of_a_path_against_finite_differences(key):
     """Of a roll-out's reward, in the vehicle: what a policy gains by a faster one."""
-    env = hover_env(Lagged(PointMass(DT), first_order(0.03)), horizon=10)
+    env = hover_env(LaggedModel(PointMass(DT), first_order(0.03)), horizon=10)
     policy, start = policy_of(key), env.task.reset(key)
     cost = jax.jit(lambda path: jnp.sum(rollout(env.with_path(path), policy, start).reward))
     path = PATHS[2]
@@ -120,10 +120,10 @@ def test_gradients_of_a_path_against_finite_differences(key):
 @pytest.mark.parametrize("wrap", [lambda model: model, lambda model: Hybrid(model, lambda x, u: STILL)])
 def test_a_path_reaches_the_model_behind_its_wrappers(wrap, key):
     slow, u = first_order(0.2), random_command(key)
-    expected = wrap(Lagged(PointMass(DT), slow))
-    for model in (wrap(PointMass(DT)), wrap(Lagged(PointMass(DT), first_order(0.01)))):
-        found = with_response(model, slow)
+    expected = wrap(LaggedModel(PointMass(DT), slow))
+    for model in (wrap(PointMass(DT)), wrap(LaggedModel(PointMass(DT), first_order(0.01)))):
+        result = with_response(model, slow)
         x = hover_task().reset(key).x
-        a, b = (eqx.filter_jit(each.step)(each.init(x), u, STILL) for each in (found, expected))
-        assert found.settling_ticks == expected.settling_ticks
-        np.testing.assert_array_equal(found.state(a).vector(), expected.state(b).vector())
+        a, b = (eqx.filter_jit(each.step)(each.init(x), u, STILL) for each in (result, expected))
+        assert result.settling_ticks == expected.settling_ticks
+        np.testing.assert_array_equal(result.state(a).vector(), expected.state(b).vector())

@@ -18,7 +18,7 @@ from retrim.learn.pretrain import pretrain
 def losses(monkeypatch):
     """Training that only tells losses."""
 
-    def told(values):
+    def capture(values):
         rest = iter(values)
         monkeypatch.setattr(
             sys.modules[pretrain.__module__],
@@ -26,7 +26,7 @@ def losses(monkeypatch):
             lambda state, env, key, optimiser, n, envs: (state, jnp.array([next(rest)] * n)),
         )
 
-    return told
+    return capture
 
 
 def run(num_updates, chunk):
@@ -74,7 +74,7 @@ def empty(request):
 def test_nothing_is_saved(tmp_path):
     (tmp_path / "nan_task.py").write_text(NAN)
     words = ("pretrain", "nan_task:empty", "--updates", "10", "--envs", "1", "--out", "p")
-    said = [line for line in retrim(*words, cwd=tmp_path, code=1).splitlines() if line.startswith("retrim:")]
-    assert len(said) == 1
-    assert "the loss is not a number in steps 1 to 10 of 10, and no policy is kept" in said[0]
+    text = [line for line in retrim(*words, cwd=tmp_path, code=1).splitlines() if line.startswith("retrim:")]
+    assert len(text) == 1
+    assert "the loss is not a number in steps 1 to 10 of 10, and no policy is kept" in text[0]
     assert not list(tmp_path.rglob("policy.safetensors"))

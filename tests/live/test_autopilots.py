@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from peers import peer, started
+from peers import peer, start_process
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
 from retrim.plants.bridges import crtp
@@ -32,7 +32,7 @@ HOME = np.array([0.0, 0.0, 1.0])
 TRUE = slice(18, 21)
 
 
-def trained(tmp_path_factory, task, *words):
+def train_policy(tmp_path_factory, task, *words):
     folder = tmp_path_factory.mktemp(task)
     command = [*RETRIM, "pretrain", task, "--preset", f"{task}/retrim", "--out", str(folder), *words]
     subprocess.run(command, check=True, capture_output=True, timeout=300)
@@ -41,7 +41,7 @@ def trained(tmp_path_factory, task, *words):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    return trained(tmp_path_factory, "hover")
+    return train_policy(tmp_path_factory, "hover")
 
 
 def live(policy, plant, out, *words, seconds=20):
@@ -52,22 +52,22 @@ def live(policy, plant, out, *words, seconds=20):
 BUSY = 0.05  # share of the ticks that the watchdog may fly on a machine that is busy with something else
 
 
-def found(out):
+def find(out):
     """Figures of the flight, and its log."""
     results = json.loads((out / "results.json").read_text())
     return {row["metric"]: row["value"] for row in results["rows"]}, read_log(out / "flight.csv")
 
 
-def said_by(flight, *, fails=False):
-    said = flight.communicate(timeout=240)[0]
-    assert (flight.returncode != 0) == fails, said
-    return said
+def output_of(flight, *, fails=False):
+    text = flight.communicate(timeout=240)[0]
+    assert (flight.returncode != 0) == fails, text
+    return text
 
 
 def error(rows, since=0.0, until=1e9, target=HOME):
     """True distance from a place at each tick that the policy flew [m]."""
-    flown = rows[(rows[:, 1] >= since) & (rows[:, 1] < until) & (rows[:, -1] == Mode.POLICY)]
-    return np.linalg.norm(flown[:, TRUE] - target, axis=1)
+    flight = rows[(rows[:, 1] >= since) & (rows[:, 1] < until) & (rows[:, -1] == Mode.POLICY)]
+    return np.linalg.norm(flight[:, TRUE] - target, axis=1)
 
 
 # ---- peers
@@ -76,16 +76,16 @@ PEERS = {"mavlink": f"mavlink:udp:127.0.0.1:{PORT}", "crazyflie": f"crazyflie:ud
 each_peer = pytest.mark.parametrize("speaks", PEERS)
 
 
-def flown_by(speaks, *words):
+def start_vehicle(speaks, *words):
     return peer(speaks, "--port", PORT, *words)
 
 
 @each_peer
 def test_a_flight_adapts_under_a_large_disturbance(speaks, small, tmp_path):
-    with flown_by(speaks, "--disturbance", "large"):
-        said = said_by(live(small, PEERS[speaks], tmp_path))
-    figures, rows = found(tmp_path)
-    assert "flight over: landed" in said
+    with start_vehicle(speaks, "--disturbance", "large"):
+        text = output_of(live(small, PEERS[speaks], tmp_path))
+    figures, rows = find(tmp_path)
+    assert "flight over: landed" in text
     assert figures["policies"] > 10
     assert figures["fallback_ticks"] <= BUSY * len(rows)
     assert figures["refused_messages"] == 0
@@ -95,12 +95,12 @@ def test_a_flight_adapts_under_a_large_disturbance(speaks, small, tmp_path):
 @each_peer
 def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(speaks, small, tmp_path):
     """The guard sinks blindly, holds when it sees again, and lands; the log goes on."""
-    with flown_by(speaks, "--cut", "5", "1"):
-        said = said_by(live(small, PEERS[speaks], tmp_path))
-    _, rows = found(tmp_path)
+    with start_vehicle(speaks, "--cut", "5", "1"):
+        text = output_of(live(small, PEERS[speaks], tmp_path))
+    _, rows = find(tmp_path)
     modes = rows[:, -1]
-    assert "blind: " in said
-    assert "flight over: landed" in said
+    assert "blind: " in text
+    assert "flight over: landed" in text
     assert np.mean(modes[rows[:, 1] < 4.5] == Mode.POLICY) > 1.0 - BUSY
     assert set(modes[rows[:, 1] > 5.5]) <= {Mode.BLIND, Mode.HOLD, Mode.DESCEND, Mode.LANDED}
     assert np.abs(rows[:, 18:20]).max() < 1.0
@@ -109,27 +109,27 @@ def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(speaks, small, tmp_pa
 @each_peer
 def test_a_link_that_is_cut_for_five_seconds_is_lost_and_the_log_is_kept(speaks, small, tmp_path):
     """The vehicle is its autopilot's, which holds its place, or lets it fall; nobody takes it back."""
-    with flown_by(speaks, "--cut", "5", "5"):
-        said = said_by(live(small, PEERS[speaks], tmp_path), fails=True)
-    figures, rows = found(tmp_path)
-    assert "plant lost: the link has been silent for 2 s" in said
+    with start_vehicle(speaks, "--cut", "5", "5"):
+        text = output_of(live(small, PEERS[speaks], tmp_path), fails=True)
+    figures, rows = find(tmp_path)
+    assert "plant lost: the link has been silent for 2 s" in text
     assert 5.0 < rows[-1, 1] < 8.0
     assert "missed_ticks" in figures
 
 
-def killed_in_flight(speaks, policy, out):
+def kill_in_flight(speaks, policy, out):
     """Fly, kill the process of the link after two seconds, and return when all of retrim has ended."""
     flight = live(policy, PEERS[speaks], out)
     while not (out / "flight.csv").exists() or len((out / "flight.csv").read_text().splitlines()) < 100:
         assert flight.poll() is None
         time.sleep(0.1)
     os.kill(bridge_of(flight.pid), signal.SIGKILL)
-    assert "the plant process is gone" in said_by(flight, fails=True)
+    assert "the plant process is gone" in output_of(flight, fails=True)
 
 
 def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_path):
-    with flown_by("mavlink") as autopilot:
-        killed_in_flight("mavlink", small, tmp_path)
+    with start_vehicle("mavlink") as autopilot:
+        kill_in_flight("mavlink", small, tmp_path)
         assert autopilot.poll() is None
         listener = MavlinkLink(UdpEndpoint("127.0.0.1", PORT))
         try:
@@ -146,8 +146,8 @@ def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_
 
 def test_a_crazyflie_whose_bridge_is_killed_falls(small, tmp_path):
     """There is nothing on board that would hold it: after two seconds without a setpoint its motors stop."""
-    with flown_by("crazyflie"):
-        killed_in_flight("crazyflie", small, tmp_path)
+    with start_vehicle("crazyflie"):
+        kill_in_flight("crazyflie", small, tmp_path)
         listener = CrazyflieLink(UdpEndpoint("127.0.0.1", 0), ("127.0.0.1", PORT))
         try:
             listener.start_logs(5.0, lambda: True)
@@ -191,18 +191,18 @@ class Changes:
 @PX4_ONLY
 @pytest.mark.px4
 def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_seconds(tmp_path_factory, tmp_path):
-    policy = trained(tmp_path_factory, "hover", "--vehicle", SIH)
-    with started(sys.executable, "-m", "retrim.testing.px4", PX4):
+    policy = train_policy(tmp_path_factory, "hover", "--vehicle", SIH)
+    with start_process(sys.executable, "-m", "retrim.testing.px4", PX4):
         changes, flight = Changes(), live(policy, ADDRESS, tmp_path, seconds=90)
         try:
             changes.set_at(tmp_path / "flight.csv", 30.0, flight, SIH_MASS=1.3)
             changes.set_at(tmp_path / "flight.csv", 60.0, flight, SIH_T_MAX=4.25)
         finally:
             changes.link.close()
-        said = said_by(flight)
-    figures, rows = found(tmp_path)
+        text = output_of(flight)
+    figures, rows = find(tmp_path)
     print(f"mean error [m] by 5 s: {[round(float(error(rows, t, t + 5).mean()), 3) for t in range(0, 90, 5)]}")
-    assert "flight over: landed" in said
+    assert "flight over: landed" in text
     # PX4's estimate is 4 to 5 cm off, and wanders: single windows of 5 s are 4 to 12 cm, as they are without a change.
     spans = [error(rows, since, until).mean() for since, until in ((0.0, 30.0), (33.0, 60.0), (63.0, 90.0))]
     print(f"mean error [m] before, and from 3 s after each change: {np.round(spans, 3).tolist()}")
@@ -213,14 +213,14 @@ def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_s
 @PX4_ONLY
 @pytest.mark.px4
 def test_px4_flies_a_circle(tmp_path_factory, tmp_path):
-    policy = trained(tmp_path_factory, "track", "--vehicle", SIH, "--reference", "circle")
-    with started(sys.executable, "-m", "retrim.testing.px4", PX4):
-        said = said_by(live(policy, ADDRESS, tmp_path, "--reference", "circle", seconds=30))
-    figures, rows = found(tmp_path)
-    flown = rows[(rows[:, 1] > 6.0) & (rows[:, -1] == Mode.POLICY)]
+    policy = train_policy(tmp_path_factory, "track", "--vehicle", SIH, "--reference", "circle")
+    with start_process(sys.executable, "-m", "retrim.testing.px4", PX4):
+        text = output_of(live(policy, ADDRESS, tmp_path, "--reference", "circle", seconds=30))
+    figures, rows = find(tmp_path)
+    flight = rows[(rows[:, 1] > 6.0) & (rows[:, -1] == Mode.POLICY)]
     print(f"steady error {figures['steady']:.3f} m")
-    assert "flight over: landed" in said
+    assert "flight over: landed" in text
     assert figures["steady"] < 0.2
-    assert np.ptp(flown[:, 18]) == pytest.approx(2.0, abs=0.3)  # the circle's diameter, along x and y
-    assert np.ptp(flown[:, 19]) == pytest.approx(2.0, abs=0.3)
-    assert np.abs(flown[:, 20] - 1.0).max() < 0.4
+    assert np.ptp(flight[:, 18]) == pytest.approx(2.0, abs=0.3)  # the circle's diameter, along x and y
+    assert np.ptp(flight[:, 19]) == pytest.approx(2.0, abs=0.3)
+    assert np.abs(flight[:, 20] - 1.0).max() < 0.4

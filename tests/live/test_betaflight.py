@@ -23,10 +23,10 @@ STEP = 1.0  # [rad/s]
 LOST, GAP = 0.1, 0.02  # [s] of simulation lost, between two looks: from here on the machine is what a flight measures
 
 
-def asked_of_a_machine_in_time(lost, gap=0.0):
+def skip_if_late(loss, gap=0.0):
     """Skip what is left of a test: board, world and test were not on time, so nothing is said of the firmware."""
-    if lost > LOST or gap > GAP:
-        pytest.skip(f"the machine is busy: the simulation lost {lost:.2f} s, the test {gap:.3f} s")
+    if loss > LOST or gap > GAP:
+        pytest.skip(f"the machine is busy: the simulation lost {loss:.2f} s, the test {gap:.3f} s")
 
 
 def test_it_is_a_link_to_a_vehicle():
@@ -41,17 +41,17 @@ def test_rates_follow_on_every_axis_in_the_right_sense():
         for axis in range(3):
             plant.take_off(np.array([0.0, 0.0, 20.0]), 0.0)
             plant.hold(time.monotonic() + 0.5)
-            told = np.zeros(4)
-            told[0], told[1 + axis] = 9.81, STEP
+            message = np.zeros(4)
+            message[0], message[1 + axis] = 9.81, STEP
             plant.send(np.array([9.81, 0.0, 0.0, 0.0]))
             plant.wait(time.monotonic() + 0.3)
-            plant.send(told)
+            plant.send(message)
             began, after = time.monotonic(), []
             while time.monotonic() < began + 0.6:
                 after.append((time.monotonic() - began, plant.read().omega.copy()))
                 plant.wait(time.monotonic() + 0.002)
             t, omega = np.array([a for a, _ in after]), np.array([b for _, b in after])
-            asked_of_a_machine_in_time(plant.lost, float(np.diff(t).max()))
+            skip_if_late(plant.lost_time, float(np.diff(t).max()))
             at = [1000 * t[omega[:, axis] > share * STEP][0] for share in (0.1, 0.9)]
             over = 100 * (omega[:, axis].max() / STEP - 1)
             print(f"{'xyz'[axis]}: 10 % after {at[0]:.0f} ms, 90 % after {at[1]:.0f} ms, overshoot {over:.0f} %")
@@ -82,20 +82,20 @@ def real_time():
 
 
 @pytest.mark.skipif(not real_time(), reason="SCHED_FIFO is refused here")
-@pytest.mark.parametrize(("disturbance", "allowed"), [("none", 0.03), ("small", 0.03), ("large", 0.05)])
-def test_a_flight_adapts_in_real_time(policy, disturbance, allowed, tmp_path):
+@pytest.mark.parametrize(("disturbance", "allowance"), [("none", 0.03), ("small", 0.03), ("large", 0.05)])
+def test_a_flight_adapts_in_real_time(policy, disturbance, allowance, tmp_path):
     words = ["live", "--policy", str(policy), "--plant", "betaflight", "--disturbance", disturbance, "--no-page"]
-    ran = subprocess.run(
+    process = subprocess.run(
         [*RETRIM, *words, "--seconds", "30", "--out", str(tmp_path)], capture_output=True, text=True, timeout=240
     )
     figures = {row["metric"]: row["value"] for row in json.loads((tmp_path / "results.json").read_text())["rows"]}
-    asked_of_a_machine_in_time(figures["simulation_lost_s"] or 0.0)
-    assert ran.returncode == 0, ran.stdout
-    assert "flight over: landed" in ran.stdout
+    skip_if_late(figures["simulation_lost_s"] or 0.0)
+    assert process.returncode == 0, process.stdout
+    assert "flight over: landed" in process.stdout
     rows = read_log(tmp_path / "flight.csv")
-    flown = rows[rows[:, 1] < 30.0]
+    flight = rows[rows[:, 1] < 30.0]
     print(f"{disturbance}: steady {figures['steady']:.4f} m, {figures['policies']} policies")
     assert rows[-1, -1] == Mode.LANDED
-    assert flown[-1, 1] > 29.0
+    assert flight[-1, 1] > 29.0
     assert figures["policies"] > 3
-    assert figures["steady"] <= allowed
+    assert figures["steady"] <= allowance

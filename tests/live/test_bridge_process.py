@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bus_ends import arrived
+from bus_ends import await_message
 from live_processes import Beside
 from retrim.live.processes import bridge as bridge_process
 from retrim.live.processes.bridge import BridgePlan
@@ -32,18 +32,18 @@ def between():
 
 
 @pytest.fixture
-def carried(between, tmp_path):
+def bridge_case(between, tmp_path):
     """The same, with the bridge in place of its plan; it carries already."""
     here, there, parent, plan = between
     bridge = launch("retrim.live.processes.bridge:carry", plan, tmp_path / "bridge.log")
-    arrived(here, "ready.bridge", patience=30.0)
+    await_message(here, "ready.bridge", patience=30.0)
     yield here, there, parent, bridge
     bridge.kill()
     bridge.wait()
 
 
-def test_a_flight_that_lost_its_supervisor_tells_the_ground_how_it_ended(carried):
-    here, there, parent, bridge = carried
+def test_a_flight_that_lost_its_supervisor_tells_the_ground_how_it_ended(bridge_case):
+    here, there, parent, bridge = bridge_case
     here.publish("sample", b"flies")
     parent.kill()
     parent.wait()
@@ -51,7 +51,7 @@ def test_a_flight_that_lost_its_supervisor_tells_the_ground_how_it_ended(carried
     here.publish("sample", b"flies still")
     assert bridge.poll() is None
     here.publish("ended", pack_note("ended", reason="landed"))
-    arrived(there, "ended")
+    await_message(there, "ended")
     assert last_note(there, "ended") == {"reason": "landed"}
     assert bridge.wait(bridge_process.SILENCE) == 0  # nobody is left to end it
     assert Path(f"{there.folder}-left").exists()
@@ -67,8 +67,8 @@ def test_without_a_supervisor_and_a_flight_it_ends(between, monkeypatch):
     assert last_note(there, "ended") == {}
 
 
-def test_a_bridge_that_is_told_to_end_leaves_the_network(carried):
-    _, there, _, bridge = carried
+def test_a_bridge_that_is_told_to_end_leaves_the_network(bridge_case):
+    _, there, _, bridge = bridge_case
     bridge.terminate()
     assert bridge.wait(10.0) == 128 + 15
     assert Path(f"{there.folder}-left").exists()

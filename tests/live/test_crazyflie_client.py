@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from peers import peer, started
+from peers import peer, start_process
 from retrim import Scenario, testing
 
 CFLIB = os.environ.get("RETRIM_CFLIB", "")
@@ -73,9 +73,9 @@ print(json.dumps(found))
 def port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        found = free.getsockname()[1]
-    with peer("crazyflie", "--plant", "simple", "--port", found):
-        yield found
+        result = free.getsockname()[1]
+    with peer("crazyflie", "--plant", "simple", "--port", result):
+        yield result
 
 
 def test_its_own_client_connects_logs_arms_and_flies_it(port):
@@ -83,20 +83,20 @@ def test_its_own_client_connects_logs_arms_and_flies_it(port):
     share = float(9.81 * vehicle.mass / vehicle.thrust_max)
     percent = (share * 65_535 - 10_001) / 499.99 if share * 65_535 > 10_001 else 0.0
     words = [CFLIB, "-c", CLIENT, f"udp://127.0.0.1:{port}", str(percent)]
-    ran = subprocess.run(words, capture_output=True, text=True, timeout=60)
-    assert ran.returncode == 0, ran.stderr
-    found = json.loads(ran.stdout.splitlines()[-1])
-    assert found["version"] == 12
-    assert found["can be armed"]
-    assert found["is armed"]
-    assert found["place"] == pytest.approx([500, 200, 1200], abs=150)  # [mm]
-    rates = [found[name] for name in ("rateRoll", "ratePitch", "rateYaw")]
+    process = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stderr
+    result = json.loads(process.stdout.splitlines()[-1])
+    assert result["version"] == 12
+    assert result["can be armed"]
+    assert result["is armed"]
+    assert result["place"] == pytest.approx([500, 200, 1200], abs=150)  # [mm]
+    rates = [result[name] for name in ("rateRoll", "ratePitch", "rateYaw")]
     # Its client's pitch is nose down, as ours about y, and its log's is nose up.
     assert rates == pytest.approx([349, -349, 349], abs=120)  # [mrad/s] of 20 deg/s, after .3 s
-    assert found["landed"]
+    assert result["landed"]
 
 
 def test_we_fly_it_through_the_script_for_the_radio(port):
     ours = port + 1 if port < 65_000 else port - 1
-    with started(CFLIB, RADIO, f"udp://127.0.0.1:{port}", ours):
+    with start_process(CFLIB, RADIO, f"udp://127.0.0.1:{port}", ours):
         testing.check_vehicle(lambda: Scenario(plant=f"crazyflie:udp:127.0.0.1:{ours}").make("small"))

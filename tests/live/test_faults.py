@@ -20,7 +20,7 @@ from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import COMMAND, TRUE, Setpoint
 from retrim.onboard.recorder import read_log
-from retrim.onboard.timing_stats import measured
+from retrim.onboard.timing_stats import has_measurement
 from retrim.transport.message import pack_arrays
 
 DRILL = {"plant": "live_processes:plant", "residual": "live_processes:learner", "policy": "live_processes:learner"}
@@ -43,7 +43,7 @@ def supervise(spec):
         for _ in drill.warm_up():
             pass
         drill.take_off()
-        while drill.watch().ended is None:
+        while drill.watch().end_reason is None:
             time.sleep(0.02)
 
 
@@ -55,17 +55,17 @@ def controller():
 def spec_in(folder, controller, **changes):
     start = folder / "start.safetensors"
     start.write_bytes(pack_arrays({}, kind="learnt", about={"preset": dump(PRESETS["hover/retrim"])}))
-    made = plan(controller)
+    setup = plan(controller)
     return replace(
         LiveSpec(
             controller, ("residual", "policy"), start, None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])),
-            HOME, made.limits, DT, 1, 150, SECONDS, 0, folder, mains=DRILL,
+            HOME, setup.limits, DT, 1, 150, SECONDS, 0, folder, mains=DRILL,
         ),
         **changes,
     )  # fmt: skip
 
 
-def flown(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
+def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
     """Fly, and kill processes on the way, each at its time; return the last status, the events, how long the watchdog
     took, and whether the system allowed real-time scheduling, without which a loaded machine is late."""
     events, took, kills = LiveEvents(), None, dict(kills or {})
@@ -74,7 +74,7 @@ def flown(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
             pass
         drill.take_off()
         until = time.monotonic() + 20.0
-        while (status := drill.watch()).ended is None and time.monotonic() < until:
+        while (status := drill.watch()).end_reason is None and time.monotonic() < until:
             events.take(status)
             for role in [role for role, at in kills.items() if status.t >= at]:
                 del kills[role]
@@ -88,13 +88,13 @@ def flown(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
         folder = drill.bus.folder
     assert not folder.exists()
     assert all(process.poll() is not None for process in drill.processes.values())
-    return status, events.all, took, not any(drill.refused.values())
+    return status, events.all, took, not any(drill.refusals.values())
 
 
-def _first_fallback(bus, killed):
-    while (message := bus.latest("fallback")) is None and time.monotonic() < killed + 1.0:
+def _first_fallback(bus, kill):
+    while (message := bus.latest("fallback")) is None and time.monotonic() < kill + 1.0:
         time.sleep(1e-3)
-    return Setpoint.unpack(message.data).sent - killed
+    return Setpoint.unpack(message.data).send_time - kill
 
 
 def whole_log(folder, status=None, until=None):
@@ -105,7 +105,7 @@ def whole_log(folder, status=None, until=None):
     """
     rows = read_log(folder / "flight.csv")
     assert len(rows) > 10
-    answers = rows[measured(rows)]  # other rows are of commands that answer nothing
+    answers = rows[has_measurement(rows)]  # other rows are of commands that answer nothing
     ticks = answers[:, 0]
     assert ticks[0] == 0
     assert (np.diff(ticks) >= 1).all()
@@ -113,18 +113,18 @@ def whole_log(folder, status=None, until=None):
     # them, one in twenty: other tests run beside this one.
     if status is not None:
         last = answers[answers[:, -1] == Mode.POLICY][-1, 1] if until is None else until  # no landing is counted
-        counted = ticks[: np.searchsorted(answers[:, 1], last)]
-        assert np.sum(np.diff(counted) - 1) <= status.control["missed"] + 1
-    missed = 0 if status is None else status.control["missed"]
-    assert ticks[-1] + 1 - len(ticks) <= missed + max(2, ticks[-1] // 20)
+        count = ticks[: np.searchsorted(answers[:, 1], last)]
+        assert np.sum(np.diff(count) - 1) <= status.control["missed"] + 1
+    error = 0 if status is None else status.control["missed"]
+    assert ticks[-1] + 1 - len(ticks) <= error + max(2, ticks[-1] // 20)
     assert np.isfinite(rows).all()
     return rows
 
 
 def test_a_flight_without_faults(tmp_path, controller):
-    status, events, *_ = flown(spec_in(tmp_path, controller))
+    status, events, *_ = fly_once(spec_in(tmp_path, controller))
     rows = whole_log(tmp_path, status)
-    assert status.ended == "landed"
+    assert status.end_reason == "landed"
     assert rows[-1, -1] == Mode.LANDED
     assert rows[-1, 5] <= 0.1
     assert next(e.note for e in events if e.kind == "guard") == "descend: landing"
@@ -139,13 +139,13 @@ def test_each_process_is_killed_at_a_random_time(tmp_path, controller, roles, se
     names = roles.split()
     kills = dict(zip(names, np.random.default_rng([seed, len(roles)]).uniform(0.0, SECONDS, len(names)), strict=True))
     at = kills[names[0]]
-    status, events, took, punctual = flown(spec_in(tmp_path, controller), kills)
+    status, events, took, punctual = fly_once(spec_in(tmp_path, controller), kills)
     rows = whole_log(tmp_path, status, at - 2 * DT if roles == "control" else None)
     if roles == "plant":
-        assert status.ended.startswith("the plant process is gone")
-        assert abs(rows[measured(rows)][-1, 1] - at) < 0.3
+        assert status.end_reason.startswith("the plant process is gone")
+        assert abs(rows[has_measurement(rows)][-1, 1] - at) < 0.3
         return
-    assert status.ended == "landed"
+    assert status.end_reason == "landed"
     assert np.abs(rows[:, 3:5]).max() < 0.3
     if roles == "control":
         assert took < (0.04 if punctual else 1.0)
@@ -163,20 +163,20 @@ def test_each_process_is_suspended_for_ever_at_a_random_time(tmp_path, controlle
     names = roles.split()
     times = np.random.default_rng([seed, len(roles)]).uniform(0.0, 1.0, len(names))
     stops, spec = dict(zip(names, times, strict=True)), spec_in(tmp_path, controller, seconds=4.0)
-    status, events, *_ = flown(spec, stops, seconds=4.0, number=signal.SIGSTOP)
+    status, events, *_ = fly_once(spec, stops, seconds=4.0, number=signal.SIGSTOP)
     rows = whole_log(tmp_path, status, times[0] - 2 * DT if roles == "control" else None)
-    told = [event.note for event in events if "hung" in event.note]
+    message = [event.note for event in events if "hung" in event.note]
     assert status.hangs == dict.fromkeys(stops, 1)
-    assert sorted(note.split()[1] for note in told) == sorted(names)
+    assert sorted(note.split()[1] for note in message) == sorted(names)
     if roles == "plant":
-        seen = rows[measured(rows)]
-        height = f"{seen[-1, TRUE][2]:.2f}"
-        assert status.ended.startswith(f"stopped without measurements at {height} m: the plant process hung")
-        assert abs(seen[-1, 1] - times[0]) < 0.3
-        assert np.isin(rows[len(seen) :, -1], (Mode.BLIND, Mode.DROP)).all()
+        observation = rows[has_measurement(rows)]
+        height = f"{observation[-1, TRUE][2]:.2f}"
+        assert status.end_reason.startswith(f"stopped without measurements at {height} m: the plant process hung")
+        assert abs(observation[-1, 1] - times[0]) < 0.3
+        assert np.isin(rows[len(observation) :, -1], (Mode.BLIND, Mode.DROP)).all()
         assert rows[-1, 1] > times[0] + 1.5  # what was commanded for nobody
         return
-    assert status.ended == "landed"
+    assert status.end_reason == "landed"
     assert np.abs(rows[:, 3:5]).max() < 0.3
     assert rows[-1, -1] == (Mode.WATCHDOG if roles == "control" else Mode.LANDED)
     assert status.restarts == ({} if roles == "control" else dict.fromkeys(stops, 1))

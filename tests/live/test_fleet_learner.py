@@ -13,7 +13,7 @@ from jax import random
 from live.test_live_learner import Beside, start  # noqa: F401
 from retrim.adapt.batched_workers import room_for
 from retrim.config.setup import Setup
-from retrim.io.trained import load_learner_state, save_learner_state
+from retrim.io.policies import load_learner_state, save_learner_state
 from retrim.live.processes import fleet as fleet_process
 from retrim.live.processes import fleet_learner
 from retrim.live.processes.fleet import FleetProcess
@@ -43,7 +43,7 @@ def fleet_for(vehicles, start, layer):  # noqa: F811
     return fleet
 
 
-def found(vehicle, layer):
+def find(vehicle, layer):
     return jax.tree.leaves(vehicle.parameters(layer).arrays)
 
 
@@ -54,14 +54,14 @@ def test_each_vehicle_gets_what_its_own_learner_learns(start, vehicles, layer): 
         vehicle.fly(60 + 10 * i)
     assert fleet_for(vehicles, start, layer).step() == 3
     for name, vehicle in vehicles.items():
-        together = found(vehicle, layer) if vehicle.bus.latest(f"parameters.{layer}") else None
+        together = find(vehicle, layer) if vehicle.bus.latest(f"parameters.{layer}") else None
         alone = Beside(start)
         alone.fly(60 + 10 * list(SEEDS).index(name))
         loop = type(alone).learner(alone, layer)
         loop.plan = plan_of(start, layer, SEEDS[name])
         loop.worker = loop.new_worker()
         assert loop.step()
-        by_itself = found(alone, layer) if alone.bus.latest(f"parameters.{layer}") else None
+        by_itself = find(alone, layer) if alone.bus.latest(f"parameters.{layer}") else None
         assert (together is None) == (by_itself is None)
         for one, other in zip(together or (), by_itself or (), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-8)
@@ -113,8 +113,8 @@ def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_
     assert fleet.step() == 2
     (base,) = fleet._bases.values()
     admitted = [vehicle for vehicle in vehicles.values() if vehicle.bus.latest("parameters.policy") is not None]
-    moved = np.abs(np.asarray(base.policy.layers[0].weight - state.policy.policy.base.layers[0].weight)).max() > 0
-    assert moved == bool(admitted)  # a step that nobody admits is taken back
+    shift = np.abs(np.asarray(base.policy.layers[0].weight - state.policy.policy.base.layers[0].weight)).max() > 0
+    assert shift == bool(admitted)  # a step that nobody admits is taken back
     fleet.loops["a"].rolled_back += 1
     was = id(base)
     for vehicle in vehicles.values():
@@ -126,13 +126,13 @@ def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_
 
 
 def test_programs_are_there_for_any_number_that_is_due(start, vehicles, monkeypatch):  # noqa: F811
-    learnt = []
-    monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: learnt.append(len(workers)))
+    learner_state = []
+    monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: learner_state.append(len(workers)))
     fleet = fleet_for(vehicles, start, "residual")
     fleet.warm_up()
-    assert learnt == [1, 2, 4]
+    assert learner_state == [1, 2, 4]
     fleet.warm_up()
-    assert learnt == [1, 2, 4]
+    assert learner_state == [1, 2, 4]
     assert [room_for(n) for n in (1, 2, 3, 4, 5, 16, 17)] == [1, 2, 4, 4, 8, 16, 32]
 
 

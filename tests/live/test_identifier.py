@@ -39,16 +39,16 @@ def rows(setup):
         rates_max=(6.0, 6.0, 4.0), motor_tau=0.03, rate_lag=(0.08, 0.08, 0.08), rate_damping=(1.0, 1.0, 1.0),
     )  # fmt: skip
     scenario = Scenario("none", plant="second-order", vehicle=vehicle, delay=0.04, thrust_error=-0.2)
-    known = dataclasses.replace(setup.preset, vehicle=dataclasses.replace(vehicle, command_delay=0.04))
+    model = dataclasses.replace(setup.preset, vehicle=dataclasses.replace(vehicle, command_delay=0.04))
     policy = setup.new_policy(jax.random.key(0))
-    (flight,) = Fleet(known, policy, [scenario], methods=("geometric",), starts=1, seconds=6.0).run().flown
+    (flight,) = Fleet(model, policy, [scenario], methods=("geometric",), starts=1, seconds=6.0).run().flights
     log = flight.log
-    found = np.zeros((len(log.t) - 1, len(COLUMNS)))
-    found[:, 0], found[:, 1] = np.arange(len(found)), log.t[:-1]
+    result = np.zeros((len(log.t) - 1, len(COLUMNS)))
+    result[:, 0], result[:, 1] = np.arange(len(result)), log.t[:-1]
     states = log.measured
-    found[:, MEASURED] = np.concatenate([states.p, states.R.reshape(-1, 9), states.v], axis=1)[:-1]
-    found[:, COMMAND] = log.u[1:]
-    return found
+    result[:, MEASURED] = np.concatenate([states.p, states.R.reshape(-1, 9), states.v], axis=1)[:-1]
+    result[:, COMMAND] = log.u[1:]
+    return result
 
 
 def bus():
@@ -65,7 +65,7 @@ def feed(loop, rows, every=7):
 
 
 @pytest.fixture(scope="module")
-def identified(setup, rows):
+def vehicle_notes(setup, rows):
     loop = IdentifierLoop(setup.preset, BASE, bus())
     feed(loop, rows)
     return loop
@@ -76,39 +76,39 @@ def parameters(loop, expected, after=0):
     return Parameters.unpack(data, expected, half=VEHICLE, base=BASE, after=after)
 
 
-def test_the_vehicle_is_found(setup, identified):
+def test_the_vehicle_is_found(setup, vehicle_notes):
     controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
     expected = plain_source(setup, controller).parameters[VEHICLE]
-    found = parameters(identified, expected)
-    centre, half_width, gain = (np.asarray(a) for a in found.arrays.values())
+    result = parameters(vehicle_notes, expected)
+    centre, half_width, gain = (np.asarray(a) for a in result.arrays.values())
     family = setup.env.family
     path = family.path(jnp.asarray(centre))
     assert float(path.delay) == pytest.approx(0.04, abs=0.004)
     assert float(path.response.rate_lag[0]) == pytest.approx(0.08, rel=0.1)
     assert float(gain) == pytest.approx(0.8, abs=0.03)
     assert half_width[:2].max() < 0.3
-    assert 1.0 < found.computed_from <= 6.0  # an unchanged vehicle is not sent again
+    assert 1.0 < result.computed_from <= 6.0  # an unchanged vehicle is not sent again
 
 
-def test_it_is_reported_after_one_and_after_five_seconds(identified):
-    reports = last_note(identified.bus, "identified")["reports"]
+def test_it_is_reported_after_one_and_after_five_seconds(vehicle_notes):
+    reports = last_note(vehicle_notes.bus, "identified")["reports"]
     assert [t for t, _ in reports] == [pytest.approx(1.0, abs=0.2), pytest.approx(5.0, abs=0.2)]
     assert all(text.startswith("thrust gain 0.") and "rate delay" in text for _, text in reports)
 
 
-def test_pieces_of_any_length_give_vehicles_that_agree(setup, rows, identified):
+def test_pieces_of_any_length_give_vehicles_that_agree(setup, rows, vehicle_notes):
     other = IdentifierLoop(setup.preset, BASE, bus())
     feed(other, rows, every=50)
     (centre, width, gain), (centre_50, width_50, gain_50) = (
-        tuple(map(np.asarray, parameters(loop, _shapes(setup)).arrays.values())) for loop in (identified, other)
+        tuple(map(np.asarray, parameters(loop, _shapes(setup)).arrays.values())) for loop in (vehicle_notes, other)
     )
     assert (np.abs(centre - centre_50) < width + width_50).all()
     assert abs(gain - gain_50) < 0.02
 
 
-def test_a_process_that_was_started_again_counts_on(setup, rows, identified):
-    before = identified.bus.latest(f"parameters.{VEHICLE}").version
-    again = IdentifierLoop(setup.preset, BASE, identified.bus)
+def test_a_process_that_was_started_again_counts_on(setup, rows, vehicle_notes):
+    before = vehicle_notes.bus.latest(f"parameters.{VEHICLE}").version
+    again = IdentifierLoop(setup.preset, BASE, vehicle_notes.bus)
     again.bus.publish("flight", FlightRows(rows[-150:]).pack())
     while again.step():
         pass
@@ -117,18 +117,18 @@ def test_a_process_that_was_started_again_counts_on(setup, rows, identified):
 
 def test_nothing_is_compiled_after_the_warm_up(setup, rows):
     """A process that compiles in flight is silent, and is ended for it."""
-    loop, compiled = IdentifierLoop(setup.preset, BASE, bus()), list[str]()
+    loop, program = IdentifierLoop(setup.preset, BASE, bus()), list[str]()
 
     def note(name, seconds, **about):
         if name.endswith("backend_compile_duration"):
-            compiled.append(name)
+            program.append(name)
 
     jax.clear_caches()
     loop.warm_up()
     jax.monitoring.register_event_duration_secs_listener(note)
     feed(loop, rows[:140])
     jax.monitoring.unregister_event_duration_listener(note)
-    assert compiled == []
+    assert program == []
 
 
 def test_damaged_rows_are_ignored(setup):
@@ -143,10 +143,10 @@ def test_a_preset_for_one_vehicle_is_refused():
 
 
 def test_a_live_flight_does_not_excite_its_vehicle(setup):
-    excited = Setup.from_preset(changed(setup.preset, family={"excitation": True}))
-    controller = excited.pilot(excited.new_policy(jax.random.key(0)), "base-id").controller
+    excitation = Setup.from_preset(changed(setup.preset, family={"excitation": True}))
+    controller = excitation.pilot(excitation.new_policy(jax.random.key(0)), "base-id").controller
     with pytest.raises(ConfigError, match=r"family\.excitation: a live flight does not excite its vehicle"):
-        plain_source(excited, controller)
+        plain_source(excitation, controller)
 
 
 def test_only_a_controller_that_identifies_has_the_half(setup):
@@ -161,8 +161,8 @@ def test_the_controller_follows_slowly_and_keeps_the_vehicle_when_learning_is_sw
     pilot = LivePilot(source)
     pilot.reset(AT_REST)
     steady = [pilot.act(0.02 * k, 0.0, AT_REST) for k in range(50)][-1]
-    told = PathBelief.between(jnp.full(4, -1.0), jnp.full(4, -0.9))
-    arrays = dict(zip(source.parameters[VEHICLE], (told.centre, told.half_width, jnp.array(0.5)), strict=True))
+    message = PathBelief.between(jnp.full(4, -1.0), jnp.full(4, -0.9))
+    arrays = dict(zip(source.parameters[VEHICLE], (message.centre, message.half_width, jnp.array(0.5)), strict=True))
     pilot.swap(Parameters(VEHICLE, 1, source.base, 1.0, {n: np.asarray(a) for n, a in arrays.items()}))
     after = [pilot.act(0.02 * k, 0.0, AT_REST) for k in range(50, 100)]
     steps = np.abs(np.diff([steady, *after], axis=0))[:, 0]

@@ -10,7 +10,7 @@ from helpers import tiny_preset
 from live_helpers import DT, TOPICS
 from retrim.adapt.updates import PolicyUpdate, Rejection, pack_update, unpack_update
 from retrim.config.setup import Setup
-from retrim.io.trained import save_learner_state
+from retrim.io.policies import save_learner_state
 from retrim.learn.bptt import PolicyState
 from retrim.live.processes.controllers import adaptive_source
 from retrim.live.processes.learner import LearnerLoop, LearnerPlan
@@ -81,8 +81,8 @@ def improving(loop, meanwhile=lambda: None):
     def learn(window):
         meanwhile()
         was = loop.worker._policy
-        nudged = jax.tree.map(lambda leaf: leaf + 0.01, was.policy.params)
-        state = PolicyState(was.policy.with_params(nudged), was.optimiser)
+        nudge = jax.tree.map(lambda leaf: leaf + 0.01, was.policy.params)
+        state = PolicyState(was.policy.with_params(nudge), was.optimiser)
         return PolicyUpdate(float(window.t[-1]), 1.0, 2.0, state)
 
     loop.worker.learn = learn
@@ -104,8 +104,8 @@ def test_a_window_becomes_parameters_that_the_controller_takes(start):
     assert not loop.step()
     beside.fly()
     assert loop.step()
-    found = beside.parameters("residual")
-    assert (found.version, found.parent, found.computed_from) == (1, 0, pytest.approx(59 * DT))
+    result = beside.parameters("residual")
+    assert (result.version, result.parent, result.computed_from) == (1, 0, pytest.approx(59 * DT))
     assert not loop.step()  # nothing new
     beside.fly()
     beside.now -= 99.99
@@ -253,5 +253,5 @@ def test_what_is_flown_stays_on_the_bus_however_much_is_learnt_that_nobody_takes
         keep(
             beside.bus, "policy", version, update, {"newest": {"policy": newest}, "given_up": given_up * (version > 5)}
         )
-    found, _ = active_update(beside.bus, beside.state, "policy", {"newest": {"policy": 5}, "given_up": given_up})
-    assert found == (4 if given_up else 5)
+    result, _ = active_update(beside.bus, beside.state, "policy", {"newest": {"policy": 5}, "given_up": given_up})
+    assert result == (4 if given_up else 5)

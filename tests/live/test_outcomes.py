@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from commands import SMALL, results, retrim, started
+from commands import SMALL, results, retrim, start_process
 from retrim import load_learner_state, load_policy
 from retrim.onboard.guard import Mode
 from retrim.onboard.messages import TRUE
 from retrim.onboard.recorder import read_log
-from retrim.onboard.timing_stats import measured
+from retrim.onboard.timing_stats import has_measurement
 from retrim.transport.shared_memory import SharedMemoryBus
 
 pytestmark = [pytest.mark.usefixtures("as_a_user"), pytest.mark.slow]
@@ -41,17 +41,17 @@ def folder(tmp_path_factory, as_a_user):
 
 def processes_of(supervisor):
     """Return the processes of a flight, and the function that each of them runs."""
-    found = {}
+    result = {}
     for pid in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-        found[int(pid)] = words[-2].decode().rpartition(":")[2]
-    return found
+        result[int(pid)] = words[-2].decode().rpartition(":")[2]
+    return result
 
 
 def bus_of(process):
     """Return the folder of the bus that a process has mapped."""
-    mapped = re.findall(r"(/dev/shm/retrim-\w+)/sample$", Path(f"/proc/{process}/maps").read_text(), re.M)
-    return sorted(set(mapped))
+    maps = re.findall(r"(/dev/shm/retrim-\w+)/sample$", Path(f"/proc/{process}/maps").read_text(), re.M)
+    return sorted(set(maps))
 
 
 def wait_for(condition, seconds=120.0):
@@ -61,15 +61,15 @@ def wait_for(condition, seconds=120.0):
     assert condition()
 
 
-def flown(folder, out, what, seed, page=("--no-page",), seconds=SECONDS):
+def fly_once(folder, out, what, seed, page=("--no-page",), seconds=SECONDS):
     """Fly, and do something once the flight has learnt; return exit code and output."""
     words = "live", "--policy", "p", "--disturbance", "small", "--seconds", seconds, *page, "--out", out
-    process, log = started(words, folder), folder / out / "flight.csv"
+    process, log = start_process(words, folder), folder / out / "flight.csv"
     at = 50.0 * np.random.default_rng(seed).uniform(3.0, SECONDS - 2.0)  # ticks
     wait_for(lambda: process.poll() is not None or (log.exists() and log.read_text().count("\n") > at))
     what(process)
-    said, _ = process.communicate(timeout=120)
-    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", said.decode())
+    message, _ = process.communicate(timeout=120)
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", message.decode())
     assert "Traceback" not in text, text
     return process.returncode, text
 
@@ -83,11 +83,11 @@ def whole(path):
     return rows
 
 
-def kept(folder):
+def check_kept(folder):
     """Assert that what was learnt can be gone on from, and flown."""
     state, _ = load_learner_state(folder / "learner_state.safetensors")
-    adapted, _ = load_policy(folder / "adapted.safetensors")
-    np.testing.assert_array_equal(adapted.layers[0].weight, state.policy.policy.layers[0].weight)
+    adapted_policy, _ = load_policy(folder / "adapted.safetensors")
+    np.testing.assert_array_equal(adapted_policy.layers[0].weight, state.policy.policy.layers[0].weight)
 
 
 @pytest.mark.parametrize("seed", DRILLS)
@@ -99,14 +99,14 @@ def test_processes_that_are_suspended_for_ever_come_back_and_the_log_is_whole(fo
             if function in (*roles, "learn"):
                 os.kill(pid, signal.SIGSTOP)
 
-    code, said = flown(folder, out, suspend, seed, ("--page", "--page-port", "18380"), seconds=14.0)
-    found = results(folder / out)
-    assert (code, found["ended"], found["faults"]) == (0, "landed", []), said
+    code, text = fly_once(folder, out, suspend, seed, ("--page", "--page-port", "18380"), seconds=14.0)
+    result = results(folder / out)
+    assert (code, result["ended"], result["faults"]) == (0, "landed", []), text
     for role in (*roles.values(), "residual", "policy"):
-        assert f"restarted: the {role} process hung: it said nothing for 2 s and was ended" in said
-    assert {row["metric"]: row["value"] for row in found["rows"]}["restarts"] == 5
+        assert f"restarted: the {role} process hung: it said nothing for 2 s and was ended" in text
+    assert {row["metric"]: row["value"] for row in result["rows"]}["restarts"] == 5
     assert len(whole(folder / out / "flight.csv")) > 50 * 14.0 - 25
-    kept(folder / out)
+    check_kept(folder / out)
 
 
 @pytest.mark.parametrize("seed", DRILLS)
@@ -118,51 +118,51 @@ def test_what_a_flight_cannot_do_without_ends_it_in_a_defined_way(folder, role, 
         (pid,) = (pid for pid, runs in processes_of(process.pid).items() if runs == function)
         os.kill(pid, signal.SIGSTOP)
 
-    code, said = flown(folder, out, suspend, seed)
-    found, rows = results(folder / out), read_log(folder / out / "flight.csv")
-    steady = next(row for row in found["rows"] if row["metric"] == "steady")
-    assert found["faults"] == []
-    assert f"guard: the {role} process hung: it said nothing for 2 s and was ended" in said
-    kept(folder / out)
+    code, text = fly_once(folder, out, suspend, seed)
+    result, rows = results(folder / out), read_log(folder / out / "flight.csv")
+    steady = next(row for row in result["rows"] if row["metric"] == "steady")
+    assert result["faults"] == []
+    assert f"guard: the {role} process hung: it said nothing for 2 s and was ended" in text
+    check_kept(folder / out)
     if role == "plant":
-        height = rows[measured(rows)][-1, TRUE][2]
-        assert found["ended"].startswith(f"stopped without measurements at {height:.2f} m: the plant process hung")
+        height = rows[has_measurement(rows)][-1, TRUE][2]
+        assert result["ended"].startswith(f"stopped without measurements at {height:.2f} m: the plant process hung")
         assert (code, steady["crashes"], steady["value"]) == (1, 1, None)
-        assert np.isin(rows[~measured(rows), -1], (Mode.BLIND, Mode.DROP)).all()
+        assert np.isin(rows[~has_measurement(rows), -1], (Mode.BLIND, Mode.DROP)).all()
     else:
-        assert (code, found["ended"], steady["crashes"]) == (0, "landed", 0)
+        assert (code, result["ended"], steady["crashes"]) == (0, "landed", 0)
         assert rows[-1, -1] == Mode.WATCHDOG
 
 
 @pytest.mark.parametrize("seed", DRILLS)
 def test_a_terminal_that_is_closed_lands_the_vehicle_and_all_is_written(folder, seed):
     out = f"hangup{seed}"
-    code, _ = flown(folder, out, lambda process: process.send_signal(signal.SIGHUP), seed)
-    found = results(folder / out)
-    assert (code, found["interrupted"], found["ended"], found["faults"]) == (130, True, "landed", [])
-    assert found["seconds"] < SECONDS - 0.5
+    code, _ = fly_once(folder, out, lambda process: process.send_signal(signal.SIGHUP), seed)
+    result = results(folder / out)
+    assert (code, result["interrupted"], result["ended"], result["faults"]) == (130, True, "landed", [])
+    assert result["seconds"] < SECONDS - 0.5
     whole(folder / out / "flight.csv")
-    kept(folder / out)
+    check_kept(folder / out)
 
 
 @pytest.mark.parametrize("seed", DRILLS)
 @pytest.mark.parametrize("how", ["removed", "renamed"])
 def test_a_folder_that_is_gone_is_made_again_with_all_that_was_flown_and_learnt(folder, how, seed):
     out = folder / f"{how}{seed}"
-    gone = (lambda: shutil.rmtree(out)) if how == "removed" else (lambda: out.rename(f"{out}-elsewhere"))
-    code, said = flown(folder, out.name, lambda process: gone(), seed)
-    assert code == 0, said
-    assert f"log: {out.name}/flight.csv: No such file or directory; the log is written anew" in said
-    found = results(out)
-    assert (found["ended"], found["faults"]) == ("landed", [])
+    loss = (lambda: shutil.rmtree(out)) if how == "removed" else (lambda: out.rename(f"{out}-elsewhere"))
+    code, text = fly_once(folder, out.name, lambda process: loss(), seed)
+    assert code == 0, text
+    assert f"log: {out.name}/flight.csv: No such file or directory; the log is written anew" in text
+    result = results(out)
+    assert (result["ended"], result["faults"]) == ("landed", [])
     assert len(whole(out / "flight.csv")) > 50 * SECONDS - 25
-    kept(out)
+    check_kept(out)
 
 
-def elsewhere(said, name, reason):
+def elsewhere(text, name, reason):
     """Return the temporary folder of a file that the output names."""
     line = rf"retrim: {re.escape(name)} cannot be written to \S+ \({reason}\); it is in (\S+)"
-    return Path(re.search(line, said)[1])
+    return Path(re.search(line, text)[1])
 
 
 @pytest.mark.parametrize("seed", DRILLS)
@@ -173,14 +173,14 @@ def test_a_folder_in_whose_place_is_something_else_loses_nothing(folder, seed):
         shutil.rmtree(out)
         out.write_text("somebody's file")
 
-    code, said = flown(folder, out.name, replace, seed)
-    assert code == 1, said
-    place = elsewhere(said, "what was learnt", "File exists")
-    found = results(elsewhere(said, "results.json", "File exists"))
-    assert found["ended"] == "landed"
-    assert any(fault.startswith(f"{out.name}/flight.csv: ") for fault in found["faults"])
+    code, text = fly_once(folder, out.name, replace, seed)
+    assert code == 1, text
+    place = elsewhere(text, "what was learnt", "File exists")
+    result = results(elsewhere(text, "results.json", "File exists"))
+    assert result["ended"] == "landed"
+    assert any(fault.startswith(f"{out.name}/flight.csv: ") for fault in result["faults"])
     assert len(whole(place / "flight.csv")) > 50 * SECONDS - 25
-    kept(place)
+    check_kept(place)
     shutil.rmtree(place)
 
 
@@ -198,15 +198,15 @@ def small_disk(folder, tmp_path):
 @pytest.mark.parametrize("seed", DRILLS)
 def test_a_full_disk_loses_nothing(folder, small_disk, seed):
     full = "No space left on device"
-    code, said = flown(folder, small_disk.name, lambda process: fill(small_disk), seed)
-    assert code == 1, said
-    place = elsewhere(said, "what was learnt", full)
-    assert f"retrim: {small_disk.name}/flight.csv: {full}; the log goes on in {place}/flight.csv" in said
-    found = results(elsewhere(said, "results.json", full))
-    assert found["ended"] == "landed"
-    assert len(found["faults"]) >= 4
+    code, text = fly_once(folder, small_disk.name, lambda process: fill(small_disk), seed)
+    assert code == 1, text
+    place = elsewhere(text, "what was learnt", full)
+    assert f"retrim: {small_disk.name}/flight.csv: {full}; the log goes on in {place}/flight.csv" in text
+    result = results(elsewhere(text, "results.json", full))
+    assert result["ended"] == "landed"
+    assert len(result["faults"]) >= 4
     assert len(whole(place / "flight.csv")) > 50 * SECONDS - 25
-    kept(place)
+    check_kept(place)
     shutil.rmtree(place)
 
 
@@ -227,10 +227,10 @@ def test_without_supervisor_and_recorder_what_was_learnt_is_kept(folder, seed):
         (recorder,) = (pid for pid, function in flight.items() if function == "record")
         os.kill(recorder, signal.SIGKILL)
 
-    code, _ = flown(folder, out.name, kill, seed)
+    code, _ = fly_once(folder, out.name, kill, seed)
     assert code == -signal.SIGKILL
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in flight))
-    kept(out)
+    check_kept(out)
     assert not (out / "results.json").exists()
     left = Path(bus[0])
     assert left.exists()

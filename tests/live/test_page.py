@@ -48,8 +48,8 @@ def test_a_port_that_is_taken_is_left_to_who_has_it():
     import socket
 
     with socket.create_server(("127.0.0.1", 0)) as server:
-        taken = server.getsockname()[1]
-        assert taken < free_port("127.0.0.1", taken) < taken + 10
+        extract = server.getsockname()[1]
+        assert extract < free_port("127.0.0.1", extract) < extract + 10
     with pytest.raises(ConfigError, match="no free port from 8080 on at 'no-such-host'"):
         free_port("no-such-host", 8080)
 
@@ -60,8 +60,8 @@ def test_a_port_that_is_taken_is_left_to_who_has_it():
 def test_a_quaternion_turns_as_its_matrix_does(vector):
     w, *u = quaternion(np.asarray(so3.exp(jnp.array(vector))))
     x = np.array([0.3, -0.5, 0.8])
-    turned = x + 2.0 * np.cross(u, np.cross(u, x) + w * x)
-    np.testing.assert_allclose(turned, np.asarray(so3.exp(jnp.array(vector))) @ x, atol=1e-12)
+    rotation = x + 2.0 * np.cross(u, np.cross(u, x) + w * x)
+    np.testing.assert_allclose(rotation, np.asarray(so3.exp(jnp.array(vector))) @ x, atol=1e-12)
 
 
 @pytest.fixture
@@ -147,6 +147,6 @@ def test_a_knob_in_a_browser_is_a_message_on_the_bus(flight):
         page.get_by_role("button", name="Land").click()
         hover(bus, 20.0, lambda: "land" in unpack_note(bus.latest("wish").data, "wish"))
         assert unpack_note(bus.latest("wish").data, "wish")["land"]
-        shot = page.screenshot()
+        screenshot = page.screenshot()
         browser.close()
-    assert len(shot) > 10_000
+    assert len(screenshot) > 10_000

@@ -137,7 +137,7 @@ def test_a_file_is_refused_like_a_handshake(page):
 
 
 @pytest.mark.parametrize(
-    ("listens", "reached", "names"),
+    ("listens", "reached_hosts", "names"),
     [
         ("0.0.0.0", ("192.168.1.5", 8080), {"192.168.1.5:8080"}),
         ("", ("127.0.0.1", 8080), {"127.0.0.1:8080", "localhost:8080"}),
@@ -146,14 +146,14 @@ def test_a_file_is_refused_like_a_handshake(page):
         ("::", ("::ffff:10.0.0.2", 80, 0, 0), {"10.0.0.2:80", "10.0.0.2"}),
     ],
 )
-def test_a_page_answers_to_the_address_that_was_reached(listens, reached, names):
-    asked = {*names, "192.168.1.5:8080", "localhost:8080", "quad.local:8080", "0.0.0.0:8080", "evil.example:8080"}
-    answered = {
-        name for name in asked
-        if refusal("/T", {"host": (name,)}, token="T", host=listens, local=reached) is None
+def test_a_page_answers_to_the_address_that_was_reached(listens, reached_hosts, names):
+    calls = {*names, "192.168.1.5:8080", "localhost:8080", "quad.local:8080", "0.0.0.0:8080", "evil.example:8080"}
+    answer = {
+        name for name in calls
+        if refusal("/T", {"host": (name,)}, token="T", host=listens, local=reached_hosts) is None
     }  # fmt: skip
-    assert answered == names
-    wrong = refusal("/t", {"host": (min(names),)}, token="T", host=listens, local=reached)
+    assert answer == names
+    wrong = refusal("/t", {"host": (min(names),)}, token="T", host=listens, local=reached_hosts)
     assert wrong == HTTPStatus.NOT_FOUND
 
 
@@ -172,13 +172,13 @@ def test_without_protection_there_is_no_page():
 
 
 def test_a_browser_is_told_the_address_in_a_file_of_this_user(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(webbrowser, "open", told.append)
+    message = []
+    monkeypatch.setattr(webbrowser, "open", message.append)
     monkeypatch.setenv("DISPLAY", ":0")
     open_page("http://127.0.0.1:8080/SECRET", tmp_path)
     (file,) = tmp_path.iterdir()
-    assert told == [file.as_uri()]
-    assert "SECRET" not in told[0]
+    assert message == [file.as_uri()]
+    assert "SECRET" not in message[0]
     assert "url=http://127.0.0.1:8080/SECRET" in file.read_text()
     assert file.stat().st_mode & 0o777 == 0o600
 

@@ -55,7 +55,7 @@ def bus():
     return InProcessBus(dict.fromkeys(TOPICS, 65536))
 
 
-def sent(server, handle, **updates):
+def send(server, handle, **updates):
     """Send the message of a changed control, and wait until the page has handled it."""
     from viser._messages import GuiUpdateMessage
 
@@ -80,23 +80,23 @@ def settled(true):
 def test_no_value_of_any_control_stops_the_page_and_land_lands(server, bus):
     page = _Page(SPEC, bus, server)
     take_values_only(server, page.refuse)
-    found = controls(server)
-    assert {"method", "pause", "reference", "Land", "rotor", "load [kg]", "kick"} <= found.keys()
-    for label, handle in found.items():
+    result = controls(server)
+    assert {"method", "pause", "reference", "Land", "rotor", "load [kg]", "kick"} <= result.keys()
+    for label, handle in result.items():
         for value in VALUES:
             if label not in ("Land", "Calm"):
-                sent(server, handle, value=value)
+                send(server, handle, value=value)
     assert settled(lambda: last_note(bus, "refusals.page").get("count", 0) > 50)
-    for label, handle in found.items():  # afterwards every control says what stands, and works
+    for label, handle in result.items():  # afterwards every control says what stands, and works
         if label in ("method", "reference", "rotor", "load [kg]", "push [m/s²]"):
             good = {"method": "lora", "reference": "figure8", "push [m/s²]": [1.0, 0.5, 0.0]}.get(label, 0.75)
             good = 0.1 if label == "load [kg]" else good
-            sent(server, handle, value=good)
+            send(server, handle, value=good)
     assert settled(lambda: last_note(bus, "wish").get("reference") == "figure8")
     assert settled(lambda: last_note(bus, "wish").get("method") == "lora")
     assert settled(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).load == 0.1)
     assert settled(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).push == (1.0, 0.5, 0.0))
-    sent(server, found["Land"], value=True)
+    send(server, result["Land"], value=True)
     assert settled(lambda: last_note(bus, "wish").get("land") is True)
     _Page(SPEC, bus, MagicMock())  # a page that is started again begins from that
 
@@ -106,7 +106,7 @@ def test_a_browser_cannot_take_the_button_away(server, bus, updates):
     page = _Page(SPEC, bus, server)
     take_values_only(server, page.refuse)
     land = controls(server)["Land"]
-    sent(server, land, **updates)
+    send(server, land, **updates)
     assert land.visible
     assert not land.disabled
     assert not land._impl.removed
@@ -142,14 +142,14 @@ def test_no_note_of_any_kind_stops_the_page_or_a_page_that_is_started_again(bus,
 
 def test_an_attitude_that_is_none_is_not_shown_and_stops_nothing(bus):
     pytest.importorskip("viser")
-    page, shown = _Page(SPEC, bus, MagicMock()), []
-    page._scene.move = lambda *given: shown.append(given)
+    page, display = _Page(SPEC, bus, MagicMock()), []
+    page._scene.move = lambda *argument: display.append(argument)
     for tick, R in enumerate((np.zeros(9), np.eye(3).ravel() * 1e200, -np.ones(9), np.eye(3).ravel())):
         x = level()
         x[:3], x[3:12] = 1e308, R
         bus.publish("sample", Sample(tick, 0.0, 0.0, 0.0, x, x, np.array([9.81, 0.0, 0.0, 0.0])).pack())
         page.refresh(text=True)
-    assert len(shown) == 1
+    assert len(display) == 1
 
 
 def test_text_of_a_process_is_no_markup_of_the_page(bus, monkeypatch):
@@ -165,13 +165,13 @@ def test_text_of_a_process_is_no_markup_of_the_page(bus, monkeypatch):
 
 def test_a_refused_note_is_counted_each_time_and_told_now_and_then():
     bus = InProcessBus({"learner.policy": 4096, "sample": 4096, "refusals.page": 4096})
-    watch, said = RefusedNotes(bus, ("learner.policy", "sample", "refusals.page")), []
+    watch, text = RefusedNotes(bus, ("learner.policy", "sample", "refusals.page")), []
     for i in range(12):
         bus.publish("learner.policy", pack_note("learner.policy", took="x" * (i + 1)))
         bus.publish("sample", b"no note")
-        said += watch.look()
+        text += watch.look()
         assert watch.look() == []
-    assert said == [
+    assert text == [
         "note learner.policy: learner.policy: took = 'x' must be a number; 1 so far",
         "note learner.policy: learner.policy: took = 'xxxxxxxxxx' must be a number; 10 so far",
     ]

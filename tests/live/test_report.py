@@ -22,98 +22,98 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
 @pytest.fixture
-def asked(tmp_path):
+def requests(tmp_path):
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset())
         return LiveRequest(setup, setup.new_policy(random.key(0)), Scenario(), "full", 10.0, 0, 3.0, tmp_path)
 
 
-def flown(asked, ticks=30):
+def fly_once(calls, ticks=30):
     """Rows of a vehicle that hovers where it should, each step a millisecond long."""
     rows = np.zeros((ticks, len(COLUMNS)))
     rows[:, 0] = np.arange(ticks)
     rows[:, 1] = DT * rows[:, 0]
-    rows[:, MEASURED] = rows[:, TRUE] = level(np.asarray(asked.setup.flight_task.home()))
+    rows[:, MEASURED] = rows[:, TRUE] = level(np.asarray(calls.setup.flight_task.home()))
     rows[:, COMMAND], rows[:, ACCOUNTS["step"]] = HOVER, 1e-3
     return rows
 
 
-def reported(asked, rows, ended, stalls=None, **control):
+def report(calls, rows, end_note, stalls=None, **control):
     lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
-    (asked.folder / "flight.csv").write_text("\n".join(lines) + "\n")
-    status, events = Status(1.0, control, {}, {}, {}, ended, [], False, 0, None, stalls or {}), LiveEvents()
-    flight, found = flight_of(asked, (), status, None, asked.folder / "flight.csv")
-    return {row["metric"]: row for row in results(asked, flight, found, status, events)}
+    (calls.folder / "flight.csv").write_text("\n".join(lines) + "\n")
+    status, events = Status(1.0, control, {}, {}, {}, end_note, [], False, 0, None, stalls or {}), LiveEvents()
+    flight, result = flight_of(calls, (), status, None, calls.folder / "flight.csv")
+    return {row["metric"]: row for row in results(calls, flight, result, status, events)}
 
 
-def test_a_crash_is_counted_with_its_last_row_and_without(asked):
-    rows = flown(asked)
-    assert reported(asked, rows, "landed")["steady"]["crashes"] == 0
-    without = reported(asked, rows, CRASHED)
+def test_a_crash_is_counted_with_its_last_row_and_without(requests):
+    rows = fly_once(requests)
+    assert report(requests, rows, "landed")["steady"]["crashes"] == 0
+    without = report(requests, rows, CRASHED)
     assert without["steady"]["crashes"] == 1
     assert without["steady"]["value"] is None
     assert without["recovery_5cm"]["value"] is None
-    assert reported(asked, rows, CRASHED, reason="landing")["steady"]["crashes"] == 0
+    assert report(requests, rows, CRASHED, reason="landing")["steady"]["crashes"] == 0
     rows[-1, TRUE] = rows[-1, MEASURED] = level((0.0, 0.0, -1.0))
-    assert reported(asked, rows, CRASHED)["steady"]["crashes"] == 1
+    assert report(requests, rows, CRASHED)["steady"]["crashes"] == 1
 
 
-def test_the_table_of_a_flight_has_labels_in_words_and_leaves_out_nothing(asked):
-    rows = list(reported(asked, flown(asked), "landed", missed=5).values())
-    shown = figures([*rows, {"metric": "later_figure", "value": 1.0}])
-    assert len(shown) < len(rows)
-    assert not any("_" in label for label, _, _ in shown)
-    assert ("missed ticks, in stalls of the machine", "", "5, -") in shown
-    assert ("later figure", "", "1") in shown
+def test_the_table_of_a_flight_has_labels_in_words_and_leaves_out_nothing(requests):
+    rows = list(report(requests, fly_once(requests), "landed", missed=5).values())
+    display = figures([*rows, {"metric": "later_figure", "value": 1.0}])
+    assert len(display) < len(rows)
+    assert not any("_" in label for label, _, _ in display)
+    assert ("missed ticks, in stalls of the machine", "", "5, -") in display
+    assert ("later figure", "", "1") in display
     assert {name for _, _, names, _ in FIGURES for name in names} == {row["metric"] for row in rows}
-    assert ("error, last seconds", "mm", "0") in shown
+    assert ("error, last seconds", "mm", "0") in display
 
 
-def test_ticks_that_were_missed_while_the_machine_stood_still_are_told_apart(asked):
+def test_ticks_that_were_missed_while_the_machine_stood_still_are_told_apart(requests):
     gaps = [(10.0, 10.04, 1), (11.0, 11.08, 3), (12.0, 12.04, 1)]
     stalls = {"count": 2, "longest": 0.05, "newest": [[11.01, 11.06], [12.05, 12.06]]}
-    found = reported(asked, flown(asked), "landed", stalls, missed=5, gaps=gaps)
-    assert [found[name]["value"] for name in ("missed_ticks", "missed_in_stalls", "stalls")] == [5, 3, 2]
-    assert found["stall_max_ms"]["value"] == pytest.approx(50.0)
-    unknown = reported(asked, flown(asked), "landed", missed=5, gaps=gaps)  # the watchdog came behind others
+    result = report(requests, fly_once(requests), "landed", stalls, missed=5, gaps=gaps)
+    assert [result[name]["value"] for name in ("missed_ticks", "missed_in_stalls", "stalls")] == [5, 3, 2]
+    assert result["stall_max_ms"]["value"] == pytest.approx(50.0)
+    unknown = report(requests, fly_once(requests), "landed", missed=5, gaps=gaps)  # the watchdog came behind others
     assert [unknown[name]["value"] for name in ("missed_in_stalls", "stalls", "stall_max_ms")] == [None] * 3
 
 
-def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(asked):
-    rows = flown(asked)
+def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(requests):
+    rows = fly_once(requests)
     rows[20, ACCOUNTS["step"]] = 0.06
     rows[20:23, -1] = Mode.WATCHDOG
     rows[21:24, ACCOUNTS["step"]] = 0.0  # the watchdog's own, which it flew or has seen
-    found = reported(asked, rows, "landed")
-    assert found["step_max_ms"]["value"] == pytest.approx(60.0)
-    assert found["step_p50_ms"]["value"] == pytest.approx(1.0)
-    assert found["fallback_ticks"]["value"] == 3
+    result = report(requests, rows, "landed")
+    assert result["step_max_ms"]["value"] == pytest.approx(60.0)
+    assert result["step_p50_ms"]["value"] == pytest.approx(1.0)
+    assert result["fallback_ticks"]["value"] == 3
     assert [ticks for ticks in histograms(rows)["step"] if ticks] == [26, 1]
 
 
-def test_a_log_that_is_shorter_than_the_flight_is_a_fault_and_missed_ticks_are_none(asked):
-    rows = flown(asked, ticks=340)
+def test_a_log_that_is_shorter_than_the_flight_is_a_fault_and_missed_ticks_are_none(requests):
+    rows = fly_once(requests, ticks=340)
 
-    def lost(kept, ticks=340, **control):
-        return missing(kept, Status(1.0, control, {}, {}, {}, "landed", [], False, 0, None, ticks=ticks), DT)
+    def lose(rest, ticks=340, **control):
+        return missing(rest, Status(1.0, control, {}, {}, {}, "landed", [], False, 0, None, ticks=ticks), DT)
 
-    assert lost(rows) == lost(rows[:-5]) == lost(rows[20:]) == lost(rows, ticks=0) == []
-    said = "the log is shorter than the flight: it holds"
-    assert lost(rows[:100]) == [f"{said} 100 of 340 ticks, none from 2.00 to 6.80 s"]
-    assert lost(rows[50:]) == [f"{said} 290 of 340 ticks, none from 0.00 to 1.00 s"]
+    assert lose(rows) == lose(rows[:-5]) == lose(rows[20:]) == lose(rows, ticks=0) == []
+    text = "the log is shorter than the flight: it holds"
+    assert lose(rows[:100]) == [f"{text} 100 of 340 ticks, none from 2.00 to 6.80 s"]
+    assert lose(rows[50:]) == [f"{text} 290 of 340 ticks, none from 0.00 to 1.00 s"]
     holed = np.delete(rows, np.arange(100, 200), axis=0)
-    assert lost(holed) == [f"{said} 240 of 340 ticks, none from 2.00 to 4.00 s"]
-    assert lost(holed, gaps=[(2.0, 4.0, 100)]) == []
-    assert lost(rows[:0]) == [f"{said} 0 of 340 ticks, none from 0.00 to 6.80 s"]
+    assert lose(holed) == [f"{text} 240 of 340 ticks, none from 2.00 to 4.00 s"]
+    assert lose(holed, gaps=[(2.0, 4.0, 100)]) == []
+    assert lose(rows[:0]) == [f"{text} 0 of 340 ticks, none from 0.00 to 6.80 s"]
 
 
-def test_a_vehicle_that_was_dropped_has_crashed_and_what_was_commanded_meanwhile_is_counted(asked):
-    rows = flown(asked)
+def test_a_vehicle_that_was_dropped_has_crashed_and_what_was_commanded_meanwhile_is_counted(requests):
+    rows = fly_once(requests)
     rows[20:, -1], rows[20:, ACCOUNTS["step"]] = Mode.BLIND, 0.0
     rows[-1, -1] = Mode.DROP
-    found = reported(asked, rows, "stopped without measurements at 0.87 m", reason="the newest measurement is old")
-    assert found["steady"]["crashes"] == 1
-    assert found["steady"]["value"] is None
-    assert found["fallback_ticks"]["value"] == 10
-    landing = reported(asked, rows, "stopped without measurements at 0.87 m", reason="landing")
+    result = report(requests, rows, "stopped without measurements at 0.87 m", reason="the newest measurement is old")
+    assert result["steady"]["crashes"] == 1
+    assert result["steady"]["value"] is None
+    assert result["fallback_ticks"]["value"] == 10
+    landing = report(requests, rows, "stopped without measurements at 0.87 m", reason="landing")
     assert landing["steady"]["crashes"] == 0

@@ -53,8 +53,8 @@ def test_the_main_function_of_a_role_exists(name):
 def test_plans_carry_the_flight_and_the_priority_of_their_role(spec):
     request = RoleRequest(spec, spec.start, Path("bus"), cores=frozenset({1}), control=7)
     plans = {name: ROLES[name].plan(request) for name in (*ALWAYS, "residual", "policy", "identifier")}
-    assert {made.folder for made in plans.values()} == {Path("bus")}
-    assert {made.parent for made in plans.values()} == {request.parent}
+    assert {setup.folder for setup in plans.values()} == {Path("bus")}
+    assert {setup.parent for setup in plans.values()} == {request.parent}
     assert plans["watchdog"].control == 7
     assert plans["watchdog"].priority > plans["control"].priority > plans["plant"].priority > 0
     assert (plans["residual"].layer, plans["policy"].layer) == ("residual", "policy")

@@ -22,10 +22,10 @@ RETRIM = [sys.executable, "-m", "retrim.cli"]
 
 @pytest.fixture(scope="module")
 def master():
-    with rosmaster() as found:
-        if found is None:
+    with rosmaster() as result:
+        if result is None:
             pytest.skip("needs rosmaster and rospy: make test-ros installs them")
-        yield f"{found.host}:{found.port}"
+        yield f"{result.host}:{result.port}"
 
 
 def test_targets_are_those_of_mavros(master):
@@ -40,7 +40,7 @@ def test_it_is_a_link_to_a_vehicle(master, more):
 
 
 def test_nobody_there_is_named(master, monkeypatch):
-    monkeypatch.setattr(ros, "HEARD_S", 0.3)
+    monkeypatch.setattr(ros, "WAIT_S", 0.3)
     plant, why = Scenario(plant=f"ros:{master}/elsewhere").make("small"), r"neither /elsewhere/.* came in 0\.3 s"
     with plant, pytest.raises(PlantError, match=why):
         plant.connect()
@@ -52,12 +52,12 @@ def test_a_flight_adapts_under_a_large_disturbance(master, tmp_path):
     subprocess.run(words, check=True, capture_output=True, timeout=300)
     with peer("ros", f"http://{master}", "--disturbance", "large"):
         words = [*RETRIM, "live", "--policy", str(policy), "--plant", f"ros:{master}", "--seconds", "20"]
-        ran = subprocess.run([*words, "--out", str(flight)], capture_output=True, text=True, timeout=240)
-    assert ran.returncode == 0, ran.stdout
+        process = subprocess.run([*words, "--out", str(flight)], capture_output=True, text=True, timeout=240)
+    assert process.returncode == 0, process.stdout
     figures = {row["metric"]: row["value"] for row in json.loads((flight / "results.json").read_text())["rows"]}
     rows = read_log(flight / "flight.csv")
     late = rows[(rows[:, 1] > 15.0) & (rows[:, -1] == Mode.POLICY)]
-    assert "flight over: landed" in ran.stdout
+    assert "flight over: landed" in process.stdout
     assert figures["policies"] > 10
     assert figures["refused_messages"] == 0
     assert np.linalg.norm(late[:, 3:6] - [0.0, 0.0, 1.0], axis=1).mean() < 0.05

@@ -4,11 +4,11 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-
-from live_processes import HOME
-from retrim.live.manual_disturbance import ManualDisturbance
+from retrim.live.operator.manual_disturbance import ManualDisturbance
 from retrim.live.panel import LEAST, START_S, Panel, top_of
 from retrim.live.scene import Scene
+
+from live_processes import HOME
 
 HALF = np.radians(75.0) / 2  # half of the height of viser's picture, as an angle
 ROTOR = 0.55  # radius of a drawn rotor, in arms
@@ -38,8 +38,8 @@ def test_a_hovering_vehicle_fills_a_tenth_of_the_picture_and_the_ground_is_in_it
     server, _ = scene_of(HOME[None].repeat(2, 0), arm)
     width = 2 * (1 + ROTOR) * max(arm, 0.08)
     ends = HOME + 0.5 * width * np.array([[0.7, -0.8, 0.0], [-0.7, 0.8, 0.0]]) / np.hypot(0.7, 0.8)
-    found = angles(server, ends)
-    assert 0.1 < np.ptp(found[:, 0]) / 2 < 0.5
+    result = angles(server, ends)
+    assert 0.1 < np.ptp(result[:, 0]) / 2 < 0.5
     assert np.abs(angles(server, HOME * [1.0, 1.0, 0.0])).max() < 1.0
 
 
@@ -55,8 +55,8 @@ def test_the_world_has_a_sky_the_ground_and_axes():
     assert (image[0] != image[-1]).any()
     names = {
         call.args[0]
-        for made in ("add_grid", "add_frame", "add_label")
-        for call in getattr(server.scene, made).call_args_list
+        for setup in ("add_grid", "add_frame", "add_label")
+        for call in getattr(server.scene, setup).call_args_list
     }
     assert {"/ground", "/axes", "/axes/x", "/axes/y", "/axes/z", "/target/name", "/vehicle"} <= names
 

@@ -37,6 +37,6 @@ def test_a_fence_holds_all_that_the_reference_passes_and_none_is_made_for_one_th
     limits = live_spec(request_for(Lost, tmp_path, 2.0)).limits
     home = np.asarray(request_for(Hover, tmp_path, 2.0).setup.flight_task.home())
     np.testing.assert_allclose(limits.high, home + 3.0)
-    assert limits.broken(np.concatenate([home + np.array([3.1, 0.0, 0.0]), np.eye(3).ravel(), np.zeros(3)]))
+    assert limits.find_violation(np.concatenate([home + np.array([3.1, 0.0, 0.0]), np.eye(3).ravel(), np.zeros(3)]))
     with pytest.raises(ConfigError, match=r"its reference is not finite at 2 s; no fence can hold it"):
         live_spec(request_for(Lost, tmp_path, 4.0))

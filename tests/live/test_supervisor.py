@@ -17,10 +17,10 @@ from retrim.transport.shared_memory import SharedMemoryBus
 ADDRESS = Address("zenoh", "127.0.0.1", 1)
 
 
-def ground_of(folder, base, heard):
+def ground_of(folder, base, reply):
     """Learners elsewhere, who take a while to hear of the end."""
     bus = SharedMemoryBus(folder)
-    while not (ended := last_note(bus, "ended")):
+    while not (end_note := last_note(bus, "ended")):
         bus.publish("ground", pack_note("ground", base=base, alive={"policy": True}))
         time.sleep(0.02)
     until = time.monotonic() + 3 * FAREWELL
@@ -28,22 +28,22 @@ def ground_of(folder, base, heard):
         bus.publish("ground", pack_note("ground", base="of another flight", alive={"policy": True}, over=True))
         time.sleep(0.02)
     if folder.exists():
-        heard.append(ended["reason"])
+        reply.append(end_note["reason"])
     bus.publish("ground", pack_note("ground", base=base, alive={}, over=True))
     bus.close()
 
 
 @pytest.mark.parametrize("reason", ["landed", None])
 def test_learners_elsewhere_hear_of_the_end_before_their_bridge_goes(tmp_path, controller, reason):  # noqa: F811
-    heard = list[str]()
+    reply = list[str]()
     with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
-        ground = threading.Thread(target=ground_of, args=(flight.bus.folder, controller.base, heard))
+        ground = threading.Thread(target=ground_of, args=(flight.bus.folder, controller.base, reply))
         ground.start()
         while flight.bus.latest("ground") is None:
             time.sleep(0.01)
         if reason:
             flight.bus.publish("ended", pack_note("ended", reason=reason))
-    assert heard == [reason or "the flight did not come to its end"]
+    assert reply == [reason or "the flight did not come to its end"]
     ground.join()
 
 
@@ -61,7 +61,7 @@ class Process:
     """Runs until it is told to end."""
 
     def __init__(self, runs=True):
-        self.told, self._code = None, None if runs else 0
+        self.stop_time, self._code = None, None if runs else 0
 
     def poll(self):
         return self._code
@@ -73,7 +73,7 @@ class Process:
         self._code = -9
 
     def terminate(self):
-        self.told, self._code = time.monotonic(), -15
+        self.stop_time, self._code = time.monotonic(), -15
 
 
 def test_control_that_has_nothing_left_to_fly_has_time_to_say_its_last_rows(tmp_path, controller):  # noqa: F811
@@ -82,4 +82,4 @@ def test_control_that_has_nothing_left_to_fly_has_time_to_say_its_last_rows(tmp_
         flight.processes = {"recorder": Process(), "control": control, "plant": Process(runs=False)}
         began = time.monotonic()
         flight.finish(patience=1.0)
-        assert began + 3 * DT < control.told < began + 1.0
+        assert began + 3 * DT < control.stop_time < began + 1.0

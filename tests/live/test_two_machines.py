@@ -43,17 +43,17 @@ def test_a_flight_learns_on_another_machine(policy, tmp_path, network):
         ground = subprocess.Popen(
             [*inside, *RETRIM, "learn", address, "--key", str(key)], stdout=subprocess.PIPE, text=True
         )
-        said, heard = flight.communicate(timeout=300)[0], ground.communicate(timeout=60)[0]
-    assert flight.returncode == 0, said
-    assert ground.returncode == 0, heard
-    assert "flight over: landed" in heard
-    assert ("warning: this machine listens on" in said) == (network != "ROS 1")
-    found = {row["metric"]: row["value"] for row in json.loads((tmp_path / "results.json").read_text())["rows"]}
-    assert found["policies"] > 10
-    assert found["flight_to_swap_s"] < 1.0
-    assert found["steady"] < 0.01
-    assert found["fallback_ticks"] == 0
-    assert found["refused_messages"] == 0
+        text, reply = flight.communicate(timeout=300)[0], ground.communicate(timeout=60)[0]
+    assert flight.returncode == 0, text
+    assert ground.returncode == 0, reply
+    assert "flight over: landed" in reply
+    assert ("warning: this machine listens on" in text) == (network != "ROS 1")
+    result = {row["metric"]: row["value"] for row in json.loads((tmp_path / "results.json").read_text())["rows"]}
+    assert result["policies"] > 10
+    assert result["flight_to_swap_s"] < 1.0
+    assert result["steady"] < 0.01
+    assert result["fallback_ticks"] == 0
+    assert result["refused_messages"] == 0
 
 
 def test_one_process_on_the_ground_learns_for_two_vehicles_as_between_namespaces(policy, tmp_path):
@@ -66,15 +66,15 @@ def test_one_process_on_the_ground_learns_for_two_vehicles_as_between_namespaces
     ]
     ground = subprocess.Popen([*RETRIM, "learn", *where], stdout=subprocess.PIPE, text=True)
     flights = [subprocess.Popen([*words, *each], stdout=subprocess.PIPE, text=True) for each in more]
-    said = [flight.communicate(timeout=300)[0] for flight in flights]
-    heard = ground.communicate(timeout=60)[0]
-    assert [flight.returncode for flight in flights] == [0, 0], said
-    assert ground.returncode == 0, heard
-    assert heard.count("flight over: landed") == 2
+    text = [flight.communicate(timeout=300)[0] for flight in flights]
+    reply = ground.communicate(timeout=60)[0]
+    assert [flight.returncode for flight in flights] == [0, 0], text
+    assert ground.returncode == 0, reply
+    assert reply.count("flight over: landed") == 2
     for i in range(2):
         rows = json.loads((tmp_path / f"{i}" / "results.json").read_text())["rows"]
-        found = {row["metric"]: row["value"] for row in rows}
-        assert found["policies"] > 3
-        assert found["flight_to_swap_s"] < 1.5
-        assert found["steady"] < 0.01
-        assert found["refused_messages"] == 0
+        result = {row["metric"]: row["value"] for row in rows}
+        assert result["policies"] > 3
+        assert result["flight_to_swap_s"] < 1.5
+        assert result["steady"] < 0.01
+        assert result["refused_messages"] == 0

@@ -42,13 +42,13 @@ def spec(tmp_path, controller):
     start = tmp_path / "start.safetensors"
     start.write_bytes(b"")
     return LiveSpec(
-        controller, ("residual", "policy"), start, None, Scenario(plant="made_up_vehicle:point"), "small", level(HOME),
+        controller, ("residual", "policy"), start, None, Scenario(plant="fake_vehicle:point"), "small", level(HOME),
         HOME, plan(controller).limits, DT, 1, 150, SECONDS, 0, tmp_path,
         mains={"plant": VEHICLE} | LEARNERS,
     )  # fmt: skip
 
 
-def flown(spec, kill=None):
+def fly_once(spec, kill=None):
     """Fly; return how it ended and what was said of it."""
     events = LiveEvents()
     with Flight(spec) as flight:
@@ -56,7 +56,7 @@ def flown(spec, kill=None):
             pass
         flight.take_off()
         until = time.monotonic() + 20.0
-        while (status := flight.watch()).ended is None and time.monotonic() < until:
+        while (status := flight.watch()).end_reason is None and time.monotonic() < until:
             events.take(status)
             if kill and status.t > 0.5:
                 os.kill(flight.processes[kill].pid, signal.SIGKILL)
@@ -70,9 +70,9 @@ def flown(spec, kill=None):
 
 
 def test_it_is_flown_from_the_hand_over_to_the_landing(spec):
-    status, _ = flown(spec)
+    status, _ = fly_once(spec)
     rows = read_log(spec.folder / "flight.csv")
-    assert status.ended == "landed"
+    assert status.end_reason == "landed"
     assert rows[0, 0] == 0
     assert rows[-1, -1] == Mode.LANDED
     # A busy machine leaves ticks out; it neither stretches the flight nor renumbers those that it flew.
@@ -90,21 +90,21 @@ def alone(spec):
 
 
 def test_without_control_the_watchdog_lands_it(alone):
-    status, events = flown(alone, "control")
+    status, events = fly_once(alone, "control")
     rows = read_log(alone.folder / "flight.csv")
-    assert status.ended == "landed"
+    assert status.end_reason == "landed"
     assert rows[-1, -1] == Mode.WATCHDOG
     assert any(event.note.startswith("watchdog: ") for event in events)
 
 
 def test_a_lost_link_ends_the_flight_and_keeps_the_log(alone):
-    status, _ = flown(replace(alone, scenario=Scenario(plant="made_up_vehicle:lost")))
-    assert status.ended == "plant lost: the link has been silent"
+    status, _ = fly_once(replace(alone, scenario=Scenario(plant="fake_vehicle:lost")))
+    assert status.end_reason == "plant lost: the link has been silent"
     assert read_log(alone.folder / "flight.csv")[-1, 1] > 0.1
 
 
 def test_what_does_not_arm_never_flies(alone):
-    spec = replace(alone, scenario=Scenario(plant="made_up_vehicle:unarmed"))
+    spec = replace(alone, scenario=Scenario(plant="fake_vehicle:unarmed"))
     with pytest.raises(PlantError, match=r"before it began: .*refuses to be armed; it said: no battery"), \
             Flight(spec) as flight:  # fmt: skip
         for _ in flight.warm_up():
@@ -136,8 +136,8 @@ def status(*, flies, ticks):
 
 def test_the_watchdog_that_flew_a_few_ticks_is_told_of():
     events = LiveEvents()
-    for seen in [status(flies=False, ticks=0), status(flies=True, ticks=2), status(flies=False, ticks=3)]:
-        events.take(seen)
+    for observation in [status(flies=False, ticks=0), status(flies=True, ticks=2), status(flies=False, ticks=3)]:
+        events.take(observation)
     notes = [event.note for event in events.all]
     assert notes[0].startswith("watchdog: ")
     assert notes[1] == "watchdog: it flew 3 ticks, control was late"

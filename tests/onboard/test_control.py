@@ -11,7 +11,7 @@ from jax import random
 
 from helpers import CheapModel
 from live_helpers import TOPICS, Holds, holding, plan, setup
-from live_processes import DT, HOME, level, moved
+from live_processes import DT, HOME, level, move
 from retrim import PlantError
 from retrim.adapt.learner_state import LearnerState
 from retrim.live.processes.controllers import adaptive_source, plain_source
@@ -30,7 +30,7 @@ from retrim.onboard.messages import (
     unpack_note,
 )
 from retrim.onboard.tick_budget import PHASE, SHARE
-from retrim.onboard.timing_stats import measured
+from retrim.onboard.timing_stats import has_measurement
 from retrim.physics import Command, State
 from retrim.physics.disturbance import Constant
 from retrim.plants.sim import SimPlant
@@ -46,7 +46,7 @@ class Flight:
         self.loop = ControlLoop(plan(source, **options), self.bus)
         self.x, self.push, self.tick = level() if x is None else x, push, 0
         self.acting = self.accepted = np.array([9.81, 0.0, 0.0, 0.0])
-        self.issued = []
+        self.commands = []
 
     def measured(self, now):
         return Sample(self.tick, self.tick * DT, now, 0.0, self.x, self.x, self.accepted)
@@ -57,11 +57,11 @@ class Flight:
             self.bus.publish("sample", change(self.measured(now - late)).pack())
             setpoint = self.loop.tick(now)
             self.loop.idle()
-            self.issued.append(setpoint.u)
-            self.x = moved(self.x, self.acting, self.push)
+            self.commands.append(setpoint.u)
+            self.x = move(self.x, self.acting, self.push)
             self.acting = self.accepted = setpoint.u
             self.tick += 1
-        return self.issued[-1]
+        return self.commands[-1]
 
     def parameters(self, gains, version, base=None, *, half="policy", parent=0):
         arrays = {"gains": np.array(gains)} if half == "policy" else {"fit": np.array(gains)}
@@ -76,25 +76,25 @@ class Flight:
 
 def test_it_is_the_lockstep_flight_tick_for_tick():
     """Frame, observer and regression included, on a plant with a delay, under a push."""
-    made = setup()
-    state = made.learner.init(made.new_policy(random.key(0)), random.key(1))
+    result = setup()
+    state = result.learner.init(result.new_policy(random.key(0)), random.key(1))
     push = Constant(jnp.array([0.3, -0.2, 0.4]))
     x0 = State.at(jnp.array([0.2, -0.1, 1.1]))
-    log = fly(SimPlant(CheapModel(), push), ControllerPilot(made.controller(state)), x0, ticks=60)
+    log = fly(SimPlant(CheapModel(), push), ControllerPilot(result.controller(state)), x0, ticks=60)
 
     bus = InProcessBus(TOPICS)
-    loop = ControlLoop(plan(adaptive_source(made, state), window=100), bus)
+    loop = ControlLoop(plan(adaptive_source(result, state), window=100), bus)
     loop.warm_up()
     with SimPlant(CheapModel(), push) as plant:
-        measurement, accepted = plant.reset(x0), np.array([9.81, 0.0, 0.0, 0.0])
+        measurement, accepted_command = plant.reset(x0), np.array([9.81, 0.0, 0.0, 0.0])
         for tick in range(60):
             x = np.concatenate([np.asarray(leaf).ravel() for leaf in (measurement.p, measurement.R, measurement.v)])
             now = time.monotonic()
             loop.rehearse()  # which changes nothing
-            bus.publish("sample", Sample(tick, measurement.t, now, 0.0, x, x, accepted).pack())
+            bus.publish("sample", Sample(tick, measurement.t, now, 0.0, x, x, accepted_command).pack())
             u = loop.tick(now).u
-            measurement, taken = plant.step(Command(jnp.asarray(u[0]), jnp.asarray(u[1:])))
-            accepted = np.asarray(taken.vector())
+            measurement, extract = plant.step(Command(jnp.asarray(u[0]), jnp.asarray(u[1:])))
+            accepted_command = np.asarray(extract.vector())
     loop.idle()
     rows = FlightRows.unpack(bus.latest("flight").data).rows
     # A tick is reported when the next measurement says what the plant took.
@@ -106,31 +106,31 @@ def test_it_is_the_lockstep_flight_tick_for_tick():
 @pytest.mark.parametrize("slow", [False, True])
 def test_only_a_controller_that_decides_at_once_is_rehearsed(monkeypatch, slow):
     flight = Flight(holding())
-    act, rehearsed = flight.loop.pilot.act, []
-    monkeypatch.setattr(flight.loop.pilot, "act", lambda *given: (time.sleep(0.1 * DT * slow), act(*given))[1])
-    monkeypatch.setattr(flight.loop.pilot, "rehearse", lambda *given: rehearsed.append(given))
+    act, rehearsals = flight.loop.pilot.act, []
+    monkeypatch.setattr(flight.loop.pilot, "act", lambda *argument: (time.sleep(0.1 * DT * slow), act(*argument))[1])
+    monkeypatch.setattr(flight.loop.pilot, "rehearse", lambda *argument: rehearsals.append(argument))
     flight.loop.warm_up()
     flight.loop.rehearse()
-    assert not rehearsed  # nothing has been measured
+    assert not rehearsals  # nothing has been measured
     flight.step()
     flight.loop.rehearse()
-    assert bool(rehearsed) != slow
+    assert bool(rehearsals) != slow
     flight.step(late=1.0)  # the guard flies
-    rehearsed.clear()
+    rehearsals.clear()
     flight.loop.rehearse()
-    assert not rehearsed
+    assert not rehearsals
 
 
 def test_a_swap_changes_the_command_little_by_little():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(3)
-    before = flight.issued[-1]
+    before = flight.commands[-1]
     flight.bus.publish("parameters.policy", flight.parameters((1.0, 1.0), 1))
     flight.loop.idle()
-    found = [flight.step() for _ in range(8)]
+    result = [flight.step() for _ in range(8)]
     assert flight.status["versions"] == {"policy": 1}
-    whole = np.abs(found[-1] - before).max()
-    jumps = np.abs(np.diff([before, *found], axis=0)).max(1)
+    whole = np.abs(result[-1] - before).max()
+    jumps = np.abs(np.diff([before, *result], axis=0)).max(1)
     assert jumps.max() < 0.45 * whole
     # After the blend it is the new controller's own command.
     fresh = Flight(holding((1.0, 1.0)), x=flight.x)
@@ -249,7 +249,7 @@ def test_the_age_of_the_policy_is_that_of_the_one_that_flies():
 
 
 def test_it_is_taken_back_while_fits_and_policies_keep_coming():
-    flight = Flight(holding(fitted=True), push=(0.3, 0.0, 0.0))
+    flight = Flight(holding(fit_result=True), push=(0.3, 0.0, 0.0))
     flight.step(200)
     for i in range(1, 120):
         if i % 10 == 1:
@@ -269,14 +269,14 @@ def test_it_is_taken_back_while_fits_and_policies_keep_coming():
 def test_a_second_swap_during_a_blend_does_not_jump():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(3)
-    before = flight.issued[-1]
+    before = flight.commands[-1]
     for version, gains in ((1, (1.0, 1.0)), (2, (1.0, 1.0)), (3, (1.0, 1.0))):
         flight.bus.publish("parameters.policy", flight.parameters(gains, version))
         flight.loop.idle()
         flight.step(2)
     flight.step(8)
-    whole = np.abs(flight.issued[-1] - before).max()
-    assert np.abs(np.diff(flight.issued[2:], axis=0)).max() < 0.45 * whole
+    whole = np.abs(flight.commands[-1] - before).max()
+    assert np.abs(np.diff(flight.commands[2:], axis=0)).max() < 0.45 * whole
 
 
 def test_a_clipped_command_is_what_the_controller_remembers():
@@ -292,7 +292,7 @@ def test_a_clipped_command_is_what_the_controller_remembers():
 
     flight = Flight(plain_source(setup(), Remembers()))
     flight.step()
-    assert flight.issued[-1][0] == 30.0
+    assert flight.commands[-1][0] == 30.0
     np.testing.assert_array_equal(flight.loop.pilot._memory[0], 30.0)
 
 
@@ -315,7 +315,7 @@ def test_a_missed_tick_is_counted_and_gets_no_row_of_another():
     rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
     assert flight.status["missed"] == 2
     np.testing.assert_array_equal(rows[:, 0], [*range(10), 12, 13])
-    np.testing.assert_allclose(rows[9, COMMAND], flight.issued[9], atol=1e-12)
+    np.testing.assert_allclose(rows[9, COMMAND], flight.commands[9], atol=1e-12)
     flight.loop.land("landing")
     flight.tick += 2
     flight.step()
@@ -355,7 +355,7 @@ def test_a_broken_limit_gives_the_vehicle_to_the_fallback_and_lands_it(change, r
     assert flight.status["reason"].startswith(reason)
     flight.step(400)
     assert flight.loop.mode == Mode.LANDED
-    assert np.isfinite(flight.issued).all()
+    assert np.isfinite(flight.commands).all()
     assert flight.x[2] < 0.2
 
 
@@ -363,7 +363,7 @@ def test_a_command_that_is_not_finite_is_never_issued():
     source = holding()
     flight = Flight(dataclasses.replace(source, parameters={"policy": {"gains": np.array([np.nan, 3.5])}}))
     flight.step(30)
-    assert np.isfinite(flight.issued).all()
+    assert np.isfinite(flight.commands).all()
     assert flight.status["reason"] == "the policy's command is not finite"
 
 
@@ -374,9 +374,9 @@ def test_a_target_that_is_not_finite_is_never_told_and_the_last_one_is_held(monk
     flight.x = level(x=0.4)
     for _ in range(60):
         flight.step()
-        said = Setpoint.unpack(flight.bus.latest("setpoint").data)
-        assert said.tick == flight.tick - 1
-        np.testing.assert_array_equal(said.target, HOME)
+        text = Setpoint.unpack(flight.bus.latest("setpoint").data)
+        assert text.tick == flight.tick - 1
+        np.testing.assert_array_equal(text.target, HOME)
     assert flight.loop.mode == Mode.HOLD
     assert flight.status["reason"] == "the target is not finite"
     assert np.linalg.norm(flight.x[:3] - HOME) < 0.2
@@ -402,8 +402,8 @@ def test_a_measurement_that_is_refused_is_answered_by_level_and_sink():
         flight.loop.idle()
         modes.append(flight.loop.mode)
         assert setpoint.tick == tick  # the plant takes no other
-        assert flight.loop.stamp == Stamp(tick, sample.sent)
-        if setpoint.landed:
+        assert flight.loop.stamp == Stamp(tick, sample.send_time)
+        if setpoint.is_final:
             break
     assert modes[:4] == [Mode.POLICY] * 4
     assert 95 <= modes.count(Mode.BLIND) <= 105
@@ -435,12 +435,12 @@ def test_all_ticks_are_reported_before_the_command_that_ends_the_flight(monkeypa
     flight.loop.land("landing")
     publish = flight.bus.publish
 
-    def noted(topic, data):
-        if topic == "setpoint" and Setpoint.unpack(data).landed:
+    def note(topic, data):
+        if topic == "setpoint" and Setpoint.unpack(data).is_final:
             last.append(FlightRows.unpack(flight.bus.latest("flight").data).rows[-1])
         publish(topic, data)
 
-    monkeypatch.setattr(flight.bus, "publish", noted)
+    monkeypatch.setattr(flight.bus, "publish", note)
     while not last:
         flight.step()
     assert last[0][0] == flight.tick - 1
@@ -451,8 +451,8 @@ def test_without_measurements_it_levels_then_lands_by_the_clock():
     flight = Flight(holding(), state_age=0.1)
     flight.step(20)
     now = time.monotonic()
-    found = [flight.loop.tick(now + 0.02 * i) for i in range(1, 140)]
-    modes = [setpoint.landed for setpoint in found]
+    result = [flight.loop.tick(now + 0.02 * i) for i in range(1, 140)]
+    modes = [setpoint.is_final for setpoint in result]
     assert flight.status["reason"].startswith("the newest measurement is")
     assert flight.loop.mode == Mode.DROP
     assert 100 <= modes.index(True) <= 110
@@ -460,8 +460,8 @@ def test_without_measurements_it_levels_then_lands_by_the_clock():
     blind = rows[rows[:, 0] > 19]  # each command that nobody asked for has a row
     assert (np.diff(blind[:, 0]) <= 2).all()
     assert sorted(set(blind[:, -1])) == [Mode.BLIND, Mode.DROP]
-    assert not measured(blind).any()
-    assert measured(rows[rows[:, 0] <= 19]).all()
+    assert not has_measurement(blind).any()
+    assert has_measurement(rows[rows[:, 0] <= 19]).all()
     np.testing.assert_allclose(blind[:, 2], DT * (blind[:, 0] - 19), atol=DT)
     np.testing.assert_array_equal(blind[-1, COMMAND], np.zeros(4))
 
@@ -469,8 +469,8 @@ def test_without_measurements_it_levels_then_lands_by_the_clock():
 def test_a_lost_sample_holds_the_command():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(5)
-    held = flight.loop.tick(time.monotonic())
-    np.testing.assert_array_equal(held.u, flight.issued[-1])
+    hold = flight.loop.tick(time.monotonic())
+    np.testing.assert_array_equal(hold.u, flight.commands[-1])
 
 
 def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
@@ -481,7 +481,7 @@ def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
     rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
     assert rows.shape == (30, len(COLUMNS))
     np.testing.assert_array_equal(rows[:, 0], np.arange(9, 39))
-    assert rows[10, COMMAND][0] == pytest.approx(flight.issued[19][0] + 0.5)
+    assert rows[10, COMMAND][0] == pytest.approx(flight.commands[19][0] + 0.5)
 
 
 @pytest.mark.parametrize("slow", ["act", "target"])
@@ -489,7 +489,7 @@ def test_a_controller_that_is_too_slow_for_its_tick_never_takes_off(monkeypatch,
     flight = Flight(holding())
     flight.loop.warm_up()
     part = getattr(flight.loop.pilot, slow)
-    monkeypatch.setattr(flight.loop.pilot, slow, lambda *given: time.sleep((SHARE - PHASE) * DT) or part(*given))
+    monkeypatch.setattr(flight.loop.pilot, slow, lambda *argument: time.sleep((SHARE - PHASE) * DT) or part(*argument))
     with pytest.raises(PlantError, match=r"takes \d+ ms to decide, here and in NumPy, of a tick of 20 ms"):
         flight.loop.warm_up()
 
@@ -505,11 +505,11 @@ def test_land_is_an_order():
 
 
 def test_parameters_of_a_learner_become_those_of_the_controller():
-    made = setup()
-    state = made.learner.init(made.new_policy(random.key(0)), random.key(1))
-    other = made.new_policy(random.key(5))
-    a = adaptive_source(made, state)
-    b = adaptive_source(made, LearnerState(eqx.tree_at(lambda s: s.policy, state.policy, other), state.residual))
+    result = setup()
+    state = result.learner.init(result.new_policy(random.key(0)), random.key(1))
+    other = result.new_policy(random.key(5))
+    a = adaptive_source(result, state)
+    b = adaptive_source(result, LearnerState(eqx.tree_at(lambda s: s.policy, state.policy, other), state.residual))
     assert a.base == b.base
     flight = Flight(a)
     flight.step()

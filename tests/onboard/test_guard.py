@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from live_processes import moved, rotation
+from live_processes import move, rotation
 from retrim.onboard.guard import HOVER, UP, Fallback, G, GeometricHover, Limits, Mode, turn
 from retrim.physics.state import STANDARD_GRAVITY, Command
 
@@ -12,32 +12,32 @@ LOW, HIGH = np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0])
 LIMITS = Limits(np.array([-3.0, -3.0, -0.3]), np.array([3.0, 3.0, 4.0]), LOW, HIGH)
 
 
-def state(p=(0.0, 0.0, 1.0), turned=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0)):
-    return np.concatenate([p, rotation(np.array(turned)).ravel(), v])
+def state(p=(0.0, 0.0, 1.0), turn=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0)):
+    return np.concatenate([p, rotation(np.array(turn)).ravel(), v])
 
 
-def flown(x, decide, push, ticks):
+def fly_once(x, decide, push, ticks):
     """Fly with a command delay of one tick; return all states."""
-    found, acting = [x], np.array([G, 0.0, 0.0, 0.0])
+    result, acting = [x], np.array([G, 0.0, 0.0, 0.0])
     for _ in range(ticks):
-        u, after = decide(found[-1], acting), moved(found[-1], acting, push)
+        u, after = decide(result[-1], acting), move(result[-1], acting, push)
         acting = u
-        found.append(after)
-    return np.stack(found)
+        result.append(after)
+    return np.stack(result)
 
 
 @pytest.mark.parametrize(
-    ("x", "said"),
+    ("x", "text"),
     [
         (state((3.1, 0.0, 1.0)), "geofence: at"),
         (state((0.0, 0.0, -0.4)), "geofence: at"),
-        (state(turned=(1.5, 0.0, 0.0)), "tilt: 1.50 rad, allowed 1.4"),
+        (state(turn=(1.5, 0.0, 0.0)), "tilt: 1.50 rad, allowed 1.4"),
         (state(v=(0.0, 16.0, 0.0)), "speed: 16.0 m/s, allowed 15"),
         (state(v=(0.0, np.nan, 0.0)), "the state is not finite"),
     ],
 )
-def test_each_limit_is_named(x, said):
-    assert said in LIMITS.broken(x)
+def test_each_limit_is_named(x, text):
+    assert text in LIMITS.find_violation(x)
 
 
 def test_it_hovers_by_the_same_gravity_as_the_models():
@@ -46,7 +46,7 @@ def test_it_hovers_by_the_same_gravity_as_the_models():
 
 
 def test_a_flight_within_limits_breaks_none():
-    assert LIMITS.broken(state((2.9, -2.9, 0.0), (1.3, 0.0, 0.0), (0.0, 14.0, 0.0))) is None
+    assert LIMITS.find_violation(state((2.9, -2.9, 0.0), (1.3, 0.0, 0.0), (0.0, 14.0, 0.0))) is None
 
 
 def test_the_turn_is_the_smallest_that_points_the_thrust():
@@ -70,7 +70,7 @@ def test_it_holds_a_place_from_a_tumble_and_against_a_push(push):
         last.append(x)
         return hover.command(x, np.array([0.0, 0.0, 1.0]))
 
-    path = flown(state((0.8, -0.5, 1.5), (0.9, -0.6, 0.4), (1.0, -1.0, 0.5)), decide, np.array(push), 500)
+    path = fly_once(state((0.8, -0.5, 1.5), (0.9, -0.6, 0.4), (1.0, -1.0, 0.5)), decide, np.array(push), 500)
     assert np.abs(path[:, :3]).max() < 4.0
     assert np.linalg.norm(path[-50:, :3] - [0.0, 0.0, 1.0], axis=1).max() < 0.05
 
@@ -88,27 +88,27 @@ def test_the_fallback_holds_then_sinks_then_stops(push):
         modes.append(mode)
         return u
 
-    path = flown(state((0.0, 0.0, 1.5)), decide, np.array(push), 400)
-    landed = modes.index(Mode.LANDED)
-    assert modes[:landed] == sorted(modes[:landed])
+    path = fly_once(state((0.0, 0.0, 1.5)), decide, np.array(push), 400)
+    landing_tick = modes.index(Mode.LANDED)
+    assert modes[:landing_tick] == sorted(modes[:landing_tick])
     assert 95 <= modes.index(Mode.DESCEND) <= 101
-    assert path[landed, 2] <= 0.1
-    assert abs(path[landed, 14]) < 0.8
-    assert np.abs(path[:landed, :2]).max() < 0.6
+    assert path[landing_tick, 2] <= 0.1
+    assert abs(path[landing_tick, 14]) < 0.8
+    assert np.abs(path[:landing_tick, :2]).max() < 0.6
 
 
 def test_blind_it_levels_and_sinks_and_stops_after_two_seconds():
     fallback = Fallback(GeometricHover(LIMITS, DT))
     x = state((0.0, 0.0, 3.0), (0.4, 0.2, 0.0))
-    found = [fallback.step(x, False, x[:3], land=False) for _ in range(102)]
-    assert {mode for _, mode in found[:99]} == {Mode.BLIND}
-    assert found[-1][1] == Mode.DROP
-    assert found[0][1] == Mode.BLIND
-    R = rotation(np.array([0.4, 0.2, 0.0])) @ rotation(0.05 * found[0][0][1:])
+    result = [fallback.step(x, False, x[:3], land=False) for _ in range(102)]
+    assert {mode for _, mode in result[:99]} == {Mode.BLIND}
+    assert result[-1][1] == Mode.DROP
+    assert result[0][1] == Mode.BLIND
+    R = rotation(np.array([0.4, 0.2, 0.0])) @ rotation(0.05 * result[0][0][1:])
     assert R[2, 2] > rotation(np.array([0.4, 0.2, 0.0]))[2, 2]
-    assert (found[50][0][1:] == 0.0).all()
-    assert 0.9 * G < found[50][0][0] < G
+    assert (result[50][0][1:] == 0.0).all()
+    assert 0.9 * G < result[50][0][0] < G
     # When the state is known again, the vehicle holds.
-    seen = Fallback(GeometricHover(LIMITS, DT))
-    seen.step(x, False, x[:3], land=False)
-    assert seen.step(x, True, x[:3], land=False)[1] == Mode.HOLD
+    observation = Fallback(GeometricHover(LIMITS, DT))
+    observation.step(x, False, x[:3], land=False)
+    assert observation.step(x, True, x[:3], land=False)[1] == Mode.HOLD

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bus_ends import LOCAL, NETWORK, arrived, two_ends
+from bus_ends import LOCAL, NETWORK, await_message, two_ends
 from live_helpers import holding
 from retrim.onboard.messages import Parameters
 from retrim.onboard.parameter_receiver import ParameterReceiver
@@ -22,19 +22,19 @@ def test_mutated_parameters_and_random_bytes_are_refused(backend):
         pilot.reset(np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)]))
         intake, version = ParameterReceiver(pilot, reader, source.base, 0.02), 0
         for i in range(2 * EACH):
-            data = _mutated(whole, rng) if i % 2 else rng.bytes(int(rng.integers(0, 2000)))
+            data = _mutate(whole, rng) if i % 2 else rng.bytes(int(rng.integers(0, 2000)))
             writer.publish("parameters.policy", data)
-            version = arrived(reader, "parameters.policy", version).version
+            version = await_message(reader, "parameters.policy", version).version
             intake.poll(0.02 * i)
         assert pilot.versions == {"policy": 0}
-        assert sum(intake.refused.values()) == 2 * EACH
+        assert sum(intake.refusals.values()) == 2 * EACH
         writer.publish("parameters.policy", Parameters("policy", 1, source.base, 0.0, {"gains": np.ones(2)}).pack())
-        arrived(reader, "parameters.policy", version)
+        await_message(reader, "parameters.policy", version)
         intake.poll(99.0)
         assert pilot.versions == {"policy": 1}
 
 
-def _mutated(whole, rng):
+def _mutate(whole, rng):
     """Some bytes changed, or the end cut off; never the message itself."""
     data = bytearray(whole)
     for _ in range(rng.integers(1, 4)):

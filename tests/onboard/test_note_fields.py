@@ -8,7 +8,7 @@ import pytest
 from retrim.control.condition import Cause, Stage
 from retrim.errors import MessageError
 from retrim.onboard.messages import last_note, pack_note, unpack_note
-from retrim.onboard.note_fields import FIELDS, plain, read_fields, shown
+from retrim.onboard.note_fields import FIELDS, format_value, plain, read_fields
 from retrim.transport.in_process import InProcessBus
 
 ODD = (None, True, 1, -1, 2**70, -(2**70), 0.5, 1e308, -1e308, math.nan, math.inf, "", "x", "\x1b[2J", "*" * 5000, [],
@@ -35,23 +35,23 @@ GOOD = {
 
 @pytest.mark.parametrize("kind", GOOD)
 def test_what_is_as_it_must_be_is_taken_as_it_is(kind):
-    found = unpack_note(pack_note(kind, **GOOD[kind]), kind)
-    np.testing.assert_equal(found, GOOD[kind])
+    result = unpack_note(pack_note(kind, **GOOD[kind]), kind)
+    np.testing.assert_equal(result, GOOD[kind])
 
 
 @pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in FIELDS for name in FIELDS[kind]])
 def test_a_field_of_any_type_is_read_or_refused_in_one_line(kind, name):
-    taken, refusals = [], []
+    extract, refusals = [], []
     for value in ODD:
         try:
-            taken.append(read_fields(kind, {name: value})[name])
+            extract.append(read_fields(kind, {name: value})[name])
         except MessageError as error:
             refusals.append(str(error))
     assert all(each.startswith(f"{kind}: {name} = ") and len(each) < 250 and each.isprintable() for each in refusals)
     assert refusals
-    kinds = {type(value) for value in taken if value is not None}
+    kinds = {type(value) for value in extract if value is not None}
     assert len(kinds) <= 1
-    assert all(value.isprintable() and len(value) <= 1000 for value in taken if isinstance(value, str))
+    assert all(value.isprintable() and len(value) <= 1000 for value in extract if isinstance(value, str))
 
 
 @pytest.mark.parametrize(
@@ -87,8 +87,8 @@ def test_fields_that_are_no_table_are_refused(fields):
 
 
 def test_what_is_quoted_is_short_and_moves_no_cursor():
-    assert shown("\x1b]0;x\x07") == r"'\x1b]0;x\x07'"
-    assert len(shown("x" * 10_000)) == 80
+    assert format_value("\x1b]0;x\x07") == r"'\x1b]0;x\x07'"
+    assert len(format_value("x" * 10_000)) == 80
     assert plain("a\x1b[2J\nb") == r"a\x1b[2J\nb"
     assert len(plain("\x00" * 10_000)) == 1000
 

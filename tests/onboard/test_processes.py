@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from live_helpers import HIGH, LOW, TOPICS
-from live_processes import DT, HOME, level, moved
+from live_processes import DT, HOME, level, move
 from retrim.onboard.control_process import PATIENCE, Schedule
 from retrim.onboard.guard import G, Limits, Mode
 from retrim.onboard.launch import launch
@@ -33,7 +33,7 @@ from retrim.onboard.messages import (
 from retrim.onboard.realtime import ParentWatch, cores_of
 from retrim.onboard.recorder import Recorder, RecorderPlan, read_log, record
 from retrim.onboard.tick_budget import MARGIN, PHASE, ROOM, SHARE
-from retrim.onboard.timing_stats import accounted, summary
+from retrim.onboard.timing_stats import is_from_control, summary
 from retrim.onboard.watchdog import Watchdog, WatchdogPlan
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.shared_memory import SharedMemoryBus
@@ -41,72 +41,72 @@ from retrim.transport.shared_memory import SharedMemoryBus
 LIMITS = Limits(np.full(3, -5.0), np.full(3, 5.0), LOW, HIGH)
 
 
-def sample(tick, sent, x=None):
+def sample(tick, sending, x=None):
     state = level() if x is None else x
-    return Sample(tick, tick * DT, sent, 0.0, state, state, np.array([G, 0.0, 0.0, 0.0]))
+    return Sample(tick, tick * DT, sending, 0.0, state, state, np.array([G, 0.0, 0.0, 0.0]))
 
 
-def steps(sent, work=0.001, ticks=60):
+def steps(sending, work=0.001, ticks=60):
     """When steps begin, for samples that are sent at ``sent(tick)``, and which sample each sees."""
-    schedule, seen, found = Schedule(0.0, DT), None, []
+    schedule, observation, result = Schedule(0.0, DT), None, []
     now = 0.0
     for _ in range(ticks):
         now = max(now, schedule.next())
-        until, last = now + PATIENCE * DT, -1 if seen is None else seen.tick
-        coming = [k for k in range(last + 1, last + 40) if sent(k) <= until]
+        until, last = now + PATIENCE * DT, -1 if observation is None else observation.tick
+        coming = [k for k in range(last + 1, last + 40) if sending(k) <= until]
         if coming:
-            seen = Stamp(coming[-1], sent(coming[-1]))
-            now = max(now, seen.sent)
-        found.append((now, None if seen is None else seen.tick))
+            observation = Stamp(coming[-1], sending(coming[-1]))
+            now = max(now, observation.send_time)
+        result.append((now, None if observation is None else observation.tick))
         now += work
-        schedule.done(now, seen)
-    return np.array(found, dtype=float)
+        schedule.done(now, observation)
+    return np.array(result, dtype=float)
 
 
 def test_steps_follow_the_samples_of_the_plant_one_by_one():
-    found = steps(lambda k: k * DT)
-    np.testing.assert_array_equal(found[:, 1], np.arange(60))
-    np.testing.assert_allclose(found[:, 0], (np.arange(60) + PHASE) * DT, atol=1e-9)
+    result = steps(lambda k: k * DT)
+    np.testing.assert_array_equal(result[:, 1], np.arange(60))
+    np.testing.assert_allclose(result[:, 0], (np.arange(60) + PHASE) * DT, atol=1e-9)
 
 
 @pytest.mark.parametrize("rate", [0.999, 1.001])
 def test_a_clock_that_drifts_is_followed(rate):
-    found = steps(lambda k: k * DT * rate, ticks=500)
-    np.testing.assert_array_equal(found[:, 1], np.arange(500))
-    assert np.abs(found[:, 0] - found[:, 1] * DT * rate - PHASE * DT).max() < 1e-3
+    result = steps(lambda k: k * DT * rate, ticks=500)
+    np.testing.assert_array_equal(result[:, 1], np.arange(500))
+    assert np.abs(result[:, 0] - result[:, 1] * DT * rate - PHASE * DT).max() < 1e-3
 
 
 @pytest.mark.parametrize("pause", [0.003, 0.009, 0.05, 1.0])
 def test_a_plant_that_stands_still_and_goes_on_is_followed_again(pause):
-    found = steps(lambda k: k * DT + (pause if k >= 20 else 0.0), ticks=160)
-    last = found[-20:]
+    result = steps(lambda k: k * DT + (pause if k >= 20 else 0.0), ticks=160)
+    last = result[-20:]
     np.testing.assert_array_equal(np.diff(last[:, 1]), 1.0)
     assert (last[:, 0] - (last[:, 1] * DT + pause) < (PHASE + PATIENCE) * DT).all()
-    answered = set(found[:, 1])
-    assert set(range(int(last[-1, 1]))) - answered <= set(range(20, 30))
+    answer = set(result[:, 1])
+    assert set(range(int(last[-1, 1]))) - answer <= set(range(20, 30))
 
 
 def test_one_late_sample_moves_nothing():
-    found = steps(lambda k: k * DT + (0.0045 if k == 20 else 0.0))
-    np.testing.assert_array_equal(found[:, 1], np.arange(60))
-    np.testing.assert_allclose(found[21:, 0], (np.arange(21, 60) + PHASE) * DT, atol=1e-9)
+    result = steps(lambda k: k * DT + (0.0045 if k == 20 else 0.0))
+    np.testing.assert_array_equal(result[:, 1], np.arange(60))
+    np.testing.assert_allclose(result[21:, 0], (np.arange(21, 60) + PHASE) * DT, atol=1e-9)
 
 
 def test_a_step_that_ends_in_the_next_tick_leaves_nothing_out():
-    found = steps(lambda k: k * DT, work=DT + 1e-4)
-    assert np.diff(found[:, 1]).max() <= 2.0
+    result = steps(lambda k: k * DT, work=DT + 1e-4)
+    assert np.diff(result[:, 1]).max() <= 2.0
     short = steps(lambda k: k * DT, work=0.9 * DT)
     np.testing.assert_array_equal(short[:, 1], np.arange(60))
 
 
 def test_a_decision_that_takes_all_its_room_is_there_while_it_is_waited_for():
     assert PHASE + ROOM + MARGIN <= SHARE + 1e-9
-    found = steps(lambda k: k * DT, work=ROOM * DT)
-    np.testing.assert_array_equal(found[:, 1], np.arange(60))
-    assert (found[:, 0] + ROOM * DT - found[:, 1] * DT <= (SHARE - MARGIN) * DT + 1e-9).all()
+    result = steps(lambda k: k * DT, work=ROOM * DT)
+    np.testing.assert_array_equal(result[:, 1], np.arange(60))
+    assert (result[:, 0] + ROOM * DT - result[:, 1] * DT <= (SHARE - MARGIN) * DT + 1e-9).all()
 
 
-class Watched:
+class WatchdogTest:
     def __init__(self):
         self.bus = InProcessBus(TOPICS)
         plan = WatchdogPlan(Path(), LIMITS, DT, HOME, frozenset({0}), 40, os.getpid(), os.getpid())
@@ -117,84 +117,84 @@ class Watched:
 
 
 def test_the_watchdog_is_silent_while_control_speaks():
-    watched = Watched()
+    watchdog_test = WatchdogTest()
     for k in range(50):
-        watched.bus.publish("sample", sample(k, k * DT).pack())
-        watched.says(k, k * DT)
-        assert watched.watchdog.check(k * DT, gone=False) is None
+        watchdog_test.bus.publish("sample", sample(k, k * DT).pack())
+        watchdog_test.says(k, k * DT)
+        assert watchdog_test.watchdog.check(k * DT, control_ended=False) is None
 
 
-@pytest.mark.parametrize(("gone", "within"), [(True, 0.001), (False, 0.04)])
-def test_it_commands_soon_after_control_is_gone_or_silent(gone, within):
-    watched = Watched()
-    watched.bus.publish("sample", sample(0, 0.0, level((1.0, 2.0, 1.5))).pack())
-    watched.says(0, 0.0, target=(1.0, 2.0, 1.5))
-    watched.watchdog.check(0.0, gone=False)
-    now, found = 0.0, None
-    while found is None and now < 1.0:
+@pytest.mark.parametrize(("loss", "within"), [(True, 0.001), (False, 0.04)])
+def test_it_commands_soon_after_control_is_gone_or_silent(loss, within):
+    watchdog_test = WatchdogTest()
+    watchdog_test.bus.publish("sample", sample(0, 0.0, level((1.0, 2.0, 1.5))).pack())
+    watchdog_test.says(0, 0.0, target=(1.0, 2.0, 1.5))
+    watchdog_test.watchdog.check(0.0, control_ended=False)
+    now, result = 0.0, None
+    while result is None and now < 1.0:
         now += 0.001
         if round(now / DT, 6) == round(now / DT):
-            watched.bus.publish("sample", sample(round(now / DT), now, level((1.0, 2.0, 1.5))).pack())
-        found = watched.watchdog.check(now, gone=gone)
+            watchdog_test.bus.publish("sample", sample(round(now / DT), now, level((1.0, 2.0, 1.5))).pack())
+        result = watchdog_test.watchdog.check(now, control_ended=loss)
     assert now <= within
-    np.testing.assert_allclose(found.u, [G, 0.0, 0.0, 0.0], atol=1e-6)  # it holds where the vehicle should be
+    np.testing.assert_allclose(result.u, [G, 0.0, 0.0, 0.0], atol=1e-6)  # it holds where the vehicle should be
 
 
 def test_what_is_no_command_is_silence():
-    watched, found = Watched(), []
-    watched.bus.publish("sample", sample(0, 0.0).pack())
-    watched.says(0, 0.0)
-    watched.watchdog.check(0.0, gone=False)
+    watchdog_test, result = WatchdogTest(), []
+    watchdog_test.bus.publish("sample", sample(0, 0.0).pack())
+    watchdog_test.says(0, 0.0)
+    watchdog_test.watchdog.check(0.0, control_ended=False)
     for k in range(1, 20):
-        watched.bus.publish("sample", sample(k, k * DT).pack())
-        watched.says(k, k * DT, target=(0.0, np.nan, 1.0))
-        found.append(watched.watchdog.check(k * DT, gone=False))
-    assert all(each is not None for each in found[1:])
-    np.testing.assert_array_equal(found[-1].target, HOME)
+        watchdog_test.bus.publish("sample", sample(k, k * DT).pack())
+        watchdog_test.says(k, k * DT, target=(0.0, np.nan, 1.0))
+        result.append(watchdog_test.watchdog.check(k * DT, control_ended=False))
+    assert all(each is not None for each in result[1:])
+    np.testing.assert_array_equal(result[-1].target, HOME)
 
 
 def test_it_answers_measurements_whose_state_is_refused():
-    watched = Watched()
-    watched.bus.publish("sample", sample(0, 0.0).pack())
-    found = [watched.watchdog.check(0.0, gone=True)]
+    watchdog_test = WatchdogTest()
+    watchdog_test.bus.publish("sample", sample(0, 0.0).pack())
+    result = [watchdog_test.watchdog.check(0.0, control_ended=True)]
     for k in range(1, 20):
-        watched.bus.publish("sample", sample(k, k * DT, np.full(15, np.nan)).pack())
-        found.append(watched.watchdog.check(k * DT, gone=True))
-    assert [each.tick for each in found] == [*range(20)]  # the plant takes no other
-    assert found[-1].u[0] < found[0].u[0]  # it sinks
-    told = FlightRows.unpack(watched.bus.latest("fallback.flight").data).rows
-    np.testing.assert_array_equal(told[:, 0], [0])
-    np.testing.assert_array_equal(told[0, COMMAND], found[0].u)
+        watchdog_test.bus.publish("sample", sample(k, k * DT, np.full(15, np.nan)).pack())
+        result.append(watchdog_test.watchdog.check(k * DT, control_ended=True))
+    assert [each.tick for each in result] == [*range(20)]  # the plant takes no other
+    assert result[-1].u[0] < result[0].u[0]  # it sinks
+    message = FlightRows.unpack(watchdog_test.bus.latest("fallback.flight").data).rows
+    np.testing.assert_array_equal(message[:, 0], [0])
+    np.testing.assert_array_equal(message[0, COMMAND], result[0].u)
 
 
 def test_it_commands_if_control_never_spoke():
-    watched, found = Watched(), []
+    watchdog_test, result = WatchdogTest(), []
     for k in range(20):
-        watched.bus.publish("sample", sample(k, k * DT).pack())
-        found.append(watched.watchdog.check(k * DT, gone=True))
-    assert sum(each is not None for each in found) >= 18
+        watchdog_test.bus.publish("sample", sample(k, k * DT).pack())
+        result.append(watchdog_test.watchdog.check(k * DT, control_ended=True))
+    assert sum(each is not None for each in result) >= 18
 
 
 def test_it_lands_the_vehicle_and_is_done():
-    watched = Watched()
+    watchdog_test = WatchdogTest()
     x, acting, modes = level((0.0, 0.0, 0.6)), np.array([G, 0.0, 0.0, 0.0]), []
     for k in range(400):
-        watched.bus.publish("sample", sample(k, k * DT, x).pack())
-        found = watched.watchdog.check(k * DT, gone=True)
-        if watched.watchdog.done:
+        watchdog_test.bus.publish("sample", sample(k, k * DT, x).pack())
+        result = watchdog_test.watchdog.check(k * DT, control_ended=True)
+        if watchdog_test.watchdog.done:
             break
-        u = acting if found is None else found.u
-        x, acting = moved(x, acting), u
+        u = acting if result is None else result.u
+        x, acting = move(x, acting), u
         modes.append(x[2])
-    assert watched.watchdog.done
+    assert watchdog_test.watchdog.done
     assert 0.0 < x[2] < 0.15
 
 
 def rows(first, n, mode=Mode.POLICY, step=1e-3):
-    made = np.zeros((n, len(COLUMNS)))
-    made[:, 0], made[:, ACCOUNTS["step"]] = np.arange(first, first + n), step
-    made[:, -1] = mode
-    return FlightRows(made).pack()
+    setup = np.zeros((n, len(COLUMNS)))
+    setup[:, 0], setup[:, ACCOUNTS["step"]] = np.arange(first, first + n), step
+    setup[:, -1] = mode
+    return FlightRows(setup).pack()
 
 
 def test_the_recorder_fills_gaps_from_reports_and_goes_on_after_a_kill(tmp_path):
@@ -214,21 +214,21 @@ def test_the_recorder_fills_gaps_from_reports_and_goes_on_after_a_kill(tmp_path)
 
 
 def test_what_the_watchdog_flies_is_written_without_a_gap(tmp_path):
-    watched = Watched()
-    recorder = Recorder(tmp_path / "flight.csv", watched.bus)
+    watchdog_test = WatchdogTest()
+    recorder = Recorder(tmp_path / "flight.csv", watchdog_test.bus)
     for k in range(30):
         now = k * DT
-        watched.bus.publish("sample", sample(k, now).pack())
+        watchdog_test.bus.publish("sample", sample(k, now).pack())
         if k < 10:  # control reports with a tick of delay, and dies
-            watched.says(k, now)
-            watched.bus.publish("flight", rows(0, k)) if k else None
-        watched.watchdog.check(now, gone=k >= 10)
+            watchdog_test.says(k, now)
+            watchdog_test.bus.publish("flight", rows(0, k)) if k else None
+        watchdog_test.watchdog.check(now, control_ended=k >= 10)
     recorder.step()
-    found = read_log(tmp_path / "flight.csv")
-    np.testing.assert_array_equal(found[:, 0], np.arange(30))
-    np.testing.assert_allclose(found[:, 1][10:], DT * np.arange(10, 30))
-    assert (found[:10, -1] == Mode.POLICY).all()
-    assert (found[10:, -1] == Mode.WATCHDOG).all()
+    result = read_log(tmp_path / "flight.csv")
+    np.testing.assert_array_equal(result[:, 0], np.arange(30))
+    np.testing.assert_allclose(result[:, 1][10:], DT * np.arange(10, 30))
+    assert (result[:10, -1] == Mode.POLICY).all()
+    assert (result[10:, -1] == Mode.WATCHDOG).all()
 
 
 def test_what_control_says_after_the_watchdog_has_spoken_is_written_too(tmp_path):
@@ -241,28 +241,28 @@ def test_what_control_says_after_the_watchdog_has_spoken_is_written_too(tmp_path
     bus.publish("flight", rows(0, 5))
     assert recorder.step() == 3
     assert Recorder(path, bus).step() == 0
-    found = read_log(path)
-    np.testing.assert_array_equal(found[:, 0], np.arange(7))
-    np.testing.assert_array_equal(found[:, -1], [Mode.POLICY] * 4 + [Mode.WATCHDOG] * 3)
+    result = read_log(path)
+    np.testing.assert_array_equal(result[:, 0], np.arange(7))
+    np.testing.assert_array_equal(result[:, -1], [Mode.POLICY] * 4 + [Mode.WATCHDOG] * 3)
 
 
 @pytest.mark.parametrize("first", ["flight", "fallback.flight"])
 def test_the_account_of_a_hang_is_in_the_log_beside_who_flew(tmp_path, first):
     bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
-    own, seen = (FlightRows.unpack(rows(0, n, step=step)).rows for n, step in ((4, 1e-3), (6, 0.0)))
+    own, observation = (FlightRows.unpack(rows(0, n, step=step)).rows for n, step in ((4, 1e-3), (6, 0.0)))
     own[3, [ACCOUNTS["step"], ACCOUNTS["policy_age"]]] = 0.06, 2.0  # control hung in its fourth tick
-    seen[3:, -1] = Mode.WATCHDOG
-    told = {"flight": own, "fallback.flight": seen}
-    for topic in sorted(told, key=lambda topic: topic != first):
-        bus.publish(topic, FlightRows(told[topic]).pack())
+    observation[3:, -1] = Mode.WATCHDOG
+    message = {"flight": own, "fallback.flight": observation}
+    for topic in sorted(message, key=lambda topic: topic != first):
+        bus.publish(topic, FlightRows(message[topic]).pack())
         assert Recorder(path, bus).step()
     assert Recorder(path, bus).step() == 0
-    found = read_log(path)
-    np.testing.assert_array_equal(found[:, 0], np.arange(6))
-    np.testing.assert_array_equal(found[:, -1], [Mode.POLICY] * 3 + [Mode.WATCHDOG] * 3)
-    np.testing.assert_allclose(found[:, ACCOUNTS["step"]], [1e-3, 1e-3, 1e-3, 0.06, 0.0, 0.0])
-    assert found[3, ACCOUNTS["policy_age"]] == 2.0
-    np.testing.assert_array_equal(accounted(found), [True] * 4 + [False] * 2)
+    result = read_log(path)
+    np.testing.assert_array_equal(result[:, 0], np.arange(6))
+    np.testing.assert_array_equal(result[:, -1], [Mode.POLICY] * 3 + [Mode.WATCHDOG] * 3)
+    np.testing.assert_allclose(result[:, ACCOUNTS["step"]], [1e-3, 1e-3, 1e-3, 0.06, 0.0, 0.0])
+    assert result[3, ACCOUNTS["policy_age"]] == 2.0
+    np.testing.assert_array_equal(is_from_control(result), [True] * 4 + [False] * 2)
 
 
 def test_what_is_reported_just_after_the_end_is_written(tmp_path):
@@ -291,20 +291,20 @@ def test_a_log_that_can_be_written_nowhere_ends_and_nothing_else(tmp_path):
     assert recorder.step() == 0
 
 
-def removed(folder):
+def remove(folder):
     shutil.rmtree(folder)
 
 
-def renamed(folder):
+def rename(folder):
     folder.rename(folder.with_name("renamed"))
 
 
-def replaced(folder):
+def replace_fields(folder):
     shutil.rmtree(folder)
     folder.write_text("a file of the same name")
 
 
-@pytest.mark.parametrize("change", [removed, renamed, replaced])
+@pytest.mark.parametrize("change", [remove, rename, replace_fields])
 def test_a_log_whose_folder_is_gone_goes_on_elsewhere_with_all_that_was_written(tmp_path, change):
     bus, folder, spare = InProcessBus(TOPICS | {"ready.recorder": 4096}), tmp_path / "out", tmp_path / "spare"
     path = folder / "flight.csv"
@@ -314,12 +314,12 @@ def test_a_log_whose_folder_is_gone_goes_on_elsewhere_with_all_that_was_written(
     change(folder)
     bus.publish("flight", rows(5, 20))
     assert recorder.step() == 15
-    found = log_path(path, (spare,))
-    assert found == (spare / "flight.csv" if change is replaced else path)
+    result = log_path(path, (spare,))
+    assert result == (spare / "flight.csv" if change is replace_fields else path)
     assert last_note(bus, "ready.recorder", "ready")["moved"].startswith(f"{path}: ")
     bus.publish("flight", rows(10, 30))  # of a recorder that was started again
     assert Recorder(path, bus, (spare,)).step() == 15
-    np.testing.assert_array_equal(read_log(found)[:, 0], np.arange(40))
+    np.testing.assert_array_equal(read_log(result)[:, 0], np.arange(40))
 
 
 def test_a_log_on_a_full_disk_goes_on_in_the_first_temporary_folder_with_room(tmp_path, monkeypatch):
@@ -341,15 +341,15 @@ def test_a_log_on_a_full_disk_goes_on_in_the_first_temporary_folder_with_room(tm
     assert recorder.step() == 15
     np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(10))  # no half lines
     np.testing.assert_array_equal(read_log(log_path(path, spare))[:, 0], np.arange(25))
-    assert recorder.moved == f"{path}: No space left on device; the log goes on in {tmp_path}/spare/flight.csv"
+    assert recorder.notice == f"{path}: No space left on device; the log goes on in {tmp_path}/spare/flight.csv"
 
 
 def test_a_lifeline_tells_at_once():
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     line = ParentWatch(process.pid)
-    assert not line.gone()
+    assert not line.has_ended()
     os.kill(process.pid, signal.SIGKILL)
-    assert line.gone(5.0)
+    assert line.has_ended(5.0)
     process.wait()
 
 
@@ -360,11 +360,11 @@ def test_cores_are_shared_out():
 
 
 def test_the_accounts_are_those_of_the_durations():
-    found = summary(np.array([1e-4] * 98 + [3e-3, 0.2]))
-    assert found["p50"] == pytest.approx(0.1)
-    assert found["max"] == pytest.approx(200.0)
-    assert sum(found["histogram"]) == 100
-    assert found["histogram"][-1] == 1
+    result = summary(np.array([1e-4] * 98 + [3e-3, 0.2]))
+    assert result["p50"] == pytest.approx(0.1)
+    assert result["max"] == pytest.approx(200.0)
+    assert sum(result["histogram"]) == 100
+    assert result["histogram"][-1] == 1
     assert summary(np.array([]))["p99"] is None
 
 
@@ -380,20 +380,20 @@ def write(place):
 """
 
 
-@pytest.mark.parametrize("appended", [False, True])
-def test_a_process_takes_no_module_from_the_current_folder_but_one_that_is_only_there(tmp_path, monkeypatch, appended):
+@pytest.mark.parametrize("appendix", [False, True])
+def test_a_process_takes_no_module_from_the_current_folder_but_one_that_is_only_there(tmp_path, monkeypatch, appendix):
     name = f"own_{os.getpid()}"
     (tmp_path / f"{name}.py").write_text(OWN)
     for shadow in ("calendar", "numpy", "json", "pickle", "retrim", "jax"):
         (tmp_path / f"{shadow}.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'w')")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path] if appended else sys.path)
-    launched = launch(f"{name}:write", str(tmp_path / "done"), tmp_path / "log")
-    assert (launched.wait(60) == 0) == appended
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path] if appendix else sys.path)
+    launch_code = launch(f"{name}:write", str(tmp_path / "done"), tmp_path / "log")
+    assert (launch_code.wait(60) == 0) == appendix
     assert not (tmp_path / "mark").exists()
-    if appended:
-        found = (tmp_path / "done").read_text().splitlines()
-        assert len(found) == 2
-        assert not any(str(tmp_path) in each for each in found)
+    if appendix:
+        result = (tmp_path / "done").read_text().splitlines()
+        assert len(result) == 2
+        assert not any(str(tmp_path) in each for each in result)
     else:
         assert f"No module named '{name}'" in (tmp_path / "log").read_text()

@@ -3,7 +3,7 @@
 import pytest
 
 from retrim.onboard.messages import unpack_note
-from retrim.onboard.stalls import KEPT, STALL, Stalls, lost_in
+from retrim.onboard.stalls import MEMORY, STALL, Stalls, count_lost_ticks
 
 EVERY = 0.002
 
@@ -15,25 +15,25 @@ def test_only_wake_ups_that_are_far_too_late_are_stalls():
         stalls.woke(now)
     assert stalls.count == 2
     assert stalls.longest == pytest.approx(0.045)
-    said = unpack_note(stalls.pack(), "stalls")
-    assert said["count"] == 2
-    assert [end - begin for begin, end in said["newest"]] == pytest.approx([0.047, 0.012])
+    text = unpack_note(stalls.pack(), "stalls")
+    assert text["count"] == 2
+    assert [end - begin for begin, end in text["newest"]] == pytest.approx([0.047, 0.012])
 
 
 def test_the_newest_stay_and_a_note_of_them_fits():
     stalls = Stalls(EVERY)
-    for k in range(3 * KEPT):
+    for k in range(3 * MEMORY):
         stalls.woke(1e6 + 0.0123456789 * k)
-    assert stalls.count == 3 * KEPT - 1
-    assert len(stalls.newest) == KEPT
-    assert stalls.newest[-1][1] == pytest.approx(1e6 + 0.0123456789 * (3 * KEPT - 1))
+    assert stalls.count == 3 * MEMORY - 1
+    assert len(stalls.newest) == MEMORY
+    assert stalls.newest[-1][1] == pytest.approx(1e6 + 0.0123456789 * (3 * MEMORY - 1))
     assert len(stalls.pack()) < 16384
 
 
 def test_a_gap_counts_once_whatever_stalls_it_overlaps():
     gaps = [(1.00, 1.04, 1), (2.00, 2.10, 4)]
-    assert lost_in([], gaps, 0.02) == 0
-    assert lost_in([(1.01, 1.02), (1.02, 1.05)], gaps, 0.02) == 1
-    assert lost_in([(0.5, 3.0)], gaps, 0.02) == 5
-    assert lost_in([(1.04, 1.97)], gaps, 0.02) == 0
-    assert lost_in([(1.04, 1.99)], gaps, 0.02) == 4  # the plant catches up
+    assert count_lost_ticks([], gaps, 0.02) == 0
+    assert count_lost_ticks([(1.01, 1.02), (1.02, 1.05)], gaps, 0.02) == 1
+    assert count_lost_ticks([(0.5, 3.0)], gaps, 0.02) == 5
+    assert count_lost_ticks([(1.04, 1.97)], gaps, 0.02) == 0
+    assert count_lost_ticks([(1.04, 1.99)], gaps, 0.02) == 4  # the plant catches up

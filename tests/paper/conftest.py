@@ -2,8 +2,8 @@
 
 import pytest
 
+from fake_flights import Imaginary
 from helpers import brief_preset
-from made_up import Imaginary
 from retrim.config import named_presets
 
 
@@ -17,31 +17,31 @@ def presets(monkeypatch):
 def imagine(monkeypatch, presets):
     """Let a table's module train and fly nothing."""
 
-    def made(table, error):
-        found = Imaginary(error)
-        for name, stands_in in (("train_all", found.train), ("fly_all", found.fly)):
+    def make(table, error):
+        result = Imaginary(error)
+        for name, stands_in in (("train_all", result.train), ("fly_all", result.fly)):
             monkeypatch.setattr(table, name, stands_in)
-        return found
+        return result
 
-    return made
+    return make
 
 
 @pytest.fixture
-def drawn(monkeypatch, tmp_path):
+def pictures(monkeypatch, tmp_path):
     """Pictures that are not drawn: what was asked for, by the name of the function."""
-    asked = {}
+    calls = {}
 
     def watch(table, *names):
         for name in names:
 
             def draw(*words, name=name, **more):
-                asked.setdefault(name, []).append((words, more))
+                calls.setdefault(name, []).append((words, more))
                 files = (tmp_path / "picture.png", tmp_path / "picture.svg")
                 for path in files:
                     path.touch()
                 return files
 
             monkeypatch.setattr(table, name, draw)
-        return asked
+        return calls
 
     return watch

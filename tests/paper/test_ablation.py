@@ -12,10 +12,10 @@ from retrim_paper.ablation_options import CONTROL, OFF, ON
 def test_every_lever_is_one_change_of_its_preset(task, kind):
     preset = presets.PRESETS[f"{task}/{kind}"]
     each = OFF[task] if kind == "retrim" else ON[task]
-    made = [(changed(preset, **lever.changes), lever.method) for lever in (*CONTROL, *each)]
-    for one, method in made:
+    setup = [(changed(preset, **lever.changes), lever.method) for lever in (*CONTROL, *each)]
+    for one, method in setup:
         find_method(method)
         Setup.from_preset(one)
-    assert made.count((preset, "full")) == 1
-    assert len({(str(one), method) for one, method in made}) == len(made)
-    assert len({lever.label for lever in (*CONTROL, *each)}) == len(made)
+    assert setup.count((preset, "full")) == 1
+    assert len({(str(one), method) for one, method in setup}) == len(setup)
+    assert len({lever.label for lever in (*CONTROL, *each)}) == len(setup)

@@ -96,8 +96,10 @@ def test_the_gradient_is_that_of_the_model_or_of_the_point_mass(key):
         model = design.design_dynamics(setup, lambda x, u: jnp.zeros(3), choice)
         return jax.jit(jax.jacobian(lambda v: model.state(model.step(model.init(x), v, jnp.zeros(3))).v))(u)
 
-    simple, own, borrowed = (jacobian(design.Choice(*c, False)) for c in ((False, True), (True, True), (True, False)))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), borrowed, simple)
+    simple, own, own_gradient = (
+        jacobian(design.Choice(*c, False)) for c in ((False, True), (True, True), (True, False))
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), own_gradient, simple)
     assert float(jnp.abs(own.c - simple.c).max()) > 0.1 * float(jnp.abs(simple.c).max())  # motors take their time
 
 
@@ -118,31 +120,31 @@ def test_the_design_study_s_rows_are_of_all_seeds_and_flights():
         (one, "2000.0 (1000.0 to 3000.0)", "1.00", "4.0", "0.250", "0.200 ± 0.082"),
         (other, "8000.0 (8000.0 to 8000.0)", "4.00", "1.0", "0.500", "0.500 ± 0.000, 1 crashed"),
     )
-    (lost,) = design_table._section([row(one, 0, [1.0], [np.nan])]).rows
-    assert lost[-1] == "all crashed"
+    (gap,) = design_table._section([row(one, 0, [1.0], [np.nan])]).rows
+    assert gap[-1] == "all crashed"
     assert section.about == f"{design_table.PAPER[:1].upper()}{design_table.PAPER[1:]}."
 
 
 def test_a_policy_is_retrained_from_where_it_was():
     setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(random.key(0))
-    logs = design.flown(setup, policy, 2, 1.0, 0)
-    made = design.retrained(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],
+    logs = design.fly_batch_of_policy(setup, policy, 2, 1.0, 0)
+    result = design.retrain(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],
                             fit_epochs=20, epochs=10, envs=4)  # fmt: skip
-    assert made.residual_rms < 3.0
-    assert any(np.any(a.weight != b.weight) for a, b in zip(made.policy.layers, policy.layers, strict=True))
+    assert result.residual_rms < 3.0
+    assert any(np.any(a.weight != b.weight) for a, b in zip(result.policy.layers, policy.layers, strict=True))
 
 
 def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     """A table that is done is not made again; one that was interrupted is; with --quick all are."""
-    made, dying = [], [True]
+    setup, dying = [], [True]
 
     def one(run, reporter, *, size=0):
-        assert run.trained == tmp_path  # networks of DATT serve all tables
-        made.append(("one", size))
+        assert run.policy_folder == tmp_path  # networks of DATT serve all tables
+        setup.append(("one", size))
 
     def two(run, reporter, *, size=0):
-        made.append(("two", size))
+        setup.append(("two", size))
         if dying.pop():
             raise RuntimeError("killed")
         dying.append(False)
@@ -158,17 +160,17 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="killed"):
         table(False)
     table(False)
-    assert made == [("one", 9), ("two", 9), ("two", 9)]
+    assert setup == [("one", 9), ("two", 9), ("two", 9)]
     assert "[two](two/two.md)" in (tmp_path / "everything.md").read_text()
     table(True)
-    assert made[3:] == [("one", 1), ("two", 1)]
+    assert setup[3:] == [("one", 1), ("two", 1)]
     table(False)  # what a quick look made is no page of the whole
-    assert made[5:] == []
+    assert setup[5:] == []
     assert "quick look" not in (tmp_path / "everything.md").read_text()  # it has an overview of its own
     assert "quick look" in (tmp_path / "everything_quick.md").read_text()
     (tmp_path / "one" / "one.md").unlink()
     table(False)
-    assert made[5:] == [("one", 9)]
+    assert setup[5:] == [("one", 9)]
 
 
 def test_what_an_interrupted_table_took_is_counted_and_what_a_killed_one_took_is_not_known(tmp_path, monkeypatch):
@@ -185,17 +187,17 @@ def test_what_an_interrupted_table_took_is_counted_and_what_a_killed_one_took_is
 
     monkeypatch.setattr(everything, "PLAN", ((one, "Table", {}),))
 
-    def told():
+    def capture():
         with contextlib.suppress(RuntimeError):
             everything.everything(Run("test", tmp_path), Silent())
         return (tmp_path / "everything.md").read_text().count("| 3.0 |"), results(tmp_path, "everything.json")["rows"]
 
-    told(), told()
-    assert told() == (2, [{"table": "one", "what": "Table", "page": "one/one.md", "s": 180.0, "at_least": False}])
-    assert told()[0] == 2  # it is made
+    capture(), capture()
+    assert capture() == (2, [{"table": "one", "what": "Table", "page": "one/one.md", "s": 180.0, "at_least": False}])
+    assert capture()[0] == 2  # it is made
     (tmp_path / "one" / "one.md").unlink()
-    told(), told()
-    (row,) = told()[1]
+    capture(), capture()
+    (row,) = capture()[1]
     assert (row["s"], row["at_least"]) == (120.0, True)
     assert "| at least 2.0 |" in (tmp_path / "everything.md").read_text()
 
@@ -216,7 +218,7 @@ def test_a_page_that_other_code_made_since_is_made_again(tmp_path, monkeypatch):
 
 def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeypatch):
     sections = []
-    monkeypatch.setattr(phase_table, "fly_levels", lambda document, found, **_: sections.extend(found))
+    monkeypatch.setattr(phase_table, "fly_levels", lambda document, result, **_: sections.extend(result))
     phase_table.phase(Run("test", tmp_path), Silent(), references=("circle",))
     presets = [section.preset for section in sections]
     assert {section.scenario.reference for section in sections} == {presets[0].track.reference} == {"circle"}
@@ -246,9 +248,9 @@ def test_every_table_of_the_plan_has_the_options_that_are_planned():
 
 def test_a_command_that_goes_on_has_a_folder_to_go_on_in():
     """And a quick look another one, or it would write over the pages of the whole."""
-    made = {make.__name__: make for make in (*tables.MADE, tables.everything)}
-    assert set(quick.GO_ON) <= set(made)
-    folders = {str(quick.folder_of(made[name], quick=look)) for name in quick.GO_ON for look in (False, True)}
+    setup = {make.__name__: make for make in (*tables.TABLES, tables.everything)}
+    assert set(quick.GO_ON) <= set(setup)
+    folders = {str(quick.folder_of(setup[name], quick=look)) for name in quick.GO_ON for look in (False, True)}
     assert len(folders) == 2 * len(quick.GO_ON) - 1  # that of all tables has one for quick looks
     assert str(quick.folder_of(tables.everything)) == "runs/reproduce-all"
     assert quick.folder_of(tables.design) is None
@@ -256,13 +258,13 @@ def test_a_command_that_goes_on_has_a_folder_to_go_on_in():
 
 
 def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
-    made = {make.__name__: make for make in tables.MADE}
+    setup = {make.__name__: make for make in tables.TABLES}
     of_paper = {"hover", "track", "vision", "reversing", "design", "efficiency", "transfer"}
-    assert of_paper <= set(quick.QUICK) <= set(made)
+    assert of_paper <= set(quick.QUICK) <= set(setup)
     for name, smaller in quick.QUICK.items():
-        options = {each.name: each.default for each in quick.options_of(made[name])}
+        options = {each.name: each.default for each in quick.options_of(setup[name])}
         assert options["quick"] is False
-        assert all(each.annotation is not inspect.Parameter.empty for each in quick.options_of(made[name]))
+        assert all(each.annotation is not inspect.Parameter.empty for each in quick.options_of(setup[name]))
         assert set(smaller) <= set(options), name
         assert any(options[option] != value for option, value in smaller.items()), name
 
@@ -270,18 +272,18 @@ def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
 @pytest.mark.usefixtures("one_condition")
 def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):
     """And says in its document that it is one."""
-    chosen = {"seconds": 30.0, "starts": 8, "seeds": (4,), "quick": True}
-    options, remark = quick.looked(tables.hover, chosen)
+    choice = {"seconds": 30.0, "starts": 8, "seeds": (4,), "quick": True}
+    options, remark = quick.looked(tables.hover, choice)
     assert (options["seconds"], options["starts"], options["seeds"]) == (12.0, 2, (4,))
     assert "not to quote" in remark
-    assert quick.looked(tables.hover, {**chosen, "quick": False}) == (
-        {k: chosen[k] for k in options if k in chosen},
+    assert quick.looked(tables.hover, {**choice, "quick": False}) == (
+        {k: choice[k] for k in options if k in choice},
         "",
     )
-    asked = inspect.signature(tables.hover).parameters
-    named = {**{name: asked[name].default for name in asked if name not in ("run", "reporter")}, "quick": True}
-    assert quick.looked(tables.hover, named)[0]["starts"] == 2
-    assert quick.looked(tables.hover, named, ["--starts", "8"])[0]["starts"] == asked["starts"].default
+    calls = inspect.signature(tables.hover).parameters
+    names = {**{name: calls[name].default for name in calls if name not in ("run", "reporter")}, "quick": True}
+    assert quick.looked(tables.hover, names)[0]["starts"] == 2
+    assert quick.looked(tables.hover, names, ["--starts", "8"])[0]["starts"] == calls["starts"].default
     words = "--methods", "indi", "--candidates", "3", "--seconds", "4", "--plant", "simple", "--quick"
     retrim("reproduce", "tuning", *words, "--out", "t", cwd=tmp_path)
     assert remark in (tmp_path / "t" / "tuning.md").read_text()
@@ -312,33 +314,33 @@ def test_vision_flies_what_a_preset_can(tmp_path):
     assert set(BASELINES) <= flyable["vision/occluded"]
     assert "base-do" not in flyable["vision/occluded"]
     assert flyable["vision/paper"] == flyable["vision/ideal"] == {"base", "full", "lora"}
-    said = retrim("reproduce", "vision", "--methods", "base", "datt", cwd=tmp_path, code=1)
-    assert "--methods datt: it is trained by a measured state" in said
-    said = retrim("reproduce", "vision", "--presets", "vision/paper", "--methods", "indi", cwd=tmp_path, code=1)
-    assert "method 'indi' needs the state, and preset 'vision/paper' shows keypoints" in said
+    text = retrim("reproduce", "vision", "--methods", "base", "datt", cwd=tmp_path, code=1)
+    assert "--methods datt: it is trained by a measured state" in text
+    text = retrim("reproduce", "vision", "--presets", "vision/paper", "--methods", "indi", cwd=tmp_path, code=1)
+    assert "method 'indi' needs the state, and preset 'vision/paper' shows keypoints" in text
 
 
 def test_re_training_goes_on_from_chunk_to_chunk_and_forgets_the_first(monkeypatch):
     """Which compiles: what it came to is not kept, and its time is told apart."""
     setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(random.key(0))
-    logs = design.flown(setup, policy, 2, 1.0, 0)
-    asked = []
+    logs = design.fly_batch_of_policy(setup, policy, 2, 1.0, 0)
+    calls = []
 
     def chunk(state, env, key, optimiser, updates, envs):
-        asked.append((state, env, random.key_data(key).tolist(), updates, envs))
-        moved = jax.tree.map(lambda leaf: leaf + 1.0, state.policy.params)
-        return design.PolicyState(state.policy.with_params(moved), state.optimiser), jnp.zeros(updates)
+        calls.append((state, env, random.key_data(key).tolist(), updates, envs))
+        shift = jax.tree.map(lambda leaf: leaf + 1.0, state.policy.params)
+        return design.PolicyState(state.policy.with_params(shift), state.optimiser), jnp.zeros(updates)
 
     monkeypatch.setattr(design, "train_chunk", chunk)
-    made = design.retrained(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],
+    result = design.retrain(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],
                             fit_epochs=5, epochs=30, envs=6)  # fmt: skip
-    assert [(updates, envs) for *_, updates, envs in asked] == [(design.CHUNK, 6)] * 4
-    assert len({tuple(key) for _, _, key, *_ in asked}) == 4
-    begins = [float(state.policy.layers[0].weight[0, 0] - policy.layers[0].weight[0, 0]) for state, *_ in asked]
+    assert [(updates, envs) for *_, updates, envs in calls] == [(design.CHUNK, 6)] * 4
+    assert len({tuple(key) for _, _, key, *_ in calls}) == 4
+    begins = [float(state.policy.layers[0].weight[0, 0] - policy.layers[0].weight[0, 0]) for state, *_ in calls]
     np.testing.assert_allclose(begins, [0.0, 0.0, 1.0, 2.0], atol=1e-6)
-    assert float(made.policy.layers[0].weight[0, 0] - policy.layers[0].weight[0, 0]) == pytest.approx(3.0, abs=1e-6)
-    assert len(made.epoch_s) == 3
-    assert all(0.0 < seconds < 1.0 for seconds in made.epoch_s)
-    env = asked[0][1]
+    assert float(result.policy.layers[0].weight[0, 0] - policy.layers[0].weight[0, 0]) == pytest.approx(3.0, abs=1e-6)
+    assert len(result.epoch_s) == 3
+    assert all(0.0 < seconds < 1.0 for seconds in result.epoch_s)
+    env = calls[0][1]
     assert (env.task, float(env.delay)) == (setup.env.task, float(setup.env.delay))

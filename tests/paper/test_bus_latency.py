@@ -27,10 +27,10 @@ class Sent(Bus):
     closed = False
 
     def __init__(self):
-        self.sent = []
+        self.messages = []
 
     def publish(self, topic, data):
-        self.sent.append((topic, data, time.monotonic_ns()))
+        self.messages.append((topic, data, time.monotonic_ns()))
 
     def latest(self, topic, after=0):
         return None
@@ -49,37 +49,37 @@ def test_messages_carry_their_number_and_when_they_were_sent(quick):
     bus = Sent()
     began = time.monotonic_ns()
     latency.write(bus, 100)
-    assert [topic for topic, *_ in bus.sent] == ["message"] * 5  # those that do not count, too
-    assert {len(data) for _, data, _ in bus.sent} == {100}
-    assert [int.from_bytes(data[:8], "little") for _, data, _ in bus.sent] == [0, 1, 2, 3, 4]
-    stamps = [int.from_bytes(data[8:16], "little") for _, data, _ in bus.sent]
+    assert [topic for topic, *_ in bus.messages] == ["message"] * 5  # those that do not count, too
+    assert {len(data) for _, data, _ in bus.messages} == {100}
+    assert [int.from_bytes(data[:8], "little") for _, data, _ in bus.messages] == [0, 1, 2, 3, 4]
+    stamps = [int.from_bytes(data[8:16], "little") for _, data, _ in bus.messages]
     assert stamps[0] - began > 0.05e9  # both ends find each other first
-    for stamp, (*_, sent) in zip(stamps, bus.sent, strict=True):
-        assert 0 <= sent - stamp < 0.5e9
+    for stamp, (*_, sending) in zip(stamps, bus.messages, strict=True):
+        assert 0 <= sending - stamp < 0.5e9
     assert all(b - a > 0.009e9 for a, b in itertools.pairwise(stamps))
 
 
 @pytest.mark.parametrize("where", ["folder/of/a/bus", "zenoh:127.0.0.1:7447"])
 def test_the_other_process_joins_the_bus_that_it_is_told_and_leaves_it(where, monkeypatch):
-    bus, asked = Sent(), []
+    bus, calls = Sent(), []
 
     class Address:
         @staticmethod
         def of(text):
-            asked.append(text)
+            calls.append(text)
             return Address()
 
         def join(self, topics, *, listen):
-            asked.append((topics, listen))
+            calls.append((topics, listen))
             return bus
 
     def folder(path):
-        asked.append(str(path))
+        calls.append(str(path))
         return bus
 
     def write(one, size):
         assert one is bus
-        asked.append(size)
+        calls.append(size)
         raise RuntimeError("cut")
 
     monkeypatch.setattr(latency, "Address", Address)
@@ -89,7 +89,7 @@ def test_the_other_process_joins_the_bus_that_it_is_told_and_leaves_it(where, mo
     with pytest.raises(RuntimeError, match="cut"):
         latency.main()
     assert bus.closed
-    assert asked == ([where, 500] if "/" in where else [where, (latency.TOPICS, False), 500])
+    assert calls == ([where, 500] if "/" in where else [where, (latency.TOPICS, False), 500])
 
 
 def test_a_rosmaster_answers_before_it_is_used_and_is_gone_afterwards(tmp_path, monkeypatch):
@@ -107,30 +107,30 @@ def test_a_rosmaster_answers_before_it_is_used_and_is_gone_afterwards(tmp_path, 
         assert nobody is None
 
 
-@pytest.mark.parametrize("allowed", [True, False])
-def test_two_machines_are_namespaces_with_a_cable_that_are_taken_away(allowed, monkeypatch):
-    ran = []
+@pytest.mark.parametrize("allowance", [True, False])
+def test_two_machines_are_namespaces_with_a_cable_that_are_taken_away(allowance, monkeypatch):
+    process = []
 
     def run(words, **_):
-        ran.append(" ".join(words))
-        return subprocess.CompletedProcess(words, 0 if allowed else 1)
+        process.append(" ".join(words))
+        return subprocess.CompletedProcess(words, 0 if allowance else 1)
 
     monkeypatch.setattr(latency.shutil, "which", lambda name: f"/sbin/{name}")
     monkeypatch.setattr(latency.subprocess, "run", run)
     name = f"retrim{os.getpid()}"
     with latency.two_machines() as machines:
-        if not allowed:
+        if not allowance:
             assert machines is None
-            assert len(ran) == 1  # the rest is not tried
+            assert len(process) == 1  # the rest is not tried
         else:
             host, inside = machines
             assert " ".join(inside) == f"ip netns exec {name}"
-            assert any(words.startswith(f"ip addr add {host}/24 dev ") for words in ran)
-            there = [words for words in ran if words.startswith(f"ip netns exec {name} ip link set")]
+            assert any(words.startswith(f"ip addr add {host}/24 dev ") for words in process)
+            there = [words for words in process if words.startswith(f"ip netns exec {name} ip link set")]
             assert len(there) == 2  # the cable's end, and its own loopback
-    assert ran[-1] == f"ip netns del {name}"
+    assert process[-1] == f"ip netns del {name}"
     monkeypatch.setattr(latency.shutil, "which", lambda name: None)
-    ran.clear()
+    process.clear()
     with latency.two_machines() as machines:
         assert machines is None
-    assert ran == []
+    assert process == []

@@ -9,7 +9,7 @@ from retrim.config import PRESETS, changed
 from retrim.config.faults import FAULTS, NO_FAULT
 from retrim.config.scenario import THRUST_ERROR, Scenario
 from retrim.physics.vehicle import kingfisher, small
-from retrim_paper.conditions import FLOWN, PUSH, conditions, fault_conditions
+from retrim_paper.conditions import PUSH, WEATHERS, conditions, fault_conditions
 
 AGREE = ("disturbance", "plant", "sensors", "reference", "thrust_error", "delay")
 
@@ -26,8 +26,8 @@ def ratios(spec, like):
 
 
 def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
-    found = conditions(PRESETS["hover/retrim"])
-    for name, scenario in found.items():
+    result = conditions(PRESETS["hover/retrim"])
+    for name, scenario in result.items():
         what, _, where = name.partition("/")
         if what.startswith("thrust"):
             what, where = "step", what
@@ -44,23 +44,23 @@ def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
             assert scenario.vehicle == where.removesuffix("-quadrotor")
         else:
             assert (scenario.vehicle is not None) == where.startswith(("random", "slow"))
-    slow = ratios(found["step/slow-motors"].vehicle, small())
+    slow = ratios(result["step/slow-motors"].vehicle, small())
     assert {name: np.unique(np.round(ratio, 6)).tolist() for name, ratio in slow.items()} == {
         name: [2.0 if name == "motor_tau" else 1.0] for name in slow
     }
 
 
 def test_a_fault_condition_has_one_fault_beside_a_push():
-    found = fault_conditions(PRESETS["hover/retrim"])
-    assert set(FAULTS) - {NO_FAULT} <= set(found)
-    for name, scenario in found.items():
+    result = fault_conditions(PRESETS["hover/retrim"])
+    assert set(FAULTS) - {NO_FAULT} <= set(result)
+    for name, scenario in result.items():
         differs = {field for field in (*AGREE, "fault") if getattr(scenario, field) != getattr(Scenario(PUSH), field)}
         assert len(differs) == 1, name
         if "fault" in differs:
             assert scenario.fault == name
-    heavier = found["mass+50"].disturbance.removeprefix(f"{PUSH}+payload=")
+    heavier = result["mass+50"].disturbance.removeprefix(f"{PUSH}+payload=")
     assert float(heavier) == pytest.approx(0.5 * float(small().mass), rel=1e-3)
-    assert (found["delay-60ms"].delay, found["thrust-50"].thrust_error) == (0.06, -0.5)
+    assert (result["delay-60ms"].delay, result["thrust-50"].thrust_error) == (0.06, -0.5)
 
 
 @pytest.mark.parametrize("preset", ["hover/retrim", "track/retrim"])
@@ -76,18 +76,18 @@ def test_other_sensors_measure_every_condition_that_names_none_and_has_some(pres
 
 @pytest.mark.parametrize(("preset", "own"), [("track/retrim", small), ("track/fast", kingfisher)])
 def test_every_reference_is_flown_in_every_weather_and_the_first_on_other_vehicles(preset, own):
-    trained = PRESETS[preset]
-    references = trained.track.reference.split("+")
-    found = conditions(trained)
-    assert {scenario.reference for scenario in found.values()} == set(references)
-    for name, scenario in found.items():
+    trained_policy = PRESETS[preset]
+    references = trained_policy.track.reference.split("+")
+    result = conditions(trained_policy)
+    assert {scenario.reference for scenario in result.values()} == set(references)
+    for name, scenario in result.items():
         reference, _, what = name.rpartition("/")
         assert scenario.reference == reference
-        if what in FLOWN:
-            assert (scenario.disturbance, scenario.sensors, scenario.vehicle) == (*FLOWN[what], None)
+        if what in WEATHERS:
+            assert (scenario.disturbance, scenario.sensors, scenario.vehicle) == (*WEATHERS[what], None)
         else:
             assert reference == references[0]
-    of_first = {name.removeprefix(f"{references[0]}/"): scenario for name, scenario in found.items()}
+    of_first = {name.removeprefix(f"{references[0]}/"): scenario for name, scenario in result.items()}
     assert of_first["thrust+20"].thrust_error == 0.2
     assert of_first["thrust-20"].thrust_error == -0.2
     assert of_first["delay-40ms"].delay == 0.04
@@ -106,9 +106,9 @@ def test_a_vehicle_of_one_s_own_has_conditions_like_itself():
 
 def test_random_vehicles_are_plausible_and_differ():
     """0.7 to 1.6 times the mass; inertia as the mass, thrust and motors within a third or a factor of two of it."""
-    found = [conditions(PRESETS["hover/retrim"])[f"step/random-{n}"].vehicle for n in range(3)]
-    told = [ratios(spec, small()) for spec in found]
-    for of in told:
+    result = [conditions(PRESETS["hover/retrim"])[f"step/random-{n}"].vehicle for n in range(3)]
+    message = [ratios(spec, small()) for spec in result]
+    for of in message:
         assert 0.7 <= of["mass"] <= 1.6
         np.testing.assert_allclose(of["inertia"], of["inertia"][0])
         assert 0.8 <= of["inertia"][0] / of["mass"] <= 1.25
@@ -116,6 +116,6 @@ def test_random_vehicles_are_plausible_and_differ():
         assert 0.7 <= of["motor_tau"] <= 2.0
         np.testing.assert_allclose(of["arm"], 1.0)
         np.testing.assert_allclose(of["drag_area"], 1.0)
-    assert [spec.name for spec in found] == ["random-0", "random-1", "random-2"]
-    assert len({round(float(of["mass"]), 6) for of in told}) == 3
-    assert all(spec.rates_max == tuple(np.asarray(small().omega_max).tolist()) for spec in found)
+    assert [spec.name for spec in result] == ["random-0", "random-1", "random-2"]
+    assert len({round(float(of["mass"]), 6) for of in message}) == 3
+    assert all(spec.rates_max == tuple(np.asarray(small().omega_max).tolist()) for spec in result)

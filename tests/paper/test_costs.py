@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from commands import results
+from fake_flights import Imaginary, Watching, flight
 from helpers import brief_preset
-from made_up import Imaginary, Watching, flight
 from retrim import ConfigError, Scenario
 from retrim.config import named_presets
 from retrim.evaluation.study import Study
 from retrim.runkit import Run
 from retrim.runkit.reporter import Silent
 from retrim.runkit.stopwatch import Stopwatch
-from retrim_paper.design import Trained
+from retrim_paper.design import Retraining
 
 # The package has functions of these names.
 NAMES = ("design", "efficiency", "scaling", "tuning")
@@ -23,46 +23,46 @@ design, efficiency, scaling, tuning = (importlib.import_module(f"retrim_paper.ta
 SEEDS = (0, 3)
 
 
-def test_scaling_flies_as_many_as_were_asked_for_and_forgets_them(tmp_path, presets, drawn, monkeypatch):
+def test_scaling_flies_as_many_as_were_asked_for_and_forgets_them(tmp_path, presets, pictures, monkeypatch):
     """Half of them adapt; errors count as they land, crashes apart."""
-    done, made = Imaginary(lambda spec: None if spec.start == 0 and spec.method == "full" else 0.25), []
+    done, setup = Imaginary(lambda spec: None if spec.start == 0 and spec.method == "full" else 0.25), []
 
     class Fleet:
         def __init__(self, preset, policies, scenarios, **how):
-            made.append((policies, tuple(scenarios), how))
+            setup.append((policies, tuple(scenarios), how))
             self._study, self._scenarios, self._how = Study(preset, policies, ()), scenarios, how
 
         def run(self, *, stop, progress, on_result, forget):
             assert forget
-            flown = done.fly(self._study, self._scenarios, None, None, **self._how).flown
-            for k in range(0, len(flown), 2):
-                on_result(flown[k : k + 2])
-                progress(k + 2.0, len(flown))
+            flight = done.fly(self._study, self._scenarios, None, None, **self._how).flights
+            for k in range(0, len(flight), 2):
+                on_result(flight[k : k + 2])
+                progress(k + 2.0, len(flight))
 
     monkeypatch.setattr(scaling, "Fleet", Fleet)
     monkeypatch.setattr(scaling, "train_all", done.train)
-    said = drawn(scaling, "panel_figure", "save")
+    message = pictures(scaling, "panel_figure", "save")
     scaling.scaling(Run("test", tmp_path), Silent(), flights=(4, 12), seconds=8.0)
-    assert [seeds for _, seeds in done.trained] == [(0,)]
-    assert made == [
+    assert [seeds for _, seeds in done.trainings] == [(0,)]
+    assert setup == [
         ({0: "policy 0"}, tuple(map(Scenario, scaling.CONDITIONS)),
          {"methods": scaling.METHODS, "starts": starts, "seconds": 8.0})
         for starts in (1, 3)
     ]  # fmt: skip
-    found = results(tmp_path, "scaling.json")["rows"]
-    assert [(row["flights"], row["seconds"], row["crashes"], row["mean"]) for row in found] == [
+    result = results(tmp_path, "scaling.json")["rows"]
+    assert [(row["flights"], row["seconds"], row["crashes"], row["mean"]) for row in result] == [
         (4, 8.0, 2, 0.25), (12, 8.0, 2, 0.25)
     ]  # fmt: skip
-    assert all(row["compile_s"] >= 0.0 and 0.0 < row["run_s"] < 30.0 for row in found)
-    assert all(row["flight_bytes"] > 1000 for row in found)
+    assert all(row["compile_s"] >= 0.0 and 0.0 < row["run_s"] < 30.0 for row in result)
+    assert all(row["flight_bytes"] > 1000 for row in result)
     text = (tmp_path / "scaling.md").read_text()
     assert "4 of 16 flights crashed." in text
-    (((_, (time, memory)), _),) = said["panel_figure"]
-    measured, linear = time.curves
-    np.testing.assert_array_equal(measured.x, [4, 12])
-    assert linear.y[0] == pytest.approx(measured.y[1] / 3.0)
-    assert linear.y[1] == pytest.approx(measured.y[1])
-    np.testing.assert_allclose(memory.curves[0].y, [row["peak_mb"] for row in found])
+    (((_, (time, memory)), _),) = message["panel_figure"]
+    measurement, linear = time.curves
+    np.testing.assert_array_equal(measurement.x, [4, 12])
+    assert linear.y[0] == pytest.approx(measurement.y[1] / 3.0)
+    assert linear.y[1] == pytest.approx(measurement.y[1])
+    np.testing.assert_allclose(memory.curves[0].y, [row["peak_mb"] for row in result])
 
 
 @pytest.mark.parametrize("flights", [(), (0,), (6,), (4, -4)])
@@ -85,8 +85,8 @@ def test_rows_of_scaling_are_rates():
     assert scaling._time(3 * 86_400.0) == "3.0 days"
 
 
-def test_the_lines_of_scaling_are_flights_by_time(tmp_path, drawn):
-    drawn(scaling, "panel_figure", "save")
+def test_the_lines_of_scaling_are_flights_by_time(tmp_path, pictures):
+    pictures(scaling, "panel_figure", "save")
     rows = [
         {"flights": n, "seconds": 10.0, "compile_s": 3.4, "run_s": took, "peak_mb": 512.3, "crashes": n // 4}
         for n, took in ((4, 2.0), (40, 8.0))
@@ -98,10 +98,10 @@ def test_the_lines_of_scaling_are_flights_by_time(tmp_path, drawn):
 
 def test_a_search_for_settings_flies_every_candidate_under_every_condition(tmp_path, monkeypatch):
     """Its score is the root mean square after 3 s, the mean over conditions; a crash counts a metre."""
-    flown = []
+    trajectory = []
 
     def fly_together(plants, pilots, starts, *, ticks, stop):
-        flown.append((plants, pilots, starts, ticks))
+        trajectory.append((plants, pilots, starts, ticks))
         return range(len(plants))
 
     t = 0.02 * np.arange(301)
@@ -117,20 +117,20 @@ def test_a_search_for_settings_flies_every_candidate_under_every_condition(tmp_p
     tuning.tuning(
         Run("test", tmp_path), Silent(), methods=("indi", "mppi"), candidates=5, starts=2, seconds=6.0, seed=7
     )
-    assert [len(pilots) for _, pilots, *_ in flown] == [12] * 3 + [6] * 3  # a third of the candidates for MPPI
-    for plants, _, starts, ticks in flown:
+    assert [len(pilots) for _, pilots, *_ in trajectory] == [12] * 3 + [6] * 3  # a third of the candidates for MPPI
+    for plants, _, starts, ticks in trajectory:
         assert ticks == 300
         assert len(plants) == len(starts)
         np.testing.assert_array_equal(starts[0].p, starts[2].p)  # every candidate flies from the same starts
         assert np.any(starts[0].p != starts[1].p)
-    found = results(tmp_path, "tuning.json")["rows"]
-    np.testing.assert_allclose([row["score"] for row in found if row["method"] == "indi"], [0.3, 0.65] * 3)
-    np.testing.assert_allclose([row["score"] for row in found if row["method"] == "mppi"], [0.3, 0.65, 0.3])
+    result = results(tmp_path, "tuning.json")["rows"]
+    np.testing.assert_allclose([row["score"] for row in result if row["method"] == "indi"], [0.3, 0.65] * 3)
+    np.testing.assert_allclose([row["score"] for row in result if row["method"] == "mppi"], [0.3, 0.65, 0.3])
     for name in ("indi", "mppi"):
         ranges = tuning.BASELINES[name].ranges
-        tried = [row["settings"] for row in found if row["method"] == name][1:]
-        assert all(low <= one[key] <= high for one in tried for key, (low, high) in ranges.items())
-        assert len({tuple(one.values()) for one in tried}) == len(tried)
+        attempts = [row["settings"] for row in result if row["method"] == name][1:]
+        assert all(low <= one[key] <= high for one in attempts for key, (low, high) in ranges.items())
+        assert len({tuple(one.values()) for one in attempts}) == len(attempts)
     text = (tmp_path / "tuning.md").read_text()
     assert "## INDI" in text
     assert "from 2 starts (seed 7)" in text
@@ -145,16 +145,16 @@ def test_the_best_settings_stand_below_the_present_ones():
 
 
 def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets, monkeypatch):
-    done, logged, trained, watching = Imaginary(None), [], [], Watching()
+    done, log_records, trained_policy, watching = Imaginary(None), [], [], Watching()
     monkeypatch.setattr(design, "train_all", done.train)
 
     def fly(setup, policy, n, seconds, seed):
-        logged.append((policy, n, seconds, seed))
+        log_records.append((policy, n, seconds, seed))
         return [f"log {seed}.{k}" for k in range(n)]
 
     def retrained(setup, policy, logs, key, choice, *, epochs):
-        trained.append((policy, tuple(logs), choice, epochs, jax.random.key_data(key).tolist()))
-        return Trained(f"re-{policy}", 2.0, [0.5, 0.7], 0.25)
+        trained_policy.append((policy, tuple(logs), choice, epochs, jax.random.key_data(key).tolist()))
+        return Retraining(f"re-{policy}", 2.0, [0.5, 0.7], 0.25)
 
     monkeypatch.setattr(design, "fly_as_it_is", fly)
     monkeypatch.setattr(design, "retrained", retrained)
@@ -162,12 +162,12 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
     monkeypatch.setattr(design, "scored", lambda setup, spec, log: flight(0.1 * (1 + spec.seed), seconds=4.0))
     design.design(Run("test", tmp_path), watching, seeds=SEEDS, starts=5, epochs=30)
     n = len(design.CHOICES)
-    assert [seeds for _, seeds in done.trained] == [SEEDS]
+    assert [seeds for _, seeds in done.trainings] == [SEEDS]
     for k, seed in enumerate(SEEDS):
-        first, *others = logged[k * (n + 1) : (k + 1) * (n + 1)]
+        first, *others = log_records[k * (n + 1) : (k + 1) * (n + 1)]
         assert first == (f"policy {seed}", design.ROLLOUTS, design.ROLLOUT_S, 1000 + seed)
         assert others == [(f"re-policy {seed}", 5, design.SCORED_S, seed)] * n
-        mine = trained[k * n : (k + 1) * n]
+        mine = trained_policy[k * n : (k + 1) * n]
         assert [choice for _, _, choice, *_ in mine] == list(design.CHOICES.values())
         assert all(
             (policy, logs[0], len(logs), epochs) == (f"policy {seed}", f"log {1000 + seed}.0", design.ROLLOUTS, 30)
@@ -177,28 +177,28 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
     np.testing.assert_allclose(watching.shares, np.arange(2 * n) / (2 * n))
     with pytest.raises(ConfigError, match="--epochs 15 must be a positive multiple of 10"):
         design.design(Run("test", tmp_path), Silent(), epochs=15)
-    found = results(tmp_path, "design.json")["rows"]
-    assert [(row["model"], row["seed"], row["order"]) for row in found] == [
+    result = results(tmp_path, "design.json")["rows"]
+    assert [(row["model"], row["seed"], row["order"]) for row in result] == [
         (name, seed, k) for seed in SEEDS for k, name in enumerate(design.CHOICES)
     ]
-    for row in found:
+    for row in result:
         np.testing.assert_allclose(row["errors"], [0.1 * (1 + row["seed"])] * 5)
 
 
 def test_costs_are_laid_out_as_they_were_measured(tmp_path, presets, monkeypatch):
     """Training without its compiling; updates with theirs; a decision in milliseconds; DATT trained afresh."""
-    asked = []
+    calls = []
 
     def train(setup, seed, *, reporter, stop):
-        asked.append(("train", setup.preset, seed))
+        calls.append(("train", setup.preset, seed))
         return setup.new_policy(jax.random.key(0)), [1.0, 0.5, 0.2]
 
     def updates(setup, *, lora=False):
-        asked.append(("updates", lora))
+        calls.append(("updates", lora))
         return {"fit_s": 0.01, "update_s": 0.5, "compile_s": 7.0, "update_steps": 45_000, "window_s": 2.0 + lora}
 
     def datt(preset, seeds, run, reporter, *, steps):
-        asked.append(("datt", list(seeds), steps, run.folder != tmp_path))
+        calls.append(("datt", list(seeds), steps, run.folder != tmp_path))
         return {0: "net"}
 
     monkeypatch.setattr(efficiency, "train", train)
@@ -208,22 +208,22 @@ def test_costs_are_laid_out_as_they_were_measured(tmp_path, presets, monkeypatch
     monkeypatch.setattr(efficiency, "datt_of", lambda setup, net: net)
     efficiency.efficiency(Run("test", tmp_path), Silent(), presets=("hover/fast", "hover/paper"), datt_steps=16_384)
     small = brief_preset()
-    found = {row["method"]: row for row in results(tmp_path, "efficiency.json")["rows"]}
+    result = {row["method"]: row for row in results(tmp_path, "efficiency.json")["rows"]}
     names = [named_presets.PRESETS[name].name for name in ("hover/fast", "hover/paper")]
-    assert [each[0] for each in asked] == ["train", "updates", "updates"] * 2 + ["datt"]
-    assert [lora for what, *lora in asked if what == "updates"] == [[False], [True]] * 2
-    assert asked[-1] == ("datt", [0], 16_384, True)
+    assert [each[0] for each in calls] == ["train", "updates", "updates"] * 2 + ["datt"]
+    assert [lora for what, *lora in calls if what == "updates"] == [[False], [True]] * 2
+    assert calls[-1] == ("datt", [0], 16_384, True)
     for name in set(names):
-        row = found[name]
+        row = result[name]
         assert row["steps"] == 3 * small.pretrain.num_envs * small.pretrain.horizon
         assert row["training_compile_s"] >= 0.0
         assert 0.0 <= row["training_s"] < 60.0
         assert row["decision_s"] == 0.0125
-        assert "decision_s" not in found[f"{name}, LoRA"]
-    line = efficiency._line({**found[names[0]], "training_s": 12.34, "training_compile_s": 3.21})
+        assert "decision_s" not in result[f"{name}, LoRA"]
+    line = efficiency._line({**result[names[0]], "training_s": 12.34, "training_compile_s": 3.21})
     assert line == (names[0], "120", "12.3", "3.2", "45,000", "0.0100 + 0.500", "2", "12.50")
-    assert efficiency._line(found[f"{names[0]}, LoRA"]) == (
+    assert efficiency._line(result[f"{names[0]}, LoRA"]) == (
         f"{names[0]}, LoRA", "", "", "7.0", "45,000", "0.0100 + 0.500", "3", ""
     )  # fmt: skip
-    assert efficiency._line(found["indi"]) == ("indi", "", "", "", "", "", "", "12.50")
-    assert found["datt"]["steps"] == 16_384
+    assert efficiency._line(result["indi"]) == ("indi", "", "", "", "", "", "", "12.50")
+    assert result["datt"]["steps"] == 16_384

@@ -14,7 +14,7 @@ from retrim.physics import Command, CommandPath, State, small
 from retrim.testing import check_controller
 from retrim_paper.datt.controller import SIZE, DattController, DattNet, _along, datt_command, datt_observation
 from retrim_paper.datt.ppo import PpoSettings, PpoState, ppo
-from retrim_paper.datt.problem import KNOWN, DattProblem, reference_bank, ticks_of
+from retrim_paper.datt.problem import MAX_DISTURBANCE, DattProblem, reference_bank, ticks_of
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 DT, TAU = 0.02, 0.033
@@ -29,18 +29,18 @@ def test_a_banded_product_is_a_convolution(key):
     k_x, k_w, k_b = random.split(key, 3)
     points, kernel, bias = random.normal(k_x, (10, 3)), random.normal(k_w, (3, 3, 8)), random.normal(k_b, (8,))
     plain = jax.jit(lambda points, taps: lax.conv_general_dilated(points.T[None], taps, (1,), "VALID")[0].T)
-    found = jax.jit(_along)(points, kernel, bias)
-    wanted = np.asarray(plain(points, kernel.transpose(2, 1, 0))) + np.asarray(bias)
-    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    result = jax.jit(_along)(points, kernel, bias)
+    expected = np.asarray(plain(points, kernel.transpose(2, 1, 0))) + np.asarray(bias)
+    np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
 def test_what_it_sees_does_not_depend_on_the_place(key):
     k_x, k_u, k_a = random.split(key, 3)
     x, u, d = random_state(k_x), random_command(k_u), jnp.array([0.5, -0.2, 0.1])
     ahead, shift = random.normal(k_a, (10, 3)), jnp.array([3.0, -2.0, 7.0])
-    seen = jax.jit(datt_observation)
-    here = seen(x, u, d, ahead)
-    there = seen(State(x.p + shift, x.R, x.v), u, d, ahead + shift[None])
+    observation = jax.jit(datt_observation)
+    here = observation(x, u, d, ahead)
+    there = observation(State(x.p + shift, x.R, x.v), u, d, ahead + shift[None])
     assert here.shape == (SIZE,)
     np.testing.assert_allclose(here, there, atol=1e-12)
 
@@ -66,37 +66,37 @@ def test_references_are_as_long_as_an_episode_and_go_nowhere_at_once():
 
 def test_an_episode_is_a_flight_of_the_lagged_model(key):
     """What disturbs stays within what training knows; the reward falls with the distance; it is cut off in time."""
-    made = problem()
-    s = eqx.filter_jit(made.reset)(key)
-    step = eqx.filter_jit(made.step)
+    setup = problem()
+    s = eqx.filter_jit(setup.reset)(key)
+    step = eqx.filter_jit(setup.step)
     s_far = s._replace(x=State(s.x.p + 1.0, s.x.R, s.x.v))
     assert float(step(s_far, jnp.zeros(4), key)[1].reward) < float(step(s, jnp.zeros(4), key)[1].reward)
     s_end = s._replace(tick=jnp.array(ticks_of(0.02) - 1))
     after, outcome = step(s_end, jnp.zeros(4), key)
     assert bool(outcome.truncated)
     assert not bool(outcome.terminated)
-    assert np.abs(after.d).max() <= KNOWN
+    assert np.abs(after.d).max() <= MAX_DISTURBANCE
 
 
 def test_it_learns_and_is_a_controller(key):
     """Every part of the network moves; that PPO finds what it should is shown on a task with a known answer."""
-    made, fresh = problem(4), eqx.filter_jit(lambda key: DattNet.of(key=key))(key)
+    setup, fresh = problem(4), eqx.filter_jit(lambda key: DattNet.of(key=key))(key)
     settings = PpoSettings(envs=16, steps=8, minibatches=2, epochs=2)
-    ((after, told),) = ppo(made, PpoState.of(made, fresh, key, settings), settings, steps=16 * 8)
+    ((after, message),) = ppo(setup, PpoState.of(setup, fresh, key, settings), settings, steps=16 * 8)
     net = after.net
-    assert np.isfinite(list(told.values())).all()
+    assert np.isfinite(list(message.values())).all()
     for before, after in zip(jax.tree.leaves(fresh), jax.tree.leaves(net), strict=True):
         assert not eqx.is_array(before) or (not np.array_equal(before, after) and np.isfinite(after).all())
     estimator = L1Estimator(jnp.array(-0.2), jnp.array(0.95), DT)
-    flown = DattController(
+    flight = DattController(
         net,
         hover_task(),
         Prediction.of(CommandPath.of(DT, first_order(TAU)), DT),
         estimator,
-        jnp.array(KNOWN),
-        made.low,
-        made.high,
+        jnp.array(MAX_DISTURBANCE),
+        setup.low,
+        setup.high,
     )
-    check_controller(flown)
-    memory = flown.init(State.at(jnp.array(GOAL)))
+    check_controller(flight)
+    memory = flight.init(State.at(jnp.array(GOAL)))
     assert not np.any(memory.estimate.d_hat)

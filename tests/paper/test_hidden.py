@@ -73,11 +73,11 @@ def test_flights_of_vehicles_that_differ_in_numbers_are_one_program(population):
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     scenarios = [vehicle.scenario("early-step") for vehicle in population[:4]]
     fleet = Fleet(preset, policy, scenarios, methods=("base",), starts=1, seconds=1.0)
-    lots = fleet.lots(fleet.specs)
-    assert all(len(lot.specs) > 1 for lot in lots)
-    flown = fleet.run().flown
-    alone = Fleet(preset, policy, scenarios[2:3], methods=("base",), starts=1, seconds=1.0).run().flown
-    np.testing.assert_allclose(flown[2].log.p, alone[0].log.p, atol=1e-5)
+    batches = fleet.make_batches(fleet.specs)
+    assert all(len(batch.specs) > 1 for batch in batches)
+    flight = fleet.run().flights
+    alone = Fleet(preset, policy, scenarios[2:3], methods=("base",), starts=1, seconds=1.0).run().flights
+    np.testing.assert_allclose(flight[2].log.p, alone[0].log.p, atol=1e-5)
 
 
 def test_another_vehicle_with_other_numbers_stated_is_another_program(population):
@@ -94,9 +94,9 @@ def test_another_vehicle_with_other_numbers_stated_is_another_program(population
         ("track/retrim", ["Figure-8 of 10 s", "Figure-8 of 5.5 s"], ("rmse_m", "peak_m")),
     ],
 )
-def test_the_table_has_a_row_for_each_flight(tmp_path, imagine, drawn, monkeypatch, preset, courses, columns):
+def test_the_table_has_a_row_for_each_flight(tmp_path, imagine, pictures, monkeypatch, preset, courses, columns):
     hidden = importlib.import_module("retrim_paper.tables.hidden")
-    drawn(hidden, "vehicle_map")
+    pictures(hidden, "vehicle_map")
     monkeypatch.setattr(hidden.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
     imagine(hidden, lambda spec: None if spec.method == "indi" else 0.01)
     sizes = {"count": 3, "starts": 2, "seeds": (0, 1), "methods": ("base", "indi")}
@@ -126,8 +126,8 @@ def test_what_cannot_be_flown_is_refused_before_training(tmp_path):
 
 def test_the_published_page_has_every_kind_of_method():
     for task in ("hover", "track"):
-        found = entrants_of(task, "any", ())
-        assert found == ENTRANTS[task]
-        assert {entrant.method for entrant in found} >= {"base", "base-do", "geometric-i", "indi", "base-id"}
-        assert all(entrant.preset in presets.PRESETS for entrant in found)
-        assert any(entrant.told for entrant in found)
+        result = entrants_of(task, "any", ())
+        assert result == ENTRANTS[task]
+        assert {entrant.method for entrant in result} >= {"base", "base-do", "geometric-i", "indi", "base-id"}
+        assert all(entrant.preset in presets.PRESETS for entrant in result)
+        assert any(entrant.knows_vehicle for entrant in result)

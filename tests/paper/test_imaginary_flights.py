@@ -25,7 +25,7 @@ SEEDS, STARTS, SECONDS = (0, 3), 2, 30.0
 
 @pytest.mark.parametrize(("cores", "together"), [(2, (("step",), ("none",))), (16, (("step", "none"),))])
 def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
-    tmp_path, imagine, drawn, monkeypatch, cores, together
+    tmp_path, imagine, pictures, monkeypatch, cores, together
 ):
     """Methods in the order asked; a flight that crashed is infinite in its mean, and counted. Many cores fly more."""
     ramp, make = np.linspace(0.0, 3.0, 1501), Scenario.make
@@ -42,61 +42,64 @@ def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
 
     monkeypatch.setattr(Scenario, "make", installed)
     monkeypatch.setattr(gauntlet, "cores", lambda: cores)
-    said = drawn(gauntlet, "heat_map", "panel_figure")
+    message = pictures(gauntlet, "heat_map", "panel_figure")
     monkeypatch.setattr(gauntlet.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
     done = imagine(gauntlet, error)
     names, methods = ("step", "large", "none"), ("indi", "base")
     gauntlet.gauntlet(
         Run("test", tmp_path), Silent(), only=names, methods=methods, seeds=SEEDS, seconds=SECONDS, starts=STARTS
     )
-    assert [seeds for _, seeds in done.trained] == [SEEDS]
-    assert [(tuple(each.disturbance for each in s), *how) for _, s, *how in done.flown] == [
+    assert [seeds for _, seeds in done.trainings] == [SEEDS]
+    assert [(tuple(each.disturbance for each in s), *how) for _, s, *how in done.flights] == [
         (each, methods, STARTS, SECONDS) for each in together
     ]
-    found = {(row["scenario"], row["method"], row["metric"]): row for row in results(tmp_path, "results.json")["rows"]}
-    assert list(dict.fromkeys(key[0] for key in found)) == ["step", "none"]
-    assert {row["n"] for row in found.values()} == {4}
+    result = {(row["scenario"], row["method"], row["metric"]): row for row in results(tmp_path, "results.json")["rows"]}
+    assert list(dict.fromkeys(key[0] for key in result)) == ["step", "none"]
+    assert {row["n"] for row in result.values()} == {4}
     for name in ("step", "none"):
-        assert {found[name, "base", metric]["crashes"] for metric in gauntlet.METRICS} == {0}
+        assert {result[name, "base", metric]["crashes"] for metric in gauntlet.METRICS} == {0}
         for metric in gauntlet.METRICS:
-            crashed = found[name, "indi", metric]
-            assert (crashed["value"], crashed["worst"], crashed["crashes"]) == (None, None, 1)
+            crashes = result[name, "indi", metric]
+            assert (crashes["value"], crashes["worst"], crashes["crashes"]) == (None, None, 1)
         # the last 2 s of a ramp of 0.1 m/s end at 3 m; starts 0 of two seeds have 0.1 and 0.4 m
-        assert found[name, "base", "steady"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 2.9) / 4, abs=2e-3)
-        assert found[name, "base", "late"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 1.75) / 4, abs=2e-3)
-        assert found[name, "base", "peak"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 3.0) / 4)
-        assert found[name, "base", "peak"]["worst"] == pytest.approx(3.0)
+        assert result[name, "base", "steady"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 2.9) / 4, abs=2e-3)
+        assert result[name, "base", "late"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 1.75) / 4, abs=2e-3)
+        assert result[name, "base", "peak"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 3.0) / 4)
+        assert result[name, "base", "peak"]["worst"] == pytest.approx(3.0)
     text = (tmp_path / "gauntlet.md").read_text()
     assert "| step | INDI | ∞ (∞) | ∞ (∞) | ∞ (∞) | ∞ (∞) | ∞ (∞) | 1 of 4 |" in text
     assert "| none | base policy | 1.575 (2.901) | 1.000 (1.750) | 1.625 (3.000) | ∞ (∞) | ∞ (∞) | 0 of 4 |" in text
     assert text.index("| step | INDI") < text.index("| step | base policy") < text.index("| none | INDI")
     assert "by seed: 1.0, 4.0 mm. Left out: large: its package is not here" in text
     assert text.startswith("# The gauntlet\n")
-    ((titles, lines, columns, values), _), = said["heat_map"]  # fmt: skip
+    ((titles, lines, columns, values), _), = message["heat_map"]  # fmt: skip
     assert titles == ["late [m]", "peak [m]", "recovery_2cm [s]"]
     assert (list(lines), tuple(columns), np.shape(values)) == (["step", "none"], methods, (3, 2, 2))
     np.testing.assert_array_equal(values[:, :, 0], np.inf)
-    np.testing.assert_allclose(values[1, :, 1], found["none", "base", "peak"]["value"])
+    np.testing.assert_allclose(values[1, :, 1], result["none", "base", "peak"]["value"])
     # the best and the worst flight of the last method, beside the other's from the same start
-    ((_, (best, worst)), _), = said["panel_figure"]  # fmt: skip
+    ((_, (best, worst)), _), = message["panel_figure"]  # fmt: skip
     assert (best.title, worst.title) == ("best: step, start 0", "worst: none, start 1")
     assert [curve.label for curve in best.curves] == ["indi", "base"]
     np.testing.assert_allclose(best.curves[1].y, 100.0)  # [mm]
     np.testing.assert_allclose(worst.curves[1].y[-1], 3000.0)
 
 
-def test_the_gauntlet_of_faults_compares_adapting_with_not_adapting(tmp_path, imagine, drawn, monkeypatch):
+def test_the_gauntlet_of_faults_compares_adapting_with_not_adapting(tmp_path, imagine, pictures, monkeypatch):
     """Adapted flights crash where the base policy survives in one condition, and are as good as it in the other."""
-    drawn(gauntlet, "heat_map", "panel_figure")
+    pictures(gauntlet, "heat_map", "panel_figure")
     monkeypatch.setattr(gauntlet.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
     done = imagine(gauntlet, lambda spec: None if (spec.scenario.fault, spec.method) == ("late", "full") else 0.1)
     run, methods = Run("test", tmp_path), ("base", "base-do", "full")
     gauntlet.gauntlet(
         run, Silent(), only=("late", "gaps"), methods=methods, starts=STARTS, seconds=SECONDS, faults=True
     )
-    assert [tuple(each.fault for each in s) for _, s, *_ in done.flown] in ([("late",), ("gaps",)], [("late", "gaps")])
-    kept = json.loads((tmp_path / "results.json").read_text())["promise"]
-    assert [(row["scenario"], row["crashed_although_base_survived"], row["holds"]) for row in kept] == [
+    assert [tuple(each.fault for each in s) for _, s, *_ in done.flights] in (
+        [("late",), ("gaps",)],
+        [("late", "gaps")],
+    )
+    rest = json.loads((tmp_path / "results.json").read_text())["promise"]
+    assert [(row["scenario"], row["crashed_although_base_survived"], row["holds"]) for row in rest] == [
         ("late", STARTS, False), ("gaps", 0, True),
     ]  # fmt: skip
     text = (tmp_path / "faults.md").read_text()
@@ -114,29 +117,29 @@ def test_a_gauntlet_of_plants_that_are_not_installed_is_refused_before_training(
     done = imagine(gauntlet, lambda spec: 0.0)
     with pytest.raises(PlantError, match="its package is not here"):
         gauntlet.gauntlet(Run("test", tmp_path), Silent(), only=("none", "step"), methods=("base",), starts=1)
-    assert not done.trained
+    assert not done.trainings
 
 
-def test_the_gauntlet_tells_recoveries_from_each_change(tmp_path, imagine, drawn, monkeypatch):
+def test_the_gauntlet_tells_recoveries_from_each_change(tmp_path, imagine, pictures, monkeypatch):
     """The step comes at 8 s; who is within 2 cm a second later took a second."""
     t = 0.02 * np.arange(1501)
-    drawn(gauntlet, "heat_map", "panel_figure")
+    pictures(gauntlet, "heat_map", "panel_figure")
     monkeypatch.setattr(gauntlet.plots, "save", lambda *_: (tmp_path / "x.png", tmp_path / "x.svg"))
     imagine(gauntlet, lambda spec: np.where((t >= 7.99) & (t < 8.99), 0.03, np.where(t < 0.49, 0.1, 0.0)))
     gauntlet.gauntlet(Run("test", tmp_path), Silent(), only=("none", "step"), methods=("base",), starts=1)
-    found = {(row["scenario"], row["metric"]): row["value"] for row in results(tmp_path, "results.json")["rows"]}
-    assert found["step", "recovery_2cm"] == pytest.approx(1.0)
-    assert found["step", "recovery_5cm"] == 0.0
-    assert found["none", "recovery_2cm"] == pytest.approx(9.0)  # nothing changes: from the start
-    assert found["none", "recovery_5cm"] == pytest.approx(0.5)
+    result = {(row["scenario"], row["metric"]): row["value"] for row in results(tmp_path, "results.json")["rows"]}
+    assert result["step", "recovery_2cm"] == pytest.approx(1.0)
+    assert result["step", "recovery_5cm"] == 0.0
+    assert result["none", "recovery_2cm"] == pytest.approx(9.0)  # nothing changes: from the start
+    assert result["none", "recovery_5cm"] == pytest.approx(0.5)
 
 
 def test_plants_have_a_section_each_with_a_column_for_each_method(tmp_path, imagine, monkeypatch):
-    made = (
+    setup = (
         ("a", Scenario(plant="simple"), ("none", "large")), ("b", Scenario(vehicle="large"), ("wind",)),
         ("c", Scenario(plant="mujoco"), ("none",)),
     )  # fmt: skip
-    monkeypatch.setattr(plants, "groups", lambda: made)
+    monkeypatch.setattr(plants, "groups", lambda: setup)
     shares = {method: 0.1 * (1 + k) for k, method in enumerate(plants.METHODS)}
 
     def error(spec):
@@ -146,8 +149,8 @@ def test_plants_have_a_section_each_with_a_column_for_each_method(tmp_path, imag
 
     done = imagine(plants, error)
     plants.plants(Run("test", tmp_path), Silent(), plant=("simple", "bem"), seeds=SEEDS, seconds=SECONDS, starts=STARTS)
-    assert [seeds for _, seeds in done.trained] == [SEEDS]
-    assert [(tuple(s.disturbance for s in scenarios), *how) for _, scenarios, *how in done.flown] == [
+    assert [seeds for _, seeds in done.trainings] == [SEEDS]
+    assert [(tuple(s.disturbance for s in scenarios), *how) for _, scenarios, *how in done.flights] == [
         (("none", "large"), plants.METHODS, STARTS, SECONDS), (("wind",), plants.METHODS, STARTS, SECONDS)
     ]  # fmt: skip
     text = (tmp_path / "plants.md").read_text()
@@ -157,8 +160,8 @@ def test_plants_have_a_section_each_with_a_column_for_each_method(tmp_path, imag
     assert f"| large | {whole.rpartition(' | ')[0]} | crashed, 4 of 4 | - | 4 of 20 |" in text
     assert text.index("## a") < text.index("## b")
     assert "## c" not in text
-    found = results(tmp_path, "plants.json")["rows"]
-    assert [(row["group"], row["vehicle"]) for row in found[:: len(plants.METHODS)]] == [
+    result = results(tmp_path, "plants.json")["rows"]
+    assert [(row["group"], row["vehicle"]) for row in result[:: len(plants.METHODS)]] == [
         ("a", "small"), ("a", "small"), ("b", "small")
     ]  # fmt: skip
 
@@ -176,28 +179,28 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
     ablation.ablation(Run("test", tmp_path), Silent(), task=task, seeds=SEEDS, seconds=SECONDS, starts=STARTS)
     references = ablation.REFERENCES[task]
     every = [*CONTROL, *OFF[task], *CONTROL, *ON[task]]
-    assert [(study.preset.name, s[0].reference, *how) for study, s, *how in done.flown] == [
+    assert [(study.preset.name, s[0].reference, *how) for study, s, *how in done.flights] == [
         (f"{task}/{'retrim' if k < len(CONTROL) + len(OFF[task]) else 'paper'}", reference, (lever.method,), STARTS,
          SECONDS)
         for k, lever in enumerate(every) for reference in references
     ]  # fmt: skip
-    assert {seeds for _, seeds in done.trained} == {SEEDS}
-    keys = [ablation.dump(ablation.replace(preset, adapt=ablation.Adapt())) for preset, _ in done.trained]
+    assert {seeds for _, seeds in done.trainings} == {SEEDS}
+    keys = [ablation.dump(ablation.replace(preset, adapt=ablation.Adapt())) for preset, _ in done.trainings]
     assert len(set(keys)) == len(keys)
     text = (tmp_path / f"ablation_{task}.md").read_text()
     columns = [f"{r}, {name}" if r else name for r in references for name in place]
     assert f"| lever | {' | '.join(columns)} |" in text
     figures = [f"{0.1 + 0.1 * k + (0.5 if r == 'figure8' else 0.0):.4f}" for r in references for k in place.values()]
-    shown = " | ".join(f"{figure} ± 0.0000" for figure in figures)
-    assert text.count(f"| {shown} |") == len(every) - 2
+    display = " | ".join(f"{figure} ± 0.0000" for figure in figures)
+    assert text.count(f"| {display} |") == len(every) - 2
     half = " | ".join(f"{figure} ± 0.0000, 2 of 4 crashed" for figure in figures)
     assert text.count(f"| {half} |") == 2
     assert text.count("\n| ") == len(every) + 2
-    found = results(tmp_path, f"ablation_{task}.json")["rows"]
-    assert [(row["lever"], row["reference"], row["disturbance"]) for row in found] == [
+    result = results(tmp_path, f"ablation_{task}.json")["rows"]
+    assert [(row["lever"], row["reference"], row["disturbance"]) for row in result] == [
         (lever.label.strip("*"), reference, name) for lever in every for reference in references for name in place
     ]
-    for preset, scenarios in ((study.preset, s) for study, s, *_ in done.flown):
+    for preset, scenarios in ((study.preset, s) for study, s, *_ in done.flights):
         if preset.track is not None and not preset.track.looks_ahead:
             assert preset.track.reference == scenarios[0].reference
 
@@ -207,25 +210,25 @@ def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch)
     every = len([*CONTROL, *OFF["hover"], *CONTROL, *ON["hover"]])
     done = imagine(ablation, lambda spec: 0.1)
 
-    def fly(folder=tmp_path / "cut", until=None, **asked):
+    def fly(folder=tmp_path / "cut", until=None, **calls):
         run = Run("test", folder)
 
         def watch(*words, **more):
-            flown = done.fly(*words, **more)
-            if len(done.flown) == until:
+            flight = done.fly(*words, **more)
+            if len(done.flights) == until:
                 run.stop.set()
-            return flown
+            return flight
 
-        done.flown.clear()
+        done.flights.clear()
         monkeypatch.setattr(ablation, "fly_all", watch)
-        asked = {"seeds": SEEDS, "seconds": SECONDS, "starts": STARTS} | asked
-        ablation.ablation(run, Silent(), **asked)
-        return len(done.flown), results(folder, "ablation_hover.json")["rows"]
+        calls = {"seeds": SEEDS, "seconds": SECONDS, "starts": STARTS} | calls
+        ablation.ablation(run, Silent(), **calls)
+        return len(done.flights), results(folder, "ablation_hover.json")["rows"]
 
-    flown, part = fly(until=4)
-    assert flown == 4
-    flown, again = fly()
-    assert flown == every - 3  # the fourth was cut
+    flight, part = fly(until=4)
+    assert flight == 4
+    flight, again = fly()
+    assert flight == every - 3  # the fourth was cut
     assert part == again[: len(part)]
     assert again == fly(tmp_path / "whole")[1]
     assert "An earlier run had made 3 of the parts" in (tmp_path / "cut" / "ablation_hover.md").read_text()
@@ -234,15 +237,17 @@ def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch)
         assert fly(**other)[0] == every
 
 
-def test_a_section_of_levels_flies_policies_and_rivals_and_orders_them_as_asked(tmp_path, imagine, drawn, monkeypatch):
+def test_a_section_of_levels_flies_policies_and_rivals_and_orders_them_as_asked(
+    tmp_path, imagine, pictures, monkeypatch
+):
     preset = brief_preset()
     place = {"none": 0.0, "small": 0.2, "large": 0.5}
     share = {"datt": 0.01, "base": 0.02, "indi": 0.03}
     done = imagine(levels, lambda spec: place[spec.scenario.disturbance] + share[spec.method] * (1 + spec.start))
-    said, asked = drawn(levels, "picture"), []
+    text, calls = pictures(levels, "picture"), []
 
     def rival(preset, seeds, run, reporter, *, steps):
-        asked.append((preset, seeds, steps))
+        calls.append((preset, seeds, steps))
         return {seed: f"net {seed}" for seed in seeds}
 
     monkeypatch.setitem(levels.RIVALS, "datt", rival)
@@ -252,9 +257,9 @@ def test_a_section_of_levels_flies_policies_and_rivals_and_orders_them_as_asked(
     )  # fmt: skip
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", SEEDS, Silent())
     levels.fly_levels(document, [section], starts=STARTS, seconds=SECONDS, datt_steps=77)
-    assert done.trained == [(preset, SEEDS)]
-    assert asked == [(preset, SEEDS, 77)]
-    own, rivals = done.flown
+    assert done.trainings == [(preset, SEEDS)]
+    assert calls == [(preset, SEEDS, 77)]
+    own, rivals = done.flights
     assert own[2:] == (("base", "indi"), STARTS, SECONDS)
     assert rivals[2:] == (("datt",), STARTS, SECONDS)
     assert list(rivals[0].policies.values()) == ["net 0", "net 3"]
@@ -265,27 +270,27 @@ def test_a_section_of_levels_flies_policies_and_rivals_and_orders_them_as_asked(
     assert [row[1] for row in table.rows] == ["0.015 ± 0.006", "0.030 ± 0.012 (1)", "0.045 ± 0.017"]
     assert [row[3] for row in table.rows] == ["0.515 ± 0.006", "0.530 ± 0.012 (3)", "0.545 ± 0.017"]
     assert "by seed: 1.0, 4.0 mm. The gate admitted 0 policies and refused 0. 0 of 36 flights crashed." in table.about
-    ((shown, _, scenario, folder), more), = said["picture"]  # fmt: skip
-    assert {(f.spec.seed, f.spec.method) for f in shown} == {(0, "datt"), (0, "indi")}
+    ((display, _, scenario, folder), more), = text["picture"]  # fmt: skip
+    assert {(f.spec.seed, f.spec.method) for f in display} == {(0, "datt"), (0, "indi")}
     assert (scenario, folder, more) == (Scenario("large", "simple"), tmp_path, {"stem": "stem"})
     assert table.picture == tmp_path / "picture.png"
-    found = results(tmp_path, "table.json")["rows"]
-    assert {(row["preset"], row["section"]) for row in found} == {(preset.name, "title")}
+    result = results(tmp_path, "table.json")["rows"]
+    assert {(row["preset"], row["section"]) for row in result} == {(preset.name, "title")}
 
 
-def test_errors_around_reversals_are_those_of_whole_flights(tmp_path, imagine, drawn):
-    said = drawn(reversing, "picture")
+def test_errors_around_reversals_are_those_of_whole_flights(tmp_path, imagine, pictures):
+    message = pictures(reversing, "picture")
     done = imagine(reversing, lambda spec: None if (spec.method, spec.start) == ("indi", 0) else 0.1 + spec.seed)
     reversing.reversing(Run("test", tmp_path), Silent(), plant="simple", seeds=SEEDS, seconds=45.0, starts=STARTS)
-    assert [seeds for _, seeds in done.trained] == [SEEDS]
-    ((_, scenarios, *how),) = done.flown
+    assert [seeds for _, seeds in done.trainings] == [SEEDS]
+    ((_, scenarios, *how),) = done.flights
     assert (scenarios, *how) == ((Scenario("reversing", "simple"),), tuple(reversing.METHODS), STARTS, 45.0)
-    found = results(tmp_path, "reversing.json")
-    assert {m: np.shape(e)[:2] for m, e in found["errors_m"].items()} == {
+    result = results(tmp_path, "reversing.json")
+    assert {m: np.shape(e)[:2] for m, e in result["errors_m"].items()} == {
         m: (2 if m == "indi" else 4, 2) for m in reversing.METHODS
     }
-    assert np.shape(found["moments_s"])[0] == 2  # at 15 and 30 s
-    for errors in found["errors_m"].values():
+    assert np.shape(result["moments_s"])[0] == 2  # at 15 and 30 s
+    for errors in result["errors_m"].values():
         np.testing.assert_allclose(sorted({round(e, 6) for e in np.ravel(errors)}), [0.1, 3.1])
     text = (tmp_path / "reversing.md").read_text()
     assert "| reversed at 15 s, INDI | 1.600 ± 2.121 |" in text
@@ -293,16 +298,16 @@ def test_errors_around_reversals_are_those_of_whole_flights(tmp_path, imagine, d
     assert "2 of 24 flights crashed." in text
     assert "base policy 1.600; " in text
     assert "INDI -" in text  # two of four crashed: the median is beyond what was flown
-    ((shown, *_), _), = said["picture"]  # fmt: skip
-    assert {f.spec.method for f in shown} == {"base", "full"}
+    ((display, *_), _), = message["picture"]  # fmt: skip
+    assert {f.spec.method for f in display} == {"base", "full"}
 
 
 def test_where_nothing_that_is_drawn_has_landed_the_rest_is_kept(tmp_path, imagine, monkeypatch):
     """As after a Ctrl-C early on: other methods' flights have landed, and no picture can be made."""
     done = imagine(reversing, lambda spec: 0.1)
     fly = reversing.fly_all
-    rest = lambda *a, **k: Flights([f for f in fly(*a, **k).flown if f.spec.method == "indi"], True)  # noqa: E731
+    rest = lambda *a, **k: Flights([f for f in fly(*a, **k).flights if f.spec.method == "indi"], True)  # noqa: E731
     monkeypatch.setattr(reversing, "fly_all", rest)
     reversing.reversing(Run("test", tmp_path), Silent(), plant="simple", seeds=SEEDS, seconds=45.0, starts=STARTS)
-    assert done.flown
+    assert done.flights
     assert [row["method"] for row in results(tmp_path, "reversing.json")["rows"]] == ["indi"]

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from commands import results, retrim
+from fake_flights import Watching
 from helpers import brief_preset
-from made_up import Watching
 from retrim import PlantError, Scenario
 from retrim.config import named_presets as presets
 from retrim.runkit import Run
 from retrim.runkit.reporter import Silent
 from retrim.transport.shared_memory import SharedMemoryBus
 from retrim_paper import latency
-from retrim_paper.published import published
+from retrim_paper.published import compare_published
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -35,13 +35,13 @@ def at(curve, x):
 
 
 def test_figures_of_the_rotor_are_near_published_ones():
-    for row in published():
+    for row in compare_published():
         assert row["ours"] == pytest.approx(row["published"], rel=0.03 if row["source"] == "Agilicious" else 0.12), row
 
 
 def test_thrust_and_inflow_lie_on_published_points():
-    found = curves(model.thrust_panel())
-    ours, theirs, points = (found[n] for n in ("blade elements", "published thrust map", "Agilicious' own model"))
+    result = curves(model.thrust_panel())
+    ours, theirs, points = (result[n] for n in ("blade elements", "published thrust map", "Agilicious' own model"))
     assert np.all(np.diff(ours.x) > 0)
     assert np.all(np.diff(ours.y) > 0)
     np.testing.assert_allclose(at(theirs, points.x), points.y, rtol=0.05)
@@ -58,9 +58,9 @@ def test_thrust_and_inflow_lie_on_published_points():
 
 
 def test_drag_grows_with_speed_and_most_of_it_is_the_rotors():
-    found = curves(model.drag_panel())
+    result = curves(model.drag_panel())
     for name in ("small", "kingfisher"):
-        whole, rotors = found[f"{name}: rotors and body"], found[f"{name}: rotors"]
+        whole, rotors = result[f"{name}: rotors and body"], result[f"{name}: rotors"]
         assert whole.y[0] == pytest.approx(0.0, abs=1e-3)
         assert np.all(np.diff(whole.y) > 0)
         assert np.all(whole.y[1:] >= rotors.y[1:] - 1e-6)
@@ -68,8 +68,8 @@ def test_drag_grows_with_speed_and_most_of_it_is_the_rotors():
         body, fast = (at(whole, v) - at(rotors, v) for v in (5.0, 10.0))
         assert fast == pytest.approx(4.0 * body, rel=0.01)  # by the square of the speed
         np.testing.assert_allclose((whole.x[0], whole.x[-1]), (0.0, 10.0))
-    assert at(found["kingfisher: rotors"], 3.0) == pytest.approx(
-        at(found["kingfisher, published: 0.24 1/s"], 3.0), rel=0.15
+    assert at(result["kingfisher: rotors"], 3.0) == pytest.approx(
+        at(result["kingfisher, published: 0.24 1/s"], 3.0), rel=0.15
     )
 
 
@@ -113,15 +113,15 @@ def test_the_model_s_page_has_each_figure_and_its_deviation(tmp_path, monkeypatc
 def test_plants_of_others_by_their_command(tmp_path, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", brief_preset())
     groups = [("a", "simple", ("none", "wind")), ("b", "mujoco", ("none",)), ("c", "rotorpy", ("none",))]
-    made = tuple((title, Scenario(plant=plant), disturbances) for title, plant, disturbances in groups)
-    monkeypatch.setattr(plants, "groups", lambda: made)
+    setup = tuple((title, Scenario(plant=plant), disturbances) for title, plant, disturbances in groups)
+    monkeypatch.setattr(plants, "groups", lambda: setup)
     monkeypatch.setattr(plants, "METHODS", ("base", "full"))
     fly_all = plants.fly_all
 
-    def fly(study, scenarios, *given, **how):
+    def fly(study, scenarios, *argument, **how):
         if scenarios[0].plant == "mujoco":
             raise PlantError("mujoco is not here")
-        return fly_all(study, scenarios, *given, **how)
+        return fly_all(study, scenarios, *argument, **how)
 
     monkeypatch.setattr(plants, "fly_all", fly)
     words = "--plant", "simple", "mujoco", "--seconds", "1", "--starts", "2"
@@ -145,17 +145,17 @@ def test_every_group_of_plants_is_a_scenario_that_can_be_made():
 
 
 def test_a_group_of_plants_is_what_its_title_says():
-    found = {title: scenario for title, scenario, _ in plants.groups()}
-    said = {
+    result = {title: scenario for title, scenario, _ in plants.groups()}
+    text = {
         "on the large one": {"vehicle": "large"}, "on the kingfisher": {"vehicle": "kingfisher"},
         "map exact": {"thrust_error": 0.0}, "3.5 % below": {"thrust_error": -0.035},
         "10.5 % above": {"thrust_error": 0.105}, "mocap sensors": {"sensors": "mocap"},
         "rough sensors": {"sensors": "rough"},
     }  # fmt: skip
-    for title, scenario in found.items():
-        (differs,) = [more for words, more in said.items() if words in title] or [{}]
+    for title, scenario in result.items():
+        (differs,) = [more for words, more in text.items() if words in title] or [{}]
         assert scenario == Scenario(plant=scenario.plant, **differs), title
-    assert all(any(words in title for title in found) for words in said)
+    assert all(any(words in title for title in result) for words in text)
 
 
 def test_a_push_that_reverses_by_its_command(tmp_path, monkeypatch):
@@ -164,16 +164,16 @@ def test_a_push_that_reverses_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setattr(reversing, "METHODS", {"base": "base policy", "full": "**adapted**"})
     words = "--plant", "simple", "--starts", "2"
     retrim("reproduce", "reversing", *words, "--seconds", "3", "--out", "r", cwd=tmp_path)
-    found = json.loads((tmp_path / "r" / "reversing.json").read_text())
-    assert [(row["method"], row["plant"], row["n"]) for row in found["rows"]] == [
+    result = json.loads((tmp_path / "r" / "reversing.json").read_text())
+    assert [(row["method"], row["plant"], row["n"]) for row in result["rows"]] == [
         ("base", "simple", 2), ("full", "simple", 2)
     ]  # fmt: skip
-    turns, read = np.shape(found["moments_s"])
-    assert (turns, found["moments_s"][0][0], found["moments_s"][0][-1]) == (2, 1.0, 2.0)
-    assert all(np.shape(errors)[1:] == (turns, read) for errors in found["errors_m"].values() if errors)
+    turns, read = np.shape(result["moments_s"])
+    assert (turns, result["moments_s"][0][0], result["moments_s"][0][-1]) == (2, 1.0, 2.0)
+    assert all(np.shape(errors)[1:] == (turns, read) for errors in result["errors_m"].values() if errors)
     assert list((tmp_path / "r").glob("*.png"))
-    said = retrim("reproduce", "reversing", *words, "--seconds", "1", cwd=tmp_path, code=1)
-    assert "a push that reverses needs at least 2 s" in said
+    text = retrim("reproduce", "reversing", *words, "--seconds", "1", cwd=tmp_path, code=1)
+    assert "a push that reverses needs at least 2 s" in text
 
 
 def test_messages_between_two_processes_are_timed(monkeypatch):
@@ -181,7 +181,7 @@ def test_messages_between_two_processes_are_timed(monkeypatch):
     monkeypatch.setattr(latency, "FIRST", 2)
     bus = SharedMemoryBus.create(latency.TOPICS)
     try:
-        took = latency.measured(bus, latency.other_process(str(bus.folder)), 500)
+        took = latency.measure_latencies(bus, latency.other_process(str(bus.folder)), 500)
     finally:
         bus.remove()
     assert len(took) == 3  # the first two are not counted
@@ -189,10 +189,10 @@ def test_messages_between_two_processes_are_timed(monkeypatch):
 
 
 def test_latencies_of_buses_by_their_command(tmp_path, monkeypatch):
-    asked = []
+    calls = []
 
     def measured(bus, words, size):
-        asked.append((type(bus).__name__, words[-1], size))
+        calls.append((type(bus).__name__, words[-1], size))
         return [] if size > 1e6 else [1e-3, 3e-3]
 
     monkeypatch.setattr(buses, "measured", measured)
@@ -200,13 +200,13 @@ def test_latencies_of_buses_by_their_command(tmp_path, monkeypatch):
     monkeypatch.setattr(buses, "two_machines", nullcontext)
     watching = Watching()
     buses.buses(Run("test", tmp_path), watching)
-    assert [each for each in watching.told if each[0] == "shared memory"] == [
+    assert [each for each in watching.messages if each[0] == "shared memory"] == [
         ("shared memory", i / len(latency.SIZES), name) for i, name in enumerate(latency.SIZES)
     ]
     rows = results(tmp_path, "buses.json")["rows"]
     assert [row["bytes"] for row in rows if row["bus"] == "shared memory"] == [500, 74_000]
     assert {(row["p50_ms"], row["max_ms"], row["n"]) for row in rows} == {(2.0, 3.0, 2)}
-    assert [size for name, _, size in asked if name == "SharedMemoryBus"] == list(latency.SIZES.values())
+    assert [size for name, _, size in calls if name == "SharedMemoryBus"] == list(latency.SIZES.values())
     assert "| shared memory | a measurement, 0.5 kB | 2.00 |" in (tmp_path / "buses.md").read_text()
-    for name, where, _ in asked:
+    for name, where, _ in calls:
         assert ("/" in where) == (name == "SharedMemoryBus")

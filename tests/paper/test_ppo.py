@@ -8,7 +8,7 @@ import pytest
 from jax import random
 
 from retrim.learn.problem import Outcome
-from retrim_paper.datt.advantages import Seen, advantages
+from retrim_paper.datt.advantages import Experience, advantages
 from retrim_paper.datt.ppo import PpoSettings, PpoState, log_prob, ppo
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -54,8 +54,8 @@ def optimum():
 def test_it_solves_a_regulator_with_a_known_answer(key):
     settings = PpoSettings(envs=64, steps=32, minibatches=4, epochs=4, learning_rate=0.02, discount=DISCOUNT)
     net = Gain(jnp.zeros(1), jnp.zeros(2), jnp.full(1, -1.0))
-    learnt = list(ppo(Linear(), PpoState.of(Linear(), net, key, settings), settings, steps=64 * 32 * 160))
-    net, figures = learnt[-1][0].net, [told for _, told in learnt]
+    learner_state = list(ppo(Linear(), PpoState.of(Linear(), net, key, settings), settings, steps=64 * 32 * 160))
+    net, figures = learner_state[-1][0].net, [message for _, message in learner_state]
     gain, curvature = optimum()
     assert float(net.gain[0]) == pytest.approx(gain, rel=0.1)
     assert float(net.value[1]) == pytest.approx(curvature, rel=0.25)
@@ -64,19 +64,19 @@ def test_it_solves_a_regulator_with_a_known_answer(key):
     assert float(net.log_std[0]) < -1.5  # noise costs, so that it goes
 
 
-def seen(key, over):
+def observe(key, over):
     k_r, k_v = random.split(key)
     n = over.shape[0]
     reward, value = random.normal(k_r, (n, 1)), random.normal(k_v, (n, 1))
     outcome = Outcome(reward, over[:, None], jnp.zeros((n, 1), dtype=bool))
-    return Seen(jnp.zeros((n, 1, 1)), jnp.zeros((n, 1, 1)), jnp.zeros((n, 1)), value, outcome)
+    return Experience(jnp.zeros((n, 1, 1)), jnp.zeros((n, 1, 1)), jnp.zeros((n, 1)), value, outcome)
 
 
 @pytest.mark.parametrize("ends", [(), (3,), (0, 5, 7)])
 def test_advantages_are_returns_less_values_and_steps_of_the_value(ends, key):
     """lambda = 1: discounted returns up to the end of the episode; lambda = 0: temporal differences."""
     over = jnp.zeros(8, dtype=bool).at[jnp.array(ends, dtype=int)].set(True)
-    rows, last = seen(key, over), jnp.array([0.7])
+    rows, last = observe(key, over), jnp.array([0.7])
     reward, value = np.asarray(rows.outcome.reward)[:, 0], np.asarray(rows.value)[:, 0]
     expected, differences, after, value_after = [], [], 0.7, 0.7
     for k in reversed(range(8)):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from made_up import flight
+from fake_flights import flight
 from retrim import Scenario
 from retrim.runkit import FlightSpec
 from retrim_paper.tables.promise import promise_rows, promise_section
@@ -10,33 +10,33 @@ from retrim_paper.tables.promise import promise_rows, promise_section
 
 def flights(**errors):
     """Flights by method and start: steady errors [m], None for a crash."""
-    found = []
+    result = []
     for method, by_start in errors.items():
         for start, error in enumerate(by_start):
             spec = FlightSpec(Scenario("small"), method.replace("_", "-"), start)
-            found.append(flight(3.0 if error is None else error, spec=spec, terminated=error is None))
-    return found
+            result.append(flight(3.0 if error is None else error, spec=spec, terminated=error is None))
+    return result
 
 
 def row(**errors):
-    (found,) = promise_rows({"late": flights(**errors)})
-    return found
+    (result,) = promise_rows({"late": flights(**errors)})
+    return result
 
 
 def test_the_bound_is_of_the_better_of_base_and_observer():
-    found = row(base=[0.10, 0.20], base_do=[0.02, 0.04], full=[0.03, 0.04])
-    assert found["bound"] == pytest.approx(1.2 * 0.03 + 0.005)
-    assert found["steady"] == pytest.approx(0.035)
-    assert found["holds"]
+    result = row(base=[0.10, 0.20], base_do=[0.02, 0.04], full=[0.03, 0.04])
+    assert result["bound"] == pytest.approx(1.2 * 0.03 + 0.005)
+    assert result["steady"] == pytest.approx(0.035)
+    assert result["holds"]
     assert not row(base=[0.10], base_do=[0.02], full=[0.03])["holds"]
     assert row(base=[0.02], base_do=[None], full=[0.0289])["holds"]
     assert not row(base=[0.02], base_do=[None], full=[0.0291])["holds"]
 
 
 def test_a_crash_counts_if_the_base_policy_survives_the_same_start():
-    found = row(base=[None, 0.1], base_do=[0.1, 0.1], full=[0.05, None])
-    assert (found["crashes"], found["crashes_base"], found["crashed_although_base_survived"]) == (1, 1, 1)
-    assert not found["holds"]
+    result = row(base=[None, 0.1], base_do=[0.1, 0.1], full=[0.05, None])
+    assert (result["crashes"], result["crashes_base"], result["crashed_although_base_survived"]) == (1, 1, 1)
+    assert not result["holds"]
     assert row(base=[None, 0.1], base_do=[0.1, 0.1], full=[None, 0.1])["holds"]
 
 

@@ -26,7 +26,7 @@ def net():
 
 
 @pytest.fixture(scope="module")
-def untrained():
+def policies():
     return Setup.from_preset(tiny_preset()).new_policy(random.key(0))
 
 
@@ -40,7 +40,7 @@ def test_the_network_computes_what_its_package_computes(net, key):
 
 
 @pytest.fixture(scope="module")
-def flown(net):
+def sample_flight(net):
     """States after some seconds of hover, by the heading of the goal and what is commanded from outside."""
 
     def fly(x0, heading, outside):
@@ -57,42 +57,42 @@ def flown(net):
     return jax.jit(fly)
 
 
-def test_it_comes_to_hover_facing_where_it_should_and_listens_to_nobody(flown):
+def test_it_comes_to_hover_facing_where_it_should_and_listens_to_nobody(sample_flight):
     x0 = State.at(jnp.array(GOAL) + jnp.array([0.6, -0.4, 0.3]))
-    path = flown(x0, jnp.array(0.5), Command.hover(float))
+    path = sample_flight(x0, jnp.array(0.5), Command.hover(float))
     assert float(jnp.max(jnp.linalg.norm(path.p[-50:] - jnp.array([GOAL]), axis=1))) < 0.15
     heading = jnp.arctan2(path.R[-1, 1, 0], path.R[-1, 0, 0])
     assert abs(float(heading) - 0.5) < 0.2
-    other = flown(x0, jnp.array(0.5), Command(jnp.array(3.0), jnp.array([2.0, -2.0, 1.0])))
+    other = sample_flight(x0, jnp.array(0.5), Command(jnp.array(3.0), jnp.array([2.0, -2.0, 1.0])))
     np.testing.assert_array_equal(other.p, path.p)
 
 
-def test_it_does_not_care_which_way_is_north(flown):
+def test_it_does_not_care_which_way_is_north(sample_flight):
     """Goal, vehicle and heading turned about the vertical by an angle: the path is turned by it."""
     turn, offset = 1.1, jnp.array([0.5, 0.2, -0.2])
     Q = so3.rotz(jnp.array(turn))
     at = jnp.array(GOAL)
-    path = flown(State.at(at + offset), jnp.array(0.0), Command.hover(float))
+    path = sample_flight(State.at(at + offset), jnp.array(0.0), Command.hover(float))
     x0 = State(at + Q @ offset, Q, jnp.zeros(3))
-    turned = flown(x0, jnp.array(turn), Command.hover(float))
-    np.testing.assert_allclose(turned.p - at[None], (path.p - at[None]) @ Q.T, atol=1e-5)
+    rotation = sample_flight(x0, jnp.array(turn), Command.hover(float))
+    np.testing.assert_allclose(rotation.p - at[None], (path.p - at[None]) @ Q.T, atol=1e-5)
 
 
-def test_it_flies_as_a_method_and_commands_no_rates(untrained):
+def test_it_flies_as_a_method_and_commands_no_rates(policies):
     preset = tiny_preset(vehicle="kingfisher")
-    fleet = Fleet(preset, untrained, [Scenario()], methods=["raptor"], starts=2, seconds=4.0)
-    flights = fleet.run().flown
+    fleet = Fleet(preset, policies, [Scenario()], methods=["raptor"], starts=2, seconds=4.0)
+    flights = fleet.run().flights
     assert [flight.log.terminated for flight in flights] == [False, False]
     assert all(flight.error[-1] < 0.3 for flight in flights)
     assert record(flights[0])["rates_rms"] is None
 
 
 @pytest.mark.parametrize(
-    ("scenario", "said"), [(Scenario(plant="simple"), "plant 'bem' alone"), (Scenario(sensors="rough"), "'ideal'")]
+    ("scenario", "text"), [(Scenario(plant="simple"), "plant 'bem' alone"), (Scenario(sensors="rough"), "'ideal'")]
 )
-def test_what_it_cannot_fly_is_refused_before_anything_flies(scenario, said, untrained):
-    with pytest.raises(ConfigError, match=said):
-        Fleet(tiny_preset(), untrained, [scenario], methods=["raptor"])
+def test_what_it_cannot_fly_is_refused_before_anything_flies(scenario, text, policies):
+    with pytest.raises(ConfigError, match=text):
+        Fleet(tiny_preset(), policies, [scenario], methods=["raptor"])
 
 
 def test_it_flies_beside_others_by_its_command(tmp_path, monkeypatch, as_a_user):

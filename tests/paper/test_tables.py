@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from commands import results, retrim
+from fake_flights import DT, Watching, flight, log
 from helpers import at, brief_preset, tiny_preset
-from made_up import DT, Watching, flight, log
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config import named_presets as presets
 from retrim.config.disturbances import DISTURBANCES
 from retrim.config.loading import dump, with_vehicle
 from retrim.config.presets import Adapt
-from retrim.evaluation.batches import LOT
+from retrim.evaluation.batches import FULL
 from retrim.evaluation.flight_groups import FLIGHTS
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
 from retrim.runkit import Run, provenance
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 LEVELS = ("none", "small", "large")
 
 
-def untrained(preset, seeds, run, reporter):
+def make_untrained(preset, seeds, run, reporter):
     """In place of training, where it does not matter how well a policy flies."""
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     return Study(preset, dict.fromkeys(seeds, policy), (0.1,) * len(seeds))
@@ -57,19 +57,19 @@ def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
     assert " (0.128 ± 0.004) |" in text
     assert "| DATT, the paper's | (0.013 ± 0.004) | (0.009 ± 0.005) | (0.231 ± 0.004) |" in text
     assert "t/hover.md" in out
-    found = results(tmp_path / "t", "hover.json")
-    methods = list(dict.fromkeys(row["method"] for row in found["rows"]))
+    result = results(tmp_path / "t", "hover.json")
+    methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
     assert methods == ["base", "indi", "full"]
-    assert [(row["disturbance"], row["method"], row["n"]) for row in found["rows"]] == [
+    assert [(row["disturbance"], row["method"], row["n"]) for row in result["rows"]] == [
         (level, method, 2) for level in LEVELS for method in methods
     ]
-    for row in found["rows"]:
+    for row in result["rows"]:
         assert row["crashes"] == 2 or f"{row['mean']:.3f} ± {row['std']:.3f}" in text
     assert (tmp_path / "t" / "hover_fast.png").stat().st_size > 10_000
 
 
 def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path, monkeypatch):
-    monkeypatch.setattr(levels, "train_all", untrained)
+    monkeypatch.setattr(levels, "train_all", make_untrained)
     preset = brief_preset("track/preview", track={"reference": "circle"})
     scenario = Scenario(plant="simple", reference="circle")
     circle = Levels(
@@ -77,8 +77,8 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path, mon
     )
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [circle], starts=1, seconds=1.0)
-    (section, figures), found = document.sections, results(tmp_path, "table.json")["rows"]
-    assert [(row["disturbance"], row["method"], row["reference"]) for row in found] == [
+    (section, figures), result = document.sections, results(tmp_path, "table.json")["rows"]
+    assert [(row["disturbance"], row["method"], row["reference"]) for row in result] == [
         (level, method, "circle") for level in LEVELS for method in ("base", "indi")
     ]
     assert [row[0] for row in section.rows] == [
@@ -86,8 +86,8 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path, mon
     ]  # fmt: skip
     assert section.rows[0][1].endswith(" (1)")
     assert section.rows[-1] == ("DATT, the paper's", "(4)", "(5)", "(6)")
-    assert section.rows[1][1] == f"{found[0]['unshifted_m']:.3f}; {found[0]['cross_track_m']:.3f}"
-    assert found[0]["unshifted_m"] <= found[0]["mean"] + 1e-9
+    assert section.rows[1][1] == f"{result[0]['unshifted_m']:.3f}; {result[0]['cross_track_m']:.3f}"
+    assert result[0]["unshifted_m"] <= result[0]["mean"] + 1e-9
     assert section.picture == tmp_path / "x.png"
     assert figures.title == "circle: large, 2 m/s² per axis"
     assert [row[0] for row in figures.rows] == ["base policy", "INDI"]
@@ -115,25 +115,25 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
 
     def table(*sections, starts=1):
         """Fly, and return the plants that were flown, and the table."""
-        done.flown.clear()
+        done.flights.clear()
         document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
         fly_levels(document, sections, starts=starts, seconds=1.0)
-        made = document.sections, results(tmp_path, "table.json")["rows"]
-        return [scenarios[0].plant for _, scenarios, *_ in done.flown], made
+        setup = document.sections, results(tmp_path, "table.json")["rows"]
+        return [scenarios[0].plant for _, scenarios, *_ in done.flights], setup
 
-    flown, (killed, rows) = table(one)
-    assert flown == ["simple"]
-    flown, whole = table(one, two)
-    assert flown == ["bem"]
-    assert (whole[0][: len(killed)], whole[1][: len(rows)]) == (killed, rows)
+    flight, (kill, rows) = table(one)
+    assert flight == ["simple"]
+    flight, whole = table(one, two)
+    assert flight == ["bem"]
+    assert (whole[0][: len(kill)], whole[1][: len(rows)]) == (kill, rows)
     unfinished = tmp_path / FLIGHTS / "of_another_section.npz"
     unfinished.parent.mkdir()
     unfinished.touch()
     assert table(one, two) == ([], whole)
     assert unfinished.exists()  # a reused section leaves the flights of an unfinished one
     assert "An earlier run had made 2 of the parts" in (tmp_path / "table.md").read_text()
-    flown, other = table(one, two, starts=2)
-    assert flown == ["simple", "bem"]
+    flight, other = table(one, two, starts=2)
+    assert flight == ["simple", "bem"]
     assert not unfinished.exists()
     assert other != whole
     (tmp_path / "x1.png").write_bytes(b"what another table of this folder drew")
@@ -144,15 +144,15 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
 
 def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, monkeypatch):
     base = Levels("title", brief_preset(), Scenario(plant="simple"), "x", ("indi", "datt"))
-    asked = []
-    monkeypatch.setattr(levels, "_fly_section", lambda *a, **k: asked.append(0) or (TableSection((), ()), []))
+    calls = []
+    monkeypatch.setattr(levels, "_fly_section", lambda *a, **k: calls.append(0) or (TableSection((), ()), []))
     monkeypatch.setattr(levels, "figures_table", lambda *_: TableSection((), ()))
 
     def fly(section=base, *, seeds=(0,), starts=1, seconds=1.0, datt_steps=1):
-        asked.clear()
+        calls.clear()
         document = Document(Run("test", tmp_path), "table", "Title", "Intro.", list(seeds), Silent())
         fly_levels(document, [section], starts=starts, seconds=seconds, datt_steps=datt_steps)
-        return len(asked)
+        return len(calls)
 
     assert [fly(), fly()] == [1, 0]
     sections = [
@@ -187,9 +187,9 @@ def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypa
 def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
     preset, watching = brief_preset(), Watching()
     study = Study(preset, {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}, ())
-    flown = fly_all(study, [Scenario(plant="simple")], Run("test", tmp_path), watching,
+    flight = fly_all(study, [Scenario(plant="simple")], Run("test", tmp_path), watching,
                     methods=("indi",), starts=2, seconds=1.0)  # fmt: skip
-    assert len(flown.flown) == 2
+    assert len(flight.flights) == 2
     assert (watching.shares[0], watching.shares[-1]) == (0.0, 1.0)
     assert watching.shares == sorted(watching.shares)
 
@@ -231,9 +231,9 @@ def small_datt(monkeypatch):
 @pytest.mark.usefixtures("small_datt")
 def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     """Of a seed and a vehicle; a file that is damaged, or made by code that has changed, is made again."""
-    said = []
+    text = []
     reporter = Silent()
-    reporter.say = said.append
+    reporter.say = text.append
     run, preset = Run("test", tmp_path), load("hover/retrim")
     first = rivals.train_datt(preset, [0, 1], run, reporter, steps=1)
     again = rivals.train_datt(preset, [0], run, reporter, steps=1)
@@ -242,7 +242,7 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
     (file,) = tmp_path.glob("datt_*_seed0.safetensors")
     file.write_bytes(file.read_bytes()[:-100])
     other = rivals.train_datt(preset, [0], run, reporter, steps=1)
-    assert "made again" in said[0]
+    assert "made again" in text[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
     monkeypatch.setattr(provenance, "code", lambda: "changed")
     rivals.train_datt(preset, [0], run, reporter, steps=1)
@@ -254,37 +254,37 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("small_datt")
 def test_a_training_of_datt_that_is_cut_goes_on_where_it_was(tmp_path):
     """To the same network, to the bit; also where its state cannot be read, when it begins anew."""
-    preset, size, said = load("hover/retrim"), rivals.DATT_PPO["envs"] * rivals.DATT_PPO["steps"], []
+    preset, size, text = load("hover/retrim"), rivals.DATT_PPO["envs"] * rivals.DATT_PPO["steps"], []
 
     def train(name, stops_at=2.0):
         run = Run("test", tmp_path / name)
         watching = Watching(lambda share: share > stops_at and run.stop.set())
-        watching.say = said.append
+        watching.say = text.append
         nets = rivals.train_datt(preset, [0], run, watching, steps=4 * size)
         return nets, [round(4 * share) for share in watching.shares]
 
     (whole, shares), (nothing, first) = train("whole"), train("cut", stops_at=0.4)
     assert (shares, nothing, first) == ([1, 2, 3, 4], {}, [1, 2])
     (partly,) = (tmp_path / "cut").glob("datt_*_state.safetensors")
-    kept = partly.read_bytes()
+    store = partly.read_bytes()
     again, rest = train("cut")
-    assert (rest, said) == ([3, 4], ["DATT, seed 0: goes on after 2 of 4 updates"])
+    assert (rest, text) == ([3, 4], ["DATT, seed 0: goes on after 2 of 4 updates"])
     assert not partly.exists()
-    (made,) = (tmp_path / "cut").glob("datt_*")
-    made.unlink()
-    partly.write_bytes(kept[:-50])
+    (setup,) = (tmp_path / "cut").glob("datt_*")
+    setup.unlink()
+    partly.write_bytes(store[:-50])
     afresh, shares = train("cut")
-    assert (shares, "made again" in said[1]) == ([1, 2, 3, 4], True)
+    assert (shares, "made again" in text[1]) == ([1, 2, 3, 4], True)
     for other in (again, afresh):
         jax.tree.map(np.testing.assert_array_equal, *(eqx.filter(n[0], eqx.is_array) for n in (whole, other)))
 
 
 def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_path, monkeypatch):
     """Another of these is another file; what is learnt goes on from update to update."""
-    preset, watching, asked = load("hover/retrim"), Watching(), []
+    preset, watching, calls = load("hover/retrim"), Watching(), []
 
     def ppo(problem, state, settings, *, steps):
-        asked.append((problem, tuple(jax.random.key_data(state.key).tolist()), steps))
+        calls.append((problem, tuple(jax.random.key_data(state.key).tolist()), steps))
         for i in range(settings.updates(steps)):
             net = jax.tree.map(lambda leaf: leaf + 1.0 if eqx.is_array(leaf) else leaf, state.net)
             state = dataclasses.replace(state, net=net, made=state.made + 1)
@@ -300,9 +300,9 @@ def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_
         return rivals.train_datt(preset, seeds, Run("test", tmp_path), watching, steps=steps)
 
     nets = train(seeds=(0, 3))
-    assert [said for _, *said in watching.told] == [[0.5, "reward 0.000"], [1.0, "reward 1.000"]] * 2
-    assert [steps for *_, steps in asked] == [2 * size] * 2
-    assert asked[0][1] != asked[1][1]
+    assert [text for _, *text in watching.messages] == [[0.5, "reward 0.000"], [1.0, "reward 1.000"]] * 2
+    assert [steps for *_, steps in calls] == [2 * size] * 2
+    assert calls[0][1] != calls[1][1]
     assert any(np.any(a != b) for a, b in zip(weights(nets[0]), weights(nets[3]), strict=True))
     others = changed(preset, vehicle="large"), changed(preset, dt=0.01), changed(preset, actuator_tau=0.2)
     for other in others:
@@ -310,11 +310,11 @@ def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_
     train(steps=size)
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 5
     assert len(list(tmp_path.glob("datt_*_seed3.safetensors"))) == 1
-    np.testing.assert_array_equal(asked[2][0].high.c, Setup.from_preset(others[0]).vehicle.command_max.c)
-    assert asked[3][0].dt == 0.01
-    before = len(asked)
+    np.testing.assert_array_equal(calls[2][0].high.c, Setup.from_preset(others[0]).vehicle.command_max.c)
+    assert calls[3][0].dt == 0.01
+    before = len(calls)
     again = train(seeds=(0, 3))
-    assert len(asked) == before
+    assert len(calls) == before
     for one, other in zip(weights(again[3]), weights(nets[3]), strict=True):
         np.testing.assert_array_equal(one, other)
     assert rivals.rounded_steps(1) == size
@@ -344,12 +344,12 @@ def test_a_table_of_fast_flight_flies_a_file_too(tmp_path, monkeypatch):
     assert setup.limits_exceeded() is None
     speeds = np.linalg.norm(at(setup.flight_task.reference, np.linspace(3.0, 10.0, 50)).v, axis=1)
     assert 8.0 < max(speeds) < 12.0
-    monkeypatch.setattr(levels, "train_all", untrained)
+    monkeypatch.setattr(levels, "train_all", make_untrained)
     section = dataclasses.replace(fast._section(preset, str(line), "simple", ("base",)), stem="race")
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [section], starts=1, seconds=1.0)
-    found = results(tmp_path, "table.json")["rows"]
-    assert [(row["disturbance"], row["vehicle"]) for row in found] == [
+    result = results(tmp_path, "table.json")["rows"]
+    assert [(row["disturbance"], row["vehicle"]) for row in result] == [
         (level, "kingfisher") for level in ("none", "wind=4", "large")
     ]
     assert document.sections[0].columns[2] == "wind of 4 m/s"
@@ -360,7 +360,7 @@ def test_an_interrupted_table_flies_nothing_more(tmp_path):
     run.stop.set()
     assert train_all(tiny_preset(), [0, 1], run, Silent()).policies == {}
     nothing = fly_all(Study(tiny_preset(), {0: "policy"}, ()), [Scenario()], run, Silent(), starts=1, seconds=1.0)
-    assert (nothing.flown, nothing.interrupted) == ([], True)
+    assert (nothing.flights, nothing.interrupted) == ([], True)
     document = Document(run, "table", "Title", "Intro.", [0], Silent())
     fly_levels(document, [Levels("", tiny_preset(), Scenario(), "x")] * 2, starts=1, seconds=1.0)
     assert document.sections == []
@@ -382,8 +382,8 @@ def test_every_section_is_written_when_it_is_added(tmp_path):
     document.add(TableSection(("a", "b"), (("1", "2"),), "First", "About it."), [{"x": 1}])
     assert "## First\n\nAbout it.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n" in (tmp_path / "table.md").read_text()
     document.add(TableSection((), (), "Second", "Left out."), [{"x": 2}])
-    found = results(tmp_path, "table.json")
-    assert (found["rows"], found["seeds"], found["more"]) == ([{"x": 1}, {"x": 2}], [0, 4], 1)
+    result = results(tmp_path, "table.json")
+    assert (result["rows"], result["seeds"], result["more"]) == ([{"x": 1}, {"x": 2}], [0, 4], 1)
     assert (tmp_path / "table.md").read_text().count("| a | b |") == 1
     assert document.run.pages == [tmp_path / "table.md"]
 
@@ -405,16 +405,16 @@ def test_errors_are_read_around_reversals_and_updates(tmp_path):
     assert updates == [1, 2, 3]
     np.testing.assert_allclose(moments, [[15, 16, 21, 26, 30], [30, 31, 36, 41, 45], [45, 46, 51, 56, 60]])
     t = DT * np.arange(3001)
-    ramp = dataclasses.replace(flight(t, flown=log(t=t)))
+    ramp = dataclasses.replace(flight(t, flight=log(t=t)))
     # fifty ticks, that of the moment last
     np.testing.assert_allclose(_errors(ramp, moments), moments - 0.49, atol=1e-9)
     errors = {method: [] for method in METHODS} | {"full": [_errors(ramp, moments)] * 2}
     section = _section(errors, moments, updates, "", tmp_path / "x.png")
     assert len(section.rows) == 3 * len(METHODS)
     assert section.rows[0] == ("reversed at 15 s, base policy", *["-"] * 5)
-    (adapted,) = [row for row in section.rows if row[0] == "reversed at 15 s, **adapted**"]
-    assert adapted[1:3] == ("14.510 ± 0.000", "15.510 ± 0.000")
-    assert len(section.columns) == len(adapted)
+    (adapted_policy,) = [row for row in section.rows if row[0] == "reversed at 15 s, **adapted**"]
+    assert adapted_policy[1:3] == ("14.510 ± 0.000", "15.510 ± 0.000")
+    assert len(section.columns) == len(adapted_policy)
     often, updates = _moments(Adapt(update_every=0.5, update_latency=0.1), 60.0)
     assert updates == [1, 2, 4, 8, 16, 30]
     np.testing.assert_allclose(often[0], [15, 15.1, 15.6, 16.1, 17.1, 19.1, 23.1, 30])
@@ -425,39 +425,37 @@ def test_errors_are_read_around_reversals_and_updates(tmp_path):
 def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
     """Plant, methods, seeds, starts, length: nothing is lost between an option and a flight."""
     table = importlib.import_module(f"{TABLES}.{name}")
-    planned = []
-    monkeypatch.setattr(
-        table, "fly_levels", lambda document, sections, **how: planned.append((document, sections, how))
-    )
-    asked = {"methods": ("indi",), "seeds": (3, 4), "starts": 2, "seconds": 7.0}
-    made = getattr(table, name)
-    options = inspect.signature(made).parameters
-    asked |= {key: value for key, value in (("plant", "simple"), ("datt_steps", 5)) if key in options}
-    made(Run("test", tmp_path), Silent(), **asked)
-    assert planned
-    for document, sections, how in planned:
+    plan = []
+    monkeypatch.setattr(table, "fly_levels", lambda document, sections, **how: plan.append((document, sections, how)))
+    calls = {"methods": ("indi",), "seeds": (3, 4), "starts": 2, "seconds": 7.0}
+    setup = getattr(table, name)
+    options = inspect.signature(setup).parameters
+    calls |= {key: value for key, value in (("plant", "simple"), ("datt_steps", 5)) if key in options}
+    setup(Run("test", tmp_path), Silent(), **calls)
+    assert plan
+    for document, sections, how in plan:
         assert (document.name, tuple(document.seeds)) == (name, (3, 4))
-        assert how == {key: asked[key] for key in ("starts", "seconds", "datt_steps") if key in asked}
+        assert how == {key: calls[key] for key in ("starts", "seconds", "datt_steps") if key in calls}
         assert sections
         assert len({section.stem for section in sections}) == len(sections)  # no picture is written over
         for section in sections:
-            assert {scenario.plant for scenario in section.scenarios} == {asked.get("plant", "bem")}
+            assert {scenario.plant for scenario in section.scenarios} == {calls.get("plant", "bem")}
             assert tuple(section.methods) in (("indi",), ())
         assert any(section.methods for section in sections)
 
 
 def test_raptor_flies_beside_policies_that_were_trained_for_its_vehicles(tmp_path, monkeypatch):
-    table, planned = importlib.import_module(f"{TABLES}.raptor"), []
-    monkeypatch.setattr(table, "fly_levels", lambda document, sections, **how: planned.extend(sections))
+    table, plan = importlib.import_module(f"{TABLES}.raptor"), []
+    monkeypatch.setattr(table, "fly_levels", lambda document, sections, **how: plan.extend(sections))
     table.raptor(Run("test", tmp_path), Silent(), vehicles=("kingfisher", "large"))
-    assert [(s.preset.vehicle, s.preset.task, s.scenario.reference) for s in planned] == [
+    assert [(s.preset.vehicle, s.preset.task, s.scenario.reference) for s in plan] == [
         (vehicle, task, reference)
         for vehicle in ("kingfisher", "large") for task, reference in (("hover", None), ("track", "figure8"))
     ]  # fmt: skip
-    for section in planned:
+    for section in plan:
         assert tuple(section.methods) == table.METHODS
         assert section.levels == table.DISTURBED
-        assert section.drawn == ("raptor", "full")
+        assert section.drawn_methods == ("raptor", "full")
         assert section.title.endswith(section.preset.vehicle)
 
 
@@ -478,7 +476,7 @@ def test_many_machines_are_limited_by_flying_then_by_the_network_then_by_the_sch
     assert {time for _, time, _ in network} == {f"{(1e6 + 60) / 86_400:.1f} days"}
     scheduler = longest(run_s=1e-9, size=0)
     assert {what for _, _, what in scheduler} == {"the scheduler"}
-    assert {time for _, time, _ in scheduler} == {f"{60 + 1e6 / LOT * scaling.JOB_S:.0f} s"}
+    assert {time for _, time, _ in scheduler} == {f"{60 + 1e6 / FULL * scaling.JOB_S:.0f} s"}
     first, *others = longest(run_s=1.1, size=scaling.LINK / 1000)
     assert first[2] == "flying"
     assert {what for *_, what in others} == {"the client's network"}

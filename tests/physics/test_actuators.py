@@ -6,25 +6,25 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, first_order, random_command, random_state, replaced, residual_targets, stacked
+from helpers import GOAL, first_order, random_command, random_state, replace_fields, residual_targets, stack_trees
 from retrim.learn import Window
-from retrim.physics import ActuatorState, Command, Hybrid, Lagged, PointMass, State, StraightThrough, f_a, so3
+from retrim.physics import ActuatorState, Command, Hybrid, LaggedModel, PointMass, State, StraightThrough, f_a, so3
 from retrim.physics.actuators import LagState
 
 TAU, DT = 0.033, 0.02
 STILL = jnp.zeros(3)
 
 
-def lagged(tau=TAU):
-    return Lagged(PointMass(DT), first_order(tau))
+def lag_model(tau=TAU):
+    return LaggedModel(PointMass(DT), first_order(tau))
 
 
 def commands(key, n):
-    return stacked([random_command(k) for k in random.split(key, n)])
+    return stack_trees([random_command(k) for k in random.split(key, n)])
 
 
 @jax.jit
-def flown(model, s, us):
+def fly_once(model, s, us):
     """All states of the model, the first included."""
 
     def tick(s, u):
@@ -36,29 +36,27 @@ def flown(model, s, us):
 
 def test_without_lag_it_is_the_base_model(key):
     x, us = random_state(key), commands(key, 10)
-    plain, quick = flown(PointMass(DT), x, us), flown(lagged(1e-9), lagged(1e-9).init(x), us)
+    plain, quick = fly_once(PointMass(DT), x, us), fly_once(lag_model(1e-9), lag_model(1e-9).init(x), us)
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(quick.inner), strict=True):
         np.testing.assert_allclose(b, a, atol=1e-5)
-    slow = flown(lagged(), lagged().init(x), us)
+    slow = fly_once(lag_model(), lag_model().init(x), us)
     assert float(jnp.abs(slow.inner.v - plain.v).max()) > 0.01
 
 
 @pytest.mark.parametrize("tau", [0.01, 0.033, 0.2])
 def test_step_response_is_exact_at_every_tick(tau):
     u = Command(jnp.array(12.0), jnp.array([1.0, -2.0, 0.5]))
-    held = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (20, *leaf.shape)), u)
-    states = flown(lagged(tau), lagged(tau).init(State.at(jnp.array(GOAL))), held)
-    risen = 1.0 - np.exp(-DT * np.arange(21) / tau)
-    np.testing.assert_allclose(states.actuators.command.c - 9.81, risen * (12.0 - 9.81), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(
-        states.actuators.command.omega, risen[:, None] * np.array([[1.0, -2.0, 0.5]]), rtol=1e-12
-    )
+    hold = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (20, *leaf.shape)), u)
+    states = fly_once(lag_model(tau), lag_model(tau).init(State.at(jnp.array(GOAL))), hold)
+    rise = 1.0 - np.exp(-DT * np.arange(21) / tau)
+    np.testing.assert_allclose(states.actuators.command.c - 9.81, rise * (12.0 - 9.81), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(states.actuators.command.omega, rise[:, None] * np.array([[1.0, -2.0, 0.5]]), rtol=1e-12)
 
 
 def test_hover_is_an_equilibrium():
     x = State.at(jnp.array(GOAL))
     still = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (50, *leaf.shape)), Command.hover())
-    states = flown(lagged(), lagged().init(x), still)
+    states = fly_once(lag_model(), lag_model().init(x), still)
     np.testing.assert_allclose(states.inner.p, np.broadcast_to(GOAL, (51, 3)), atol=1e-12)
     np.testing.assert_allclose(states.inner.v, 0.0, atol=1e-12)
 
@@ -66,47 +64,47 @@ def test_hover_is_an_equilibrium():
 def fine(x, us, tau, h=1e-3):
     """Eq. (1) under a command that creeps towards ``us``, in steps of 1 ms: midpoint in time."""
     acting, states = Command.hover().vector(), [x]
-    base, wanted = PointMass(h), np.stack([np.append(c, w) for c, w in zip(us.c, us.omega, strict=True)])
+    base, expected = PointMass(h), np.stack([np.append(c, w) for c, w in zip(us.c, us.omega, strict=True)])
     step = jax.jit(base.step)
-    for target in wanted:
+    for target in expected:
         for i in range(round(DT / h)):
             now = target + np.exp(-(i + 0.5) * h / tau) * (acting - target)
             x = step(x, Command.of(jnp.asarray(now)), STILL)
         acting = target + np.exp(-DT / tau) * (acting - target)
         states.append(x)
-    return stacked(states)
+    return stack_trees(states)
 
 
 def test_thrust_over_a_tick_is_its_mean(key):
     """Without turning, velocity is exact: only the integral of thrust counts."""
     us = jax.tree.map(lambda leaf: leaf if leaf.ndim == 1 else jnp.zeros_like(leaf), commands(key, 8))
     x = random_state(key)
-    found, true = flown(lagged(), lagged().init(x), us).inner, fine(x, us, TAU)
-    np.testing.assert_allclose(found.v, true.v, atol=1e-4)  # the error of 1 ms steps
-    np.testing.assert_allclose(found.p, true.p, atol=1e-3)
-    end_only = flown(PointMass(DT), x, us)
+    result, true = fly_once(lag_model(), lag_model().init(x), us).inner, fine(x, us, TAU)
+    np.testing.assert_allclose(result.v, true.v, atol=1e-4)  # the error of 1 ms steps
+    np.testing.assert_allclose(result.p, true.p, atol=1e-3)
+    end_only = fly_once(PointMass(DT), x, us)
     assert float(jnp.abs(end_only.v - true.v).max()) > 0.01
 
 
 def test_close_to_fine_steps_while_turning(key):
     us, x = commands(key, 8), random_state(key)
-    found, true = flown(lagged(), lagged().init(x), us).inner, fine(x, us, TAU)
-    assert float(jnp.abs(found.v - true.v).max()) < 0.02
-    np.testing.assert_allclose(found.R, true.R, atol=0.01)
-    assert float(jnp.abs(flown(PointMass(DT), x, us).R - true.R).max()) > 0.02
+    result, true = fly_once(lag_model(), lag_model().init(x), us).inner, fine(x, us, TAU)
+    assert float(jnp.abs(result.v - true.v).max()) < 0.02
+    np.testing.assert_allclose(result.R, true.R, atol=0.01)
+    assert float(jnp.abs(fly_once(PointMass(DT), x, us).R - true.R).max()) > 0.02
 
 
 def test_external_acceleration_is_not_delayed():
     x = State.at(jnp.array(GOAL))
-    pushed = lagged().step(lagged().init(x), Command.hover(), jnp.array([2.0, 0.0, 0.0]))
-    np.testing.assert_allclose(pushed.inner.v, [0.04, 0.0, 0.0], atol=1e-12)
+    with_push = lag_model().step(lag_model().init(x), Command.hover(), jnp.array([2.0, 0.0, 0.0]))
+    np.testing.assert_allclose(with_push.inner.v, [0.04, 0.0, 0.0], atol=1e-12)
 
 
 def test_what_is_hidden_stays(key):
     s = LagState(random_state(key), ActuatorState.at(random_command(key)))
-    after = lagged().with_state(s, State.at(jnp.array(GOAL)))
+    after = lag_model().with_state(s, State.at(jnp.array(GOAL)))
     jax.tree.map(np.testing.assert_array_equal, after.actuators, s.actuators)
-    np.testing.assert_array_equal(lagged().state(after).p, GOAL)
+    np.testing.assert_array_equal(lag_model().state(after).p, GOAL)
 
 
 def test_gradients_against_finite_differences(key):
@@ -117,7 +115,7 @@ def test_gradients_against_finite_differences(key):
 
     def mixture(what):
         x, us, tau = what
-        model, s = Lagged(PointMass(DT), first_order(tau)), None
+        model, s = LaggedModel(PointMass(DT), first_order(tau)), None
         s = model.init(x)
         for k in range(3):
             s = model.step(s, jax.tree.map(lambda leaf, k=k: leaf[k], us), STILL)
@@ -140,13 +138,13 @@ def test_wraps_and_is_wrapped(key):
     """A residual around it acts at once; behind a straight-through estimator its lag is kept."""
     push = lambda x, u: jnp.array([1.0, 0.0, 0.0])  # noqa: E731
     x, u = State.at(jnp.array(GOAL)), Command(jnp.array(15.0), jnp.zeros(3))
-    model = Hybrid(lagged(), push)
+    model = Hybrid(lag_model(), push)
     s = model.step(model.init(x), u, STILL)
     assert float(s.inner.v[0]) == pytest.approx(0.02, rel=1e-9)
     through = StraightThrough(model, PointMass(DT))
     t = through.step(through.init(x), u, STILL)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), t, s)
-    gain = jax.jit(jax.jacobian(lambda c: through.step(through.init(x), replaced(u, c=c), STILL).inner.v[2]))(u.c)
+    gain = jax.jit(jax.jacobian(lambda c: through.step(through.init(x), replace_fields(u, c=c), STILL).inner.v[2]))(u.c)
     assert float(gain) == pytest.approx(DT)  # of the model behind, which has no lag
 
 
@@ -155,16 +153,18 @@ def test_wraps_and_is_wrapped(key):
 
 def window(key, n, delay):
     """A flight that the lagged model made; commands act ``delay`` ticks after they were issued."""
-    issued = commands(key, n)
-    acting = stacked([Command.hover()] * delay + [jax.tree.map(lambda l, k=k: l[k], issued) for k in range(n - delay)])
-    states = flown(lagged(), lagged().init(State.at(jnp.array(GOAL))), acting).inner
+    issued_commands = commands(key, n)
+    acting = stack_trees(
+        [Command.hover()] * delay + [jax.tree.map(lambda l, k=k: l[k], issued_commands) for k in range(n - delay)]
+    )
+    states = fly_once(lag_model(), lag_model().init(State.at(jnp.array(GOAL))), acting).inner
     x = jax.tree.map(lambda leaf: leaf[:n], states)
-    return Window(jnp.asarray(DT * np.arange(n)), x, issued, jnp.ones(n, dtype=bool))
+    return Window(jnp.asarray(DT * np.arange(n)), x, issued_commands, jnp.ones(n, dtype=bool))
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_a_lagged_flight_leaves_no_residual(delay, key):
-    rows = residual_targets(window(key, 40, delay), lagged(), delay_ticks=delay)
+    rows = residual_targets(window(key, 40, delay), lag_model(), delay_ticks=delay)
     np.testing.assert_allclose(rows.a_res, 0.0, atol=1e-10)
     unaware = residual_targets(window(key, 40, delay), PointMass(DT), delay_ticks=delay)
     assert float(jnp.abs(unaware.a_res).max()) > 0.3
@@ -173,7 +173,7 @@ def test_a_lagged_flight_leaves_no_residual(delay, key):
 def test_a_window_from_mid_flight_settles(key):
     """What acts at its first tick is not known; the mistake dies with the lag: 4 % after five ticks."""
     late = jax.tree.map(lambda leaf: leaf[23:], window(key, 80, 1))
-    away = np.linalg.norm(residual_targets(late, lagged(), delay_ticks=1).a_res, axis=1)
+    away = np.linalg.norm(residual_targets(late, lag_model(), delay_ticks=1).a_res, axis=1)
     assert away[0] > 0.05
     assert away[5:].max() < 0.1
     assert away[35:].max() < 1e-6
@@ -182,9 +182,9 @@ def test_a_window_from_mid_flight_settles(key):
 def test_a_filling_window_settles_too(key):
     """In front the oldest tick is repeated, invalid; soon after take-off nothing is left of that."""
     whole = window(key, 60, 1)
-    padded = jax.tree.map(lambda leaf: jnp.concatenate([jnp.repeat(leaf[:1], 20, axis=0), leaf]), whole)
-    padded = replaced(padded, valid=jnp.arange(80) >= 20)
-    rows = residual_targets(padded, lagged(), delay_ticks=1)
+    padding = jax.tree.map(lambda leaf: jnp.concatenate([jnp.repeat(leaf[:1], 20, axis=0), leaf]), whole)
+    padding = replace_fields(padding, valid=jnp.arange(80) >= 20)
+    rows = residual_targets(padding, lag_model(), delay_ticks=1)
     away = np.linalg.norm(rows.a_res, axis=1)
     assert away[27:].max() < 0.1
     assert away[57:].max() < 1e-6
@@ -193,7 +193,7 @@ def test_a_filling_window_settles_too(key):
 def test_rates_lag_as_thrust_does():
     """R after a tick of a roll command: the mean rate, exactly, since the axis stays."""
     u = Command(jnp.array(9.81), jnp.array([2.0, 0.0, 0.0]))
-    s = lagged().step(lagged().init(State.at(jnp.array(GOAL))), u, STILL)
-    turned = 2.0 * (DT - TAU * (1.0 - np.exp(-DT / TAU)))
-    np.testing.assert_allclose(so3.log(s.inner.R), [turned, 0.0, 0.0], atol=1e-12)
+    s = lag_model().step(lag_model().init(State.at(jnp.array(GOAL))), u, STILL)
+    rotation = 2.0 * (DT - TAU * (1.0 - np.exp(-DT / TAU)))
+    np.testing.assert_allclose(so3.log(s.inner.R), [rotation, 0.0, 0.0], atol=1e-12)
     assert float(f_a(s.inner, u, STILL).v[1]) < 0.0  # rolled to the right: -y

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import random_command, random_state, replaced
+from helpers import random_command, random_state, replace_fields
 from retrim.physics import (
     BemQuadrotor,
     Command,
@@ -44,17 +44,17 @@ def bem(request):
     return strong(BemQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0))
 
 
-def effects(**given):
-    return ExternalEffects.of(jnp.dtype(float), **strong(given))
+def effects(**argument):
+    return ExternalEffects.of(jnp.dtype(float), **strong(argument))
 
 
 def command(c=G, omega=ZERO):
     return Command(*strong((c, omega)))
 
 
-def state(v=ZERO, turned=ZERO):
-    p, turned, v = strong((ZERO, turned, v))
-    return State(p, so3.exp(turned), v)
+def state(v=ZERO, rotation=ZERO):
+    p, rotation, v = strong((ZERO, rotation, v))
+    return State(p, so3.exp(rotation), v)
 
 
 def body(x, motors, omega=ZERO):
@@ -85,14 +85,14 @@ def at(path, ms):
 def loads(model, b, motors, effects):
     """Steady loads at rotor speeds ``motors``, and what the blades give."""
     above = jax.tree.map(lambda leaf: jnp.full(4, leaf), Inflow.above(motors.dtype))
-    settled = lax.fori_loop(0, 9, lambda _, inflow: model.rotors(b, motors, inflow, effects.wind)[1], above)
-    blades, _ = model.rotors(b, motors, settled, effects.wind)
+    has_settled = lax.fori_loop(0, 9, lambda _, inflow: model.rotors(b, motors, inflow, effects.wind)[1], above)
+    blades, _ = model.rotors(b, motors, has_settled, effects.wind)
     return model.loads(b, motors, blades, effects), blades
 
 
-def hovering(model, x=None, **given):
+def hovering(model, x=None, **argument):
     motors = start(model, state()).body.motors
-    return loads(model, body(x or state(), motors), motors, effects(**given))[0]
+    return loads(model, body(x or state(), motors), motors, effects(**argument))[0]
 
 
 # ---- balance
@@ -119,26 +119,26 @@ def test_mirror_symmetry(bem, key):
     """Left and right are the same: mirror start, command and wind in y, and the flight is mirrored."""
     M = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
     x, u, wind = random_state(key, 0.3), random_command(key), jnp.array([1.0, 2.0, 0.5])
-    mirrored = jax.jit(lambda x: State(M @ x.p, M @ x.R @ M, M @ x.v))(x)
+    mirror = jax.jit(lambda x: State(M @ x.p, M @ x.R @ M, M @ x.v))(x)
     s = at(path(bem, start(bem, x), u, effects(wind=wind)), 300).body.x
-    t = at(path(bem, start(bem, mirrored), Command(u.c, -M @ u.omega), effects(wind=M @ wind)), 300).body.x
+    t = at(path(bem, start(bem, mirror), Command(u.c, -M @ u.omega), effects(wind=M @ wind)), 300).body.x
     np.testing.assert_allclose(t.p, M @ s.p, atol=1e-10)
     np.testing.assert_allclose(t.R, M @ s.R @ M, atol=1e-10)
 
 
 def test_only_the_motion_through_the_air_counts(bem):
-    v, turned = jnp.array([2.0, -1.0, 0.5]), [0.1, 0.2, 0.3]
+    v, rotation = jnp.array([2.0, -1.0, 0.5]), [0.1, 0.2, 0.3]
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12),
-        hovering(bem, state(v, turned)),
-        hovering(bem, state(ZERO, turned), wind=-v),
+        hovering(bem, state(v, rotation)),
+        hovering(bem, state(ZERO, rotation), wind=-v),
     )
-    u, s = command(10.0, [1.0, 0.5, -0.5]), start(bem, state(v, turned))
+    u, s = command(10.0, [1.0, 0.5, -0.5]), start(bem, state(v, rotation))
     flying = path(bem, s, u, effects()).body.x
-    held = path(bem, bem.with_state(s, state(ZERO, turned)), u, effects(wind=-v)).body.x
+    hold = path(bem, bem.with_state(s, state(ZERO, rotation)), u, effects(wind=-v)).body.x
     t = SUBSTEP * np.arange(1, 301)[:, None]
-    np.testing.assert_allclose(flying.p[:300] - held.p[:300], t * np.asarray(v), atol=1e-10)
-    np.testing.assert_allclose(flying.R[:300], held.R[:300], atol=1e-10)
+    np.testing.assert_allclose(flying.p[:300] - hold.p[:300], t * np.asarray(v), atol=1e-10)
+    np.testing.assert_allclose(flying.R[:300], hold.R[:300], atol=1e-10)
 
 
 def test_terminal_velocity(bem):
@@ -198,8 +198,8 @@ def test_commands_are_limited(bem):
     assert (p.motors >= vehicle.motor_min).all()
     assert jnp.abs(p.omega[:, 0]).max() < 1.5 * vehicle.omega_max[0]
     full = path(bem, start(bem, state()), command(1e4), effects()).body.motors[-1]
-    wanted = jnp.sqrt(vehicle.thrust_max / (4.0 * bem.loop.thrust_map))  # the small one's controllers end below it
-    np.testing.assert_allclose(full, min(wanted, vehicle.esc.speed(jnp.array(1.0))), rtol=1e-6)
+    expected = jnp.sqrt(vehicle.thrust_max / (4.0 * bem.loop.thrust_map))  # the small one's controllers end below it
+    np.testing.assert_allclose(full, min(expected, vehicle.esc.speed(jnp.array(1.0))), rtol=1e-6)
 
 
 @pytest.mark.parametrize("rotor", range(4))
@@ -215,8 +215,8 @@ def test_a_weak_rotor_lets_its_corner_sink(bem, rotor):
 def test_payload_slows_the_climb(bem):
     m, dm = float(bem.vehicle.mass), 0.07
     s = path(bem, start(bem, state()), command(15.0), effects())
-    gained = [path(bem, at(s, 20), command(15.0), effects(mass=k)).body.x.v[0] - s.body.x.v[19] for k in (0.0, dm)]
-    thrusts = [g[2] / SUBSTEP + G for g in gained]
+    gain = [path(bem, at(s, 20), command(15.0), effects(mass=k)).body.x.v[0] - s.body.x.v[19] for k in (0.0, dm)]
+    thrusts = [g[2] / SUBSTEP + G for g in gain]
     assert float(thrusts[1] / thrusts[0]) == pytest.approx(m / (m + dm), rel=1e-9)
 
 
@@ -224,7 +224,7 @@ def test_angular_momentum_is_kept(bem):
     """Rotors that give no force: gyroscopic torque and yaw reaction only pass momentum between body and rotors."""
     vehicle, yaw = bem.vehicle, jnp.array(SIGNS[2], dtype=float)
     none = BladeForces(*(jnp.zeros(4) for _ in range(3)))
-    still = replaced(bem, vehicle=replaced(vehicle, drag_area=1e-12 * jnp.ones(3)))
+    still = replace_fields(bem, vehicle=replace_fields(vehicle, drag_area=1e-12 * jnp.ones(3)))
 
     def momentum(b):
         rotors = -vehicle.rotor_inertia * jnp.sum(yaw * b.motors)  # the front-right one turns towards +z
@@ -261,14 +261,14 @@ def test_loads_may_be_held_over_a_millisecond(monkeypatch):
         u = Command(up[2], jnp.array([-8.0 * up[1], 8.0 * up[0], 0.0]) / jnp.linalg.norm(a))
         return lax.fori_loop(0, n, lambda _, s: model.substep(s, u, windy), s), x.p
 
-    def flown(n):
+    def fly_once(n):
         x0 = State(jnp.array([0.3, -0.3, 0.3]), jnp.eye(3), jnp.zeros(3))
         return jax.jit(lambda s: lax.scan(lambda s, i: tick(s, i, n=n), s, length=500)[1])(start(model, x0))
 
-    coarse = flown(20)
+    coarse = fly_once(20)
     for module in (bem_module, betaflight, highrate):
         monkeypatch.setattr(module, "SUBSTEP", 0.5e-3)
-    fine = flown(40)
+    fine = fly_once(40)
     assert jnp.abs(coarse[-1]).max() < 0.2  # it hovers
     assert 0.0 < jnp.abs(coarse - fine).max() < 1e-3
 
@@ -292,7 +292,7 @@ def test_gradients_over_the_envelope(bem, key):
         s, d = start(bem, x), 1e-5 * random.normal(k, (3,))
         _, (dx, du) = tick(bem, s, x, u, weights)
         high, low = (
-            tick(bem, s, replaced(x, v=x.v + e), Command(u.c + e[0], u.omega + e), weights)[0] for e in (d, -d)
+            tick(bem, s, replace_fields(x, v=x.v + e), Command(u.c + e[0], u.omega + e), weights)[0] for e in (d, -d)
         )
         slope = (dx.v + du.omega) @ d + du.c * d[0]
         assert float(high - low) / 2.0 == pytest.approx(float(slope), rel=1e-4, abs=1e-10)
@@ -313,8 +313,8 @@ def test_hybrid_and_straight_through(key):
     both = StraightThrough(Hybrid(model, lambda x, u: 2.0 * x.v), PointMass(0.02))
     value, gradient = jax.jit(lambda s: slope(both, s))(s)
     _, expected = jax.jit(lambda x: slope(both.backward, x))(x)
-    flown = at(path(model, s, u, effects(push=push + 2.0 * x.v)), 20)
-    assert float(value) == pytest.approx(float(weights @ flown.body.x.vector()), rel=1e-12)
+    flight = at(path(model, s, u, effects(push=push + 2.0 * x.v)), 20)
+    assert float(value) == pytest.approx(float(weights @ flight.body.x.vector()), rel=1e-12)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), gradient, expected)
 
 

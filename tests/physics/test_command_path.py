@@ -11,7 +11,7 @@ import pytest
 from jax import lax, random
 from scipy.linalg import expm
 
-from helpers import random_command, stacked
+from helpers import random_command, stack_trees
 from retrim.physics import ActuatorResponse, ActuatorState, Command, CommandPath, CommandQueue
 from retrim.physics.command_path import queue_length, whole_steps
 
@@ -21,7 +21,7 @@ REST = ActuatorState.at(Command(jnp.array(9.81), jnp.zeros(3)))
 
 
 def commands(key, n):
-    return stacked([random_command(k) for k in random.split(key, n)])
+    return stack_trees([random_command(k) for k in random.split(key, n)])
 
 
 @eqx.filter_jit
@@ -54,11 +54,11 @@ def step_response(response, times):
 def test_first_order_step(lag):
     times = np.linspace(0.0, 0.5, 26)
     total, s = step_response(ActuatorResponse.of(lag, lag), jnp.asarray(times))
-    risen = 1.0 - np.exp(-times / lag)
-    np.testing.assert_allclose(s.command.c, 9.81 + 2.19 * risen, rtol=1e-12)
-    np.testing.assert_allclose(s.command.omega, risen[:, None] * np.asarray(STEP.omega), rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(total.c, 12.0 * times - 2.19 * lag * risen, rtol=1e-12)
-    np.testing.assert_allclose(total.omega[:, 1], -2.0 * (times - lag * risen), rtol=1e-10, atol=1e-12)
+    rise = 1.0 - np.exp(-times / lag)
+    np.testing.assert_allclose(s.command.c, 9.81 + 2.19 * rise, rtol=1e-12)
+    np.testing.assert_allclose(s.command.omega, rise[:, None] * np.asarray(STEP.omega), rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(total.c, 12.0 * times - 2.19 * lag * rise, rtol=1e-12)
+    np.testing.assert_allclose(total.omega[:, 1], -2.0 * (times - lag * rise), rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("zeta", [0.4, 0.5, 0.7, 0.95, 0.999999, 1.0, 1.000001, 1.05, 1.2, 3.0])
@@ -99,8 +99,8 @@ def test_response_equals_the_matrix_exponential(h):
     state = ActuatorState(Command(jnp.array(8.0), jnp.array([0.4, -0.7, 0.2])), jnp.array([0.5, -1.0, 2.0]))
     total, end = advance(response, state, STEP, jnp.array(h))
     for axis in range(3):
-        found = (end.command.omega[axis], end.slope[axis], total.omega[axis])
-        np.testing.assert_allclose(found, exact(response, state, STEP, h, axis), rtol=1e-9, atol=1e-11)
+        result = (end.command.omega[axis], end.slope[axis], total.omega[axis])
+        np.testing.assert_allclose(result, exact(response, state, STEP, h, axis), rtol=1e-9, atol=1e-11)
 
 
 def test_first_order_is_the_limit_of_the_second():
@@ -157,9 +157,9 @@ def test_whole_ticks_are_the_queue_of_old(ticks, key):
         return queue, queue.arrival(path.delay, DT)
 
     start = CommandQueue.of(Command.hover(float), DT)
-    found = jax.jit(lambda us: lax.scan(tick, start, us)[1])(us).omega
+    result = jax.jit(lambda us: lax.scan(tick, start, us)[1])(us).omega
     expected = np.concatenate([np.zeros((ticks, 3)), us.omega])[:30]
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(result, expected)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -219,15 +219,15 @@ def mixture(path, us, start, weights):
 def test_gradients_against_finite_differences(kappa, key):
     """In commands, start, delay, lags, gains and damping; near the critical damping, too."""
     response = ActuatorResponse.of(0.05, jnp.array([0.03, 0.06, 0.2]), inverse_damping=kappa, thrust_gain=1.1)
-    given = (CommandPath.of(0.033, response), commands(key, 8), random_command(random.key(5)))
-    cost = jax.jit(lambda given: mixture(*given, jnp.array([0.7])))
-    slope = jax.grad(cost)(given)
-    leaves, shape = jax.tree.flatten(given)
+    argument = (CommandPath.of(0.033, response), commands(key, 8), random_command(random.key(5)))
+    cost = jax.jit(lambda argument: mixture(*argument, jnp.array([0.7])))
+    slope = jax.grad(cost)(argument)
+    leaves, shape = jax.tree.flatten(argument)
     for k in random.split(key, 5):
         way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
         way = shape.unflatten([0.02 * each for each in way])
         h = 1e-5
-        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, given, way)) for s in (h, -h))
+        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, argument, way)) for s in (h, -h))
         expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
         assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-5, abs=1e-8)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
@@ -240,10 +240,10 @@ def test_gradients_against_finite_differences(kappa, key):
 )
 def test_gradients_are_finite_at_the_edges(lag, kappa, delay, key):
     response = ActuatorResponse.of(lag, lag, inverse_damping=kappa)
-    given = (CommandPath.of(delay, response), commands(key, 5), Command.hover(float))
+    argument = (CommandPath.of(delay, response), commands(key, 5), Command.hover(float))
     for dtype in (jnp.float64, jnp.float32):
-        cast = jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), given)
-        slope = jax.jit(jax.grad(lambda given: mixture(*given, jnp.array([0.7], given[1].c.dtype))))(cast)
+        cast = jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), argument)
+        slope = jax.jit(jax.grad(lambda argument: mixture(*argument, jnp.array([0.7], argument[1].c.dtype))))(cast)
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
 
 
@@ -273,7 +273,7 @@ def test_a_batch_equals_its_members(key):
         CommandPath.of(delay, ActuatorResponse.of(0.03, lag, inverse_damping=kappa))
         for delay, lag, kappa in ((0.0, 0.02, 0.0), (0.05, 0.1, 1.0), (0.0333, 0.2, 2.5))
     ]
-    together = eqx.filter_jit(jax.vmap(lambda path: follow(path, us, Command.hover(float))))(stacked(paths))
+    together = eqx.filter_jit(jax.vmap(lambda path: follow(path, us, Command.hover(float))))(stack_trees(paths))
     for i, path in enumerate(paths):
         alone = follow(path, us, Command.hover(float))
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
@@ -285,8 +285,8 @@ def test_single_precision_is_close(key):
     path = CommandPath.of(0.047, ActuatorResponse.of(0.05, 0.08, inverse_damping=1.7))
     exactly = follow(path, us, Command.hover(float))
     low = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (path, us))
-    found = follow(*low, Command.hover(jnp.float32))
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(exactly), strict=True):
+    result = follow(*low, Command.hover(jnp.float32))
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(exactly), strict=True):
         assert a.dtype == jnp.float32
         np.testing.assert_allclose(a, b, atol=2e-5)
 

@@ -60,14 +60,14 @@ def test_all(name, double):
         disturbance = DISTURBANCES[name](random.key(1), None)
         assert isinstance(disturbance, Disturbance)
         times = [*np.arange(0.0, 12.0, 0.05), 100.0, 3600.0]  # a kick lasts a tenth of a second
-        found = over(disturbance, times, at(1.9 if name == "downwash" else 0.3, -0.2, 1.0))
+        result = over(disturbance, times, at(1.9 if name == "downwash" else 0.3, -0.2, 1.0))
         for field, shape in SHAPES.items():
-            value = getattr(found, field)
+            value = getattr(result, field)
             assert value.shape == (len(times), *shape)
             assert value.dtype == (jnp.float64 if double else jnp.float32)
             assert np.isfinite(value).all()
-        calm = ExternalEffects.calm(found.push.dtype)
-        quiet = jax.tree.map(lambda leaf, calm: bool((leaf == calm[None]).all()), found, calm)
+        calm = ExternalEffects.calm(result.push.dtype)
+        quiet = jax.tree.map(lambda leaf, calm: bool((leaf == calm[None]).all()), result, calm)
         assert all(jax.tree.leaves(quiet)) == (name == "none")
 
 
@@ -92,8 +92,8 @@ def test_together_adds_and_gains_multiply(key):
 
 def test_push_lifts_a_function(key):
     x = random_state(key)
-    found = Push(lambda t, x: t * x.v)(jnp.array(2.0), x)
-    same(found, ExternalEffects.of(x.p.dtype, push=2.0 * x.v))
+    result = Push(lambda t, x: t * x.v)(jnp.array(2.0), x)
+    same(result, ExternalEffects.of(x.p.dtype, push=2.0 * x.v))
 
 
 # ---- random walk
@@ -151,12 +151,12 @@ def test_turbulence_has_the_stated_variance_and_no_mean(turbulence, key):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_turbulence_has_drydens_spectra(turbulence, axis):
     """Energy below a frequency: of the sinusoids, and of the integrated spectrum (MIL-F-8785C)."""
-    l, found = L[axis] / V, np.asarray(turbulence.rate[:, axis])
+    l, result = L[axis] / V, np.asarray(turbulence.rate[:, axis])
     for limit in (0.3 / l, 1.0 / l, 3.0 / l, 10.0 / l):
         w = np.linspace(0.0, limit, 20_001)
         along = 2.0 * l / np.pi / (1.0 + (l * w) ** 2)
         across = l / np.pi * (1.0 + 3.0 * (l * w) ** 2) / (1.0 + (l * w) ** 2) ** 2
-        assert np.mean(found < limit) == pytest.approx(np.trapezoid(across if axis else along, w), abs=1.1 / 64)
+        assert np.mean(result < limit) == pytest.approx(np.trapezoid(across if axis else along, w), abs=1.1 / 64)
 
 
 def test_dryden_blows_along_its_mean(key):
@@ -177,9 +177,11 @@ def test_dryden_refuses(mean, altitude, key):
         Dryden.of(jnp.array(mean, dtype=float), key=key, altitude=altitude)
 
 
-def fan(key, **changed):
-    given = {"speed": 6.0, "width": 0.3, "intensity": 0.0, **changed}
-    return Fan.of(jnp.array([1.0, 2.0, 1.0]), jnp.array(given.pop("direction", (3.0, 4.0, 0.0))), key=key, **given)
+def fan(key, **changes):
+    argument = {"speed": 6.0, "width": 0.3, "intensity": 0.0, **changes}
+    return Fan.of(
+        jnp.array([1.0, 2.0, 1.0]), jnp.array(argument.pop("direction", (3.0, 4.0, 0.0))), key=key, **argument
+    )
 
 
 def jet(fan, along, off=0.0):
@@ -249,9 +251,9 @@ def test_payload_is_picked_up_and_dropped():
     mass = over(Payload.of(0.07, picked=8.0, dropped=20.0), [0.0, 7.99, 8.0, 19.99, 20.0]).mass
     np.testing.assert_allclose(mass, [0.0, 0.0, 0.07, 0.07, 0.0])
     assert float(over(Payload.of(0.07), [1e6]).mass[0]) == pytest.approx(0.07)  # never dropped
-    for mass, picked, dropped in ((0.0, 0.0, 1.0), (0.1, 2.0, 2.0), (0.1, 3.0, 1.0)):
+    for mass, pick_time, drop_time in ((0.0, 0.0, 1.0), (0.1, 2.0, 2.0), (0.1, 3.0, 1.0)):
         with pytest.raises(ValueError, match="Payload: mass = "):
-            Payload.of(mass, picked=picked, dropped=dropped)
+            Payload.of(mass, picked=pick_time, dropped=drop_time)
 
 
 @pytest.mark.parametrize("ahead", [0.05, -0.08])

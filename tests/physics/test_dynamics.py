@@ -25,7 +25,7 @@ from retrim.physics import (
 G = 9.81
 # One program each, instead of one for each operation.
 rate = jax.jit(f_a)
-stepped = eqx.filter_jit(lambda model, x, u, a_ext: model.step(x, u, a_ext))
+step = eqx.filter_jit(lambda model, x, u, a_ext: model.step(x, u, a_ext))
 
 
 def test_f_a_is_equation_1_in_numpy(key):
@@ -34,24 +34,24 @@ def test_f_a_is_equation_1_in_numpy(key):
         a_ext = np.array([0.5, -1.0, 2.0])
         R, w = np.asarray(x.R), np.asarray(u.omega)
         hat = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-        found = rate(x, u, jnp.asarray(a_ext))
-        np.testing.assert_allclose(found.p, x.v)
-        np.testing.assert_allclose(R @ np.asarray(so3.hat(found.omega)), R @ hat)
-        np.testing.assert_allclose(found.v, R @ [0, 0, float(u.c)] + [0, 0, -G] + a_ext, rtol=1e-14)
+        result = rate(x, u, jnp.asarray(a_ext))
+        np.testing.assert_allclose(result.p, x.v)
+        np.testing.assert_allclose(R @ np.asarray(so3.hat(result.omega)), R @ hat)
+        np.testing.assert_allclose(result.v, R @ [0, 0, float(u.c)] + [0, 0, -G] + a_ext, rtol=1e-14)
 
 
 @jax.jit
 def generic_rk4(x, u, a_ext, h):
     """Runge-Kutta 4 on the manifold, stage by stage; the model has it with equal stages merged."""
 
-    def moved(rate, h):
+    def move(rate, h):
         return State(x.p + h * rate.p, so3.mul(x.R, so3.exp(h * rate.omega)), x.v + h * rate.v)
 
     k1 = f_a(x, u, a_ext)
-    k2 = f_a(moved(k1, h / 2), u, a_ext)
-    k3 = f_a(moved(k2, h / 2), u, a_ext)
-    k4 = f_a(moved(k3, h), u, a_ext)
-    return moved(jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), h)
+    k2 = f_a(move(k1, h / 2), u, a_ext)
+    k3 = f_a(move(k2, h / 2), u, a_ext)
+    k4 = f_a(move(k3, h), u, a_ext)
+    return move(jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), h)
 
 
 def test_step_is_runge_kutta_4(key):
@@ -59,7 +59,7 @@ def test_step_is_runge_kutta_4(key):
         x, u, a_ext = random_state(k), random_command(k), random.normal(k, (3,))
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14),
-            stepped(PointMass(0.02), x, u, a_ext),
+            step(PointMass(0.02), x, u, a_ext),
             generic_rk4(x, u, a_ext, 0.02),
         )
 
@@ -71,10 +71,10 @@ def spin(t, w, c):
     return np.array(p), np.array(v)
 
 
-def flown(dt, seconds, u, x=None):
+def fly_once(dt, seconds, u, x=None):
     x = State.at(jnp.zeros(3)) if x is None else x
     for _ in range(round(seconds / dt)):
-        x = stepped(PointMass(dt), x, u, jnp.zeros(3))
+        x = step(PointMass(dt), x, u, jnp.zeros(3))
     return x
 
 
@@ -83,7 +83,7 @@ def flown(dt, seconds, u, x=None):
     ("c", "w", "tolerance"), [(0.0, 1e-3, 1e-12), (9.81, 1e-3, 1e-9), (12.0, 2.0, 2e-8), (20.0, 6.0, 1e-5)]
 )
 def test_against_closed_forms(c, w, tolerance):
-    x = flown(0.02, 1.0, Command(jnp.array(c), jnp.array([w, 0.0, 0.0])))
+    x = fly_once(0.02, 1.0, Command(jnp.array(c), jnp.array([w, 0.0, 0.0])))
     p, v = spin(1.0, w, c)
     np.testing.assert_allclose(x.p, p, atol=tolerance)
     np.testing.assert_allclose(x.v, v, atol=tolerance)
@@ -97,7 +97,7 @@ def test_order_of_accuracy_is_four():
     errors = np.array(
         [
             [np.linalg.norm(np.asarray(x.p) - p), np.linalg.norm(np.asarray(x.v) - v)]
-            for x in (flown(dt, 1.2, u) for dt in (0.04, 0.02, 0.01))
+            for x in (fly_once(dt, 1.2, u) for dt in (0.04, 0.02, 0.01))
         ]
     )
     orders = np.log2(errors[:-1] / errors[1:])
@@ -105,7 +105,7 @@ def test_order_of_accuracy_is_four():
 
 
 def test_rotation_does_not_drift():
-    x = flown(0.02, 3.0, Command(jnp.array(10.0), jnp.array([3.0, -2.0, 1.0])))
+    x = fly_once(0.02, 3.0, Command(jnp.array(10.0), jnp.array([3.0, -2.0, 1.0])))
     R = np.asarray(x.R)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
@@ -144,8 +144,8 @@ def test_no_gradient_through_the_residual(key):
     x, u, a_ext = random_state(key), random_command(key), jnp.array([0.3, 0.0, -0.2])
     residual = network(key)
     y = jnp.concatenate([x.vector(), u.vector()])
-    hybrid, held = flat_step(Hybrid(PointMass(0.02), residual), a_ext), jax.jit(residual)(x, u)
-    analytical = flat_step(PointMass(0.02), a_ext + held)
+    hybrid, hold = flat_step(Hybrid(PointMass(0.02), residual), a_ext), jax.jit(residual)(x, u)
+    analytical = flat_step(PointMass(0.02), a_ext + hold)
     np.testing.assert_allclose(hybrid(y), analytical(y), atol=1e-15)
     J = jax.jit(jax.jacobian(hybrid))(y)
     np.testing.assert_allclose(J, differences(analytical, y), atol=1e-8)
@@ -169,16 +169,16 @@ def test_straight_through_has_one_models_value_and_the_others_gradient(key):
     y = jnp.concatenate([x.vector(), u.vector()])
     both, forward, backward = (flat_step(each, a_ext) for each in (model, rotors, simple))
     ways = jax.jit(lambda y: (both(y), forward(y), jax.jacobian(both)(y), jax.jacobian(backward)(y)))
-    value, wanted, slope, wanted_slope = ways(y)
-    np.testing.assert_array_equal(value, wanted)
+    value, expected, slope, wanted_slope = ways(y)
+    np.testing.assert_array_equal(value, expected)
     np.testing.assert_allclose(slope, wanted_slope, atol=1e-15)
     # over two ticks too: what is hidden in the forward state carries no gradient
     two = lambda m: lambda u: m.state(m.step(m.step(m.init(x), u, a_ext), u, a_ext)).v  # noqa: E731
 
     def surrogate(u):
-        reached, middle = jax.lax.stop_gradient(rotors.step(rotors.init(x), u, a_ext)), simple.step(x, u, a_ext)
-        moved = jax.tree.map(lambda value, b: value + b - jax.lax.stop_gradient(b), rotors.state(reached), middle)
-        return simple.step(moved, u, a_ext).v
+        reached_hosts, middle = jax.lax.stop_gradient(rotors.step(rotors.init(x), u, a_ext)), simple.step(x, u, a_ext)
+        shift = jax.tree.map(lambda value, b: value + b - jax.lax.stop_gradient(b), rotors.state(reached_hosts), middle)
+        return simple.step(shift, u, a_ext).v
 
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-13),

@@ -39,7 +39,7 @@ def strong(prop):
 
 class Cold(NamedTuple):
     forces: BladeForces
-    found: Inflow
+    inflow: Inflow
     v_i: jax.Array  # in the end
     slopes: tuple  # of thrust, in-plane force and torque with respect to omega, v_hor, v_ver
 
@@ -49,8 +49,8 @@ def cold(prop, omega, v_hor, v_ver):
     """One program for all tests: values and gradients, from far away."""
 
     def one(*at):
-        forces, found = rotor(prop, *at, Inflow.above(at[0].dtype), steps=16)
-        return jnp.stack(forces), (forces, found, vortex_ring(found, at[2]))
+        forces, result = rotor(prop, *at, Inflow.above(at[0].dtype), steps=16)
+        return jnp.stack(forces), (forces, result, vortex_ring(result, at[2]))
 
     slopes, values = jax.vmap(jax.jacfwd(one, argnums=(0, 1, 2), has_aux=True))(omega, v_hor, v_ver)
     return Cold(*values, slopes)
@@ -61,7 +61,7 @@ def sections(prop, omega, v_hor, v_ver, v_i):
     return jax.vmap(lambda *at: blade_forces(prop, *at))(omega, v_hor, v_ver, v_i)
 
 
-def padded(*numbers):
+def pad(*numbers):
     """To 256 points, so that one compiled program serves all tests."""
     return tuple(jnp.resize(jnp.asarray(n, dtype=float), 256) for n in numbers)
 
@@ -77,13 +77,13 @@ def points(key, box):
 @pytest.mark.parametrize("case", range(12))
 def test_golden(case):
     c = GOLDEN["cases"][case]
-    forces, found, v_i, _ = cold(strong(five_inch()), *padded(c["mot"], c["v_hor"], c["v_ver"]))
+    forces, result, v_i, _ = cold(strong(five_inch()), *pad(c["mot"], c["v_hor"], c["v_ver"]))
     near = lambda ours, name: np.testing.assert_allclose(ours[:4], c[name], rtol=0.025)  # noqa: E731
     near(forces.thrust, "thrust")
     near(forces.torque, "torque")
     near(v_i, "vind")
     if case != 9:  # there the reference's search ends at the limit of its bracket, 30 m/s; the root is beyond
-        near(found.v_i, "vind_momentum")
+        near(result.v_i, "vind_momentum")
     np.testing.assert_allclose(3.0 * forces.in_plane[:4], c["hforce"], atol=0.015)
 
 
@@ -132,9 +132,9 @@ TABLE = {
 def test_regression(make):
     omega, rows = TABLE[make]
     v_hor, v_ver, v_i, T, Q, H3 = np.array(rows, dtype=float).T
-    forces, _, found, _ = cold(strong(make()), *padded(omega, v_hor, v_ver))
+    forces, _, result, _ = cold(strong(make()), *pad(omega, v_hor, v_ver))
     n = len(rows)
-    np.testing.assert_allclose(found[:n], v_i, rtol=3e-3)
+    np.testing.assert_allclose(result[:n], v_i, rtol=3e-3)
     np.testing.assert_allclose(forces.thrust[:n], T, rtol=3e-3)
     np.testing.assert_allclose(forces.torque[:n], Q, rtol=3e-3)
     np.testing.assert_allclose(3.0 * forces.in_plane[:n], H3, rtol=3e-3, atol=5e-4)
@@ -143,10 +143,10 @@ def test_regression(make):
 @pytest.mark.parametrize(("make", "c_T", "kappa"), [(five_inch, 1.5625e-6, 0.01172), (three_inch, 2.05e-7, 0.00804)])
 def test_hover_coefficients(make, c_T, kappa):
     coefficient = jax.jit(hover_coefficient)
-    found = [float(coefficient(make(), jnp.array(omega))) for omega in (800.0, 1500.0, 4000.0)]
-    assert found[0] == pytest.approx(c_T, rel=0.01)
-    np.testing.assert_allclose(found, found[0], rtol=1e-3)  # the same at every speed
-    forces = cold(strong(make()), *padded(1500.0, 0.0, 0.0)).forces
+    result = [float(coefficient(make(), jnp.array(omega))) for omega in (800.0, 1500.0, 4000.0)]
+    assert result[0] == pytest.approx(c_T, rel=0.01)
+    np.testing.assert_allclose(result, result[0], rtol=1e-3)  # the same at every speed
+    forces = cold(strong(make()), *pad(1500.0, 0.0, 0.0)).forces
     assert float(forces.torque[0] / forces.thrust[0]) == pytest.approx(kappa, rel=0.01)
 
 
@@ -156,17 +156,17 @@ def test_hover_coefficients(make, c_T, kappa):
 def test_momentum_balance_at_the_largest_root(prop, key):
     """T = 2 rho A v_i |V|; at every larger v_i the air takes more momentum than the blades give."""
     omega, v_hor, v_ver = points(key, ENVELOPE)
-    found = cold(prop, omega, v_hor, v_ver).found
+    result = cold(prop, omega, v_hor, v_ver).inflow
 
     def balance(v):
         momentum = 2.0 * AIR_DENSITY * prop.area * v * jnp.sqrt(v_hor**2 + (v_ver - v) ** 2)
         return sections(prop, omega, v_hor, v_ver, v).thrust, momentum
 
-    balanced = jnp.isclose(*balance(found.v_i), rtol=1e-6, atol=1e-8)
-    assert balanced[v_ver < 1.2 * found.v_h].all()
-    assert jnp.mean(balanced) > 0.99  # in fast descent two roots may meet, and Newton's steps grow slow
+    balances = jnp.isclose(*balance(result.v_i), rtol=1e-6, atol=1e-8)
+    assert balances[v_ver < 1.2 * result.v_h].all()
+    assert jnp.mean(balances) > 0.99  # in fast descent two roots may meet, and Newton's steps grow slow
     for above in np.geomspace(1e-3, 30.0, 30):
-        thrust, momentum = balance(found.v_i + above)
+        thrust, momentum = balance(result.v_i + above)
         assert (thrust < momentum).all()
 
 
@@ -202,9 +202,9 @@ def test_warm_start(prop, key):
     k, l = random.split(key)
     before = points(k, ((800.0, 3000.0), *FLIGHT[1:]))
     after = tuple(n + d for n, d in zip(before, points(l, ((-40.0, 40.0), (-0.04, 0.04), (-0.04, 0.04))), strict=True))
-    start, (far, settled, *_) = cold(prop, *before).found, cold(prop, *after)
-    near, found = warm(prop, *after, start)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), (near, found), (far, settled))
+    start, (far, has_settled, *_) = cold(prop, *before).inflow, cold(prop, *after)
+    near, result = warm(prop, *after, start)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), (near, result), (far, has_settled))
 
 
 # ---- gradients
@@ -237,11 +237,11 @@ def test_no_gradient_through_the_warm_start(prop):
 def test_finite_and_bounded_everywhere(prop, key, dtype):
     """Also at the corners, where the flow reverses, the rotor idles or the air rests."""
     corners = jnp.meshgrid(*(jnp.linspace(a, b, 5) for a, b in ENVELOPE))
-    for at in (points(key, ENVELOPE), padded(*(c.ravel() for c in corners))):
+    for at in (points(key, ENVELOPE), pad(*(c.ravel() for c in corners))):
         with jax.enable_x64(dtype == jnp.float64):
-            forces, found, v_i, slopes = cold(*jax.tree.map(lambda leaf: leaf.astype(dtype), (prop, *at)))
+            forces, result, v_i, slopes = cold(*jax.tree.map(lambda leaf: leaf.astype(dtype), (prop, *at)))
             assert forces.thrust.dtype == dtype
             assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((forces, slopes)))
             assert (jnp.abs(forces.thrust) < 60.0).all()
-            assert (jnp.abs(jnp.stack([found.v_i, found.v_h, v_i])) < 59.0).all()
-            assert (v_i <= jnp.maximum(found.v_i, 2.0 * found.v_h) * (1 + 1e-6)).all()
+            assert (jnp.abs(jnp.stack([result.v_i, result.v_h, v_i])) < 59.0).all()
+            assert (v_i <= jnp.maximum(result.v_i, 2.0 * result.v_h) * (1 + 1e-6)).all()

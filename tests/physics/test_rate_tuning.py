@@ -14,7 +14,7 @@ from retrim.physics import Command, State
 from retrim.physics.bem import BemQuadrotor
 from retrim.physics.betaflight import Betaflight
 from retrim.physics.effects import ExternalEffects
-from retrim.physics.rate_tuning import Gains, is_damped, tuned
+from retrim.physics.rate_tuning import Gains, is_damped, tune
 from retrim.physics.rotors import LinearDragQuadrotor
 from retrim.physics.step_response import step_responses
 from retrim_paper.conditions import conditions
@@ -28,7 +28,7 @@ SIZES = {
 }
 
 
-def sized(name, motor_tau):
+def size_of(name, motor_tau):
     mass, inertia, arm, thrust, inches = SIZES[name]
     return VehicleSpec(
         name="sized", mass=mass, inertia=inertia, arm=(arm, arm), thrust_max=thrust, rates_max=(4.0, 4.0, 2.0),
@@ -37,12 +37,12 @@ def sized(name, motor_tau):
 
 
 @eqx.filter_jit
-def flown(model, axis):
+def fly_once(model, axis):
     """Body rate under a step of 1 rad/s at hover thrust, tick by tick."""
-    wanted = jnp.zeros(3).at[axis].set(1.0)
+    expected = jnp.zeros(3).at[axis].set(1.0)
 
     def tick(s, _):
-        s = model.substep(s, Command(jnp.array(9.80665), wanted), ExternalEffects.calm(jnp.zeros(()).dtype))
+        s = model.substep(s, Command(jnp.array(9.80665), expected), ExternalEffects.calm(jnp.zeros(()).dtype))
         return s, model.rotor_state(s).omega[axis]
 
     return lax.scan(tick, model.init(State.at(jnp.array([0.0, 0.0, 1.0]))), length=600)[1]
@@ -57,7 +57,7 @@ def test_published_vehicles_keep_the_settings_of_the_platform(name):
 
 
 def test_so_does_every_vehicle_of_the_gauntlet_at_hover():
-    vehicles = [flown.vehicle for flown in conditions(PRESETS["hover/retrim"]).values() if flown.vehicle is not None]
+    vehicles = [flight.vehicle for flight in conditions(PRESETS["hover/retrim"]).values() if flight.vehicle is not None]
     assert len(vehicles) >= 6
     for vehicle in vehicles:
         for error in (0.035, -0.2, 0.2):
@@ -69,10 +69,10 @@ def test_so_does_every_vehicle_of_the_gauntlet_at_hover():
 @pytest.mark.parametrize("name", SIZES)
 def test_the_simulated_vehicle_answers_a_step_as_foretold(name, motor_tau):
     """It overshoots by less than 40 %, from 35 g to 10 kg; the platform's settings overshoot by up to 200 %."""
-    vehicle = sized(name, motor_tau)
+    vehicle = size_of(name, motor_tau)
     model = BemQuadrotor.of(vehicle, 0.02)
     for axis, foretold in enumerate(step_responses(vehicle)):
-        rate = np.asarray(flown(model, axis))
+        rate = np.asarray(fly_once(model, axis))
         assert rate.max() - 1.0 < 0.4
         assert foretold.overshoot == pytest.approx(max(0.0, rate.max() - 1.0), abs=0.1)
         assert foretold.rise == pytest.approx(1e-3 * np.argmax(rate >= 0.632), rel=0.05, abs=0.004)
@@ -80,9 +80,9 @@ def test_the_simulated_vehicle_answers_a_step_as_foretold(name, motor_tau):
 
 @pytest.mark.parametrize("motor_tau", [0.02, 0.05, 0.1])
 def test_the_simple_plant_answers_a_step_with_little_overshoot(motor_tau):
-    model = LinearDragQuadrotor.of(sized("4 kg", motor_tau), 0.02)
+    model = LinearDragQuadrotor.of(size_of("4 kg", motor_tau), 0.02)
     for axis in range(3):
-        assert np.asarray(flown(model, axis)).max() < 1.4
+        assert np.asarray(fly_once(model, axis)).max() < 1.4
 
 
 def poles(gains, tau, lead=0.0):
@@ -93,10 +93,10 @@ def poles(gains, tau, lead=0.0):
 @pytest.mark.parametrize("motor_tau", [0.01, 0.05, 0.1, 0.3])
 def test_gains_of_its_own_have_the_damping_that_they_are_said_to_have(motor_tau):
     plain = Gains(jnp.full(3, 20.0), jnp.full(3, 300.0), jnp.full(3, 0.2))
-    own = tuned(plain, jnp.array(motor_tau))
+    own = tune(plain, jnp.array(motor_tau))
     without_integral = Gains(own.a, jnp.zeros(3), own.b)
-    found = poles(without_integral, motor_tau)
-    oscillating = found[np.abs(found.imag) > 1e-6]
+    result = poles(without_integral, motor_tau)
+    oscillating = result[np.abs(result.imag) > 1e-6]
     np.testing.assert_allclose(-oscillating.real / np.abs(oscillating), 0.8, rtol=1e-6)
     assert np.all(poles(own, motor_tau).real < -0.02 / motor_tau)
     assert np.all(is_damped(own, jnp.zeros(3), jnp.array(motor_tau)))
@@ -116,5 +116,5 @@ def test_a_loop_that_is_not_stable_is_never_damped():
 
 def test_a_step_shows_what_the_thrust_cannot_do():
     """With a hundredth of the lever, the same gains saturate."""
-    weak = dataclasses.replace(sized("4 kg", 0.1), inertia=200.0 * jnp.array([0.08, 0.08, 0.14]))
-    assert step_responses(weak)[0].rise > 2.0 * step_responses(sized("4 kg", 0.1))[0].rise
+    weak = dataclasses.replace(size_of("4 kg", 0.1), inertia=200.0 * jnp.array([0.08, 0.08, 0.14]))
+    assert step_responses(weak)[0].rise > 2.0 * step_responses(size_of("4 kg", 0.1))[0].rise

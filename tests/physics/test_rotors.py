@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import random_command, random_state, replaced
+from helpers import random_command, random_state, replace_fields
 from retrim.physics import Command, ExternalEffects, LinearDragQuadrotor, State, large, small, so3
 from retrim.physics.substep import RotorState
 
@@ -17,10 +17,10 @@ VEHICLES = {"small": small, "large": large}
 def exact(request):
     """No thrust error, no drag."""
     model = LinearDragQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0)
-    return replaced(model, drag=jnp.zeros(3))
+    return replace_fields(model, drag=jnp.zeros(3))
 
 
-def flown(model, s, u, seconds, a_ext=None):
+def fly_once(model, s, u, seconds, a_ext=None):
     step = jax.jit(lambda s: model.step(s, u, jnp.zeros(3) if a_ext is None else a_ext))
     for _ in range(round(seconds / model.dt)):
         s = step(s)
@@ -28,7 +28,7 @@ def flown(model, s, u, seconds, a_ext=None):
 
 
 def test_hover_balance(exact):
-    s = flown(exact, exact.init(State.at(jnp.zeros(3))), Command.hover(), 2.0)
+    s = fly_once(exact, exact.init(State.at(jnp.zeros(3))), Command.hover(), 2.0)
     np.testing.assert_allclose(s.x.p, 0.0, atol=1e-10)
     np.testing.assert_allclose(s.x.R, np.eye(3), atol=1e-12)
     force, torque = exact.wrench(s, s.motors, exact.vehicle.thrust_coefficient * s.motors**2, jnp.zeros(3))
@@ -37,8 +37,8 @@ def test_hover_balance(exact):
 
 
 def test_thrust_error_is_the_stated_acceleration():
-    model = replaced(LinearDragQuadrotor.of(small(), 0.02, thrust_error=0.035), drag=jnp.zeros(3))
-    s = flown(model, model.init(State.at(jnp.zeros(3))), Command.hover(), 1.0)
+    model = replace_fields(LinearDragQuadrotor.of(small(), 0.02, thrust_error=0.035), drag=jnp.zeros(3))
+    s = fly_once(model, model.init(State.at(jnp.zeros(3))), Command.hover(), 1.0)
     assert s.x.v[2] == pytest.approx(0.035 * 9.81 * 1.0, rel=1e-6)
 
 
@@ -78,9 +78,9 @@ def test_mirror_symmetry(exact, key):
     """Left and right are the same: mirror the start and the command in y, and the flight is mirrored."""
     M = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
     x, u = random_state(key, 0.3), random_command(key)
-    mirrored = State(M @ x.p, M @ x.R @ M, M @ x.v)
-    s = flown(exact, exact.init(x), u, 0.2)
-    t = flown(exact, exact.init(mirrored), Command(u.c, -M @ u.omega), 0.2)
+    mirror = State(M @ x.p, M @ x.R @ M, M @ x.v)
+    s = fly_once(exact, exact.init(x), u, 0.2)
+    t = fly_once(exact, exact.init(mirror), Command(u.c, -M @ u.omega), 0.2)
     np.testing.assert_allclose(t.x.p, M @ s.x.p, atol=1e-10)
     np.testing.assert_allclose(t.x.R, M @ s.x.R @ M, atol=1e-10)
 
@@ -98,7 +98,7 @@ def test_drag_takes_energy_and_thrustless_flight_creates_none():
 
 def test_commands_are_limited(exact):
     wild = Command(jnp.array(1e4), jnp.array([1e3, 0.0, 0.0]))
-    s = flown(exact, exact.init(State.at(jnp.zeros(3))), wild, 0.5)
+    s = fly_once(exact, exact.init(State.at(jnp.zeros(3))), wild, 0.5)
     vehicle = exact.vehicle
     thrusts = vehicle.thrust_coefficient * s.motors**2
     assert float(jnp.sum(thrusts)) <= float(vehicle.thrust_max) * (1 + 1e-9)
@@ -137,7 +137,7 @@ def test_vehicles(make):
 
 def test_vehicles_can_be_made_under_a_transformation():
     """A mass may be traced: mapped over, or differentiated."""
-    hover = lambda mass: replaced(small(), mass=mass).hover_speed  # noqa: E731
+    hover = lambda mass: replace_fields(small(), mass=mass).hover_speed  # noqa: E731
     np.testing.assert_allclose(jax.vmap(hover)(jnp.array([0.19, 0.76]))[1], 2 * hover(jnp.array(0.19)))
     assert jax.grad(hover)(jnp.array(0.19)) > 0
 
@@ -152,4 +152,4 @@ def test_vehicles_can_be_made_under_a_transformation():
 )
 def test_impossible_vehicles(field, value, message):
     with pytest.raises(ValueError, match=message):
-        replaced(small(), **{field: jnp.array(value)})
+        replace_fields(small(), **{field: jnp.array(value)})

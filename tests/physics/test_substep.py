@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import CheapModel, random_state, replaced
+from helpers import CheapModel, random_state, replace_fields
 from retrim.physics import BemQuadrotor, Command, LinearDragQuadrotor, RotorState, State, large, small
 
 MODELS = {"linear drag": LinearDragQuadrotor, "bem": BemQuadrotor}
@@ -37,11 +37,11 @@ def test_rotor_state_is_what_the_model_turns_with(make, key):
     model = make.of(small(), 0.02, thrust_error=0.0)
     x = random_state(key)
     s = model.init(x)
-    found = model.rotor_state(s)
-    assert isinstance(found, RotorState)
-    jax.tree.map(np.testing.assert_array_equal, found.x, x)
-    np.testing.assert_array_equal(found.omega, 0.0)
-    np.testing.assert_allclose(found.motors, small().hover_speed, rtol=0.05)
+    result = model.rotor_state(s)
+    assert isinstance(result, RotorState)
+    jax.tree.map(np.testing.assert_array_equal, result.x, x)
+    np.testing.assert_array_equal(result.omega, 0.0)
+    np.testing.assert_allclose(result.motors, small().hover_speed, rtol=0.05)
     roll = Command(jnp.array(9.81), jnp.array([3.0, 0.0, 0.0]))
     after = eqx.filter_jit(model.step)(model.init(State.at(jnp.zeros(3))), roll, jnp.zeros(3))
     turning = model.rotor_state(after)
@@ -53,8 +53,8 @@ def test_rotor_state_is_what_the_model_turns_with(make, key):
 
 def test_a_model_need_have_neither(key):
     """One of rigid translation: at hover thrust, level and undisturbed it moves on a straight line."""
-    x = replaced(random_state(key), R=jnp.eye(3))
+    x = replace_fields(random_state(key), R=jnp.eye(3))
     assert CheapModel().command_limits is None
     assert CheapModel().rotor_state(x) is None
-    moved = CheapModel().step(x, Command.hover(), jnp.zeros(3))
-    np.testing.assert_allclose(moved.p, x.p + 0.02 * x.v, rtol=1e-12)
+    shift = CheapModel().step(x, Command.hover(), jnp.zeros(3))
+    np.testing.assert_allclose(shift.p, x.p + 0.02 * x.v, rtol=1e-12)

@@ -41,8 +41,8 @@ def test_sticks_ask_for_rates_and_keep_to_their_ends():
 
 
 def test_motors_come_in_the_order_of_our_rotors():
-    found = motors_of(struct.pack("<4f", 0.1, 0.2, 0.3, 0.4))
-    np.testing.assert_allclose(found, [0.1, 0.2, 0.4, 0.3], atol=1e-7)
+    result = motors_of(struct.pack("<4f", 0.1, 0.2, 0.3, 0.4))
+    np.testing.assert_allclose(result, [0.1, 0.2, 0.4, 0.3], atol=1e-7)
 
 
 def test_throttle_is_the_inverse_of_what_the_mixer_does():
@@ -60,7 +60,7 @@ def test_noise_is_no_packet_of_motors():
         for k in range(2000):
             stranger.sendto(rng.bytes(16 if k % 2 else int(rng.integers(0, 64))), ("127.0.0.1", ears.port))
             np.testing.assert_allclose(ears.hear(motors), [0.1, 0.2, 0.4, 0.3], atol=1e-7)
-        assert ears.refused == 2000
+        assert ears.refusals == 2000
         board.sendto(b"torn", ("127.0.0.1", ears.port))
         board.sendto(struct.pack("<4f", 0.5, 0.5, 0.5, 0.5), ("127.0.0.1", ears.port))
         np.testing.assert_allclose(ears.hear(motors), 0.5)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from made_up_wire import Wire
+from fake_wire import Wire
 from retrim import PlantError
 from retrim.plants.bridges import crtp
 from retrim.plants.bridges.crazyflie_link import STATES, STATUSES, CrazyflieLink
@@ -18,9 +18,9 @@ UPRIGHT = np.eye(3)
 
 @pytest.fixture
 def wire():
-    made = Wire()
-    yield made
-    made.close()
+    setup = Wire()
+    yield setup
+    setup.close()
 
 
 @pytest.fixture
@@ -28,8 +28,8 @@ def link(wire):
     return CrazyflieLink(wire, HERE)
 
 
-def sent(wire):
-    return [crtp.unpacked(data) for data, _ in wire.sent]
+def send(wire):
+    return [crtp.unpack(data) for data, _ in wire.packets]
 
 
 def says(wire, link, block, ms, values, sender=HERE):
@@ -92,7 +92,7 @@ def test_of_2000_damaged_packets_none_is_believed(wire, link):
     says(wire, link, STATES, 5_000_000, state())
     says(wire, link, STATUSES, 5_000_000, crtp.status_values(crtp.Status(1.0, 0, 3.9)))
     good = Packet(crtp.LOG, crtp.DATA, bytes([STATES]) + (5_000_010).to_bytes(3, "little") + state((9.0, 9.0, 9.0)))
-    before, heard = link.reading, link.heard
+    before, reply = link.reading, link.last_message
     for k in range(2000):
         kind = k % 4
         if kind == 0:
@@ -108,7 +108,7 @@ def test_of_2000_damaged_packets_none_is_believed(wire, link):
         link.pump(0.0)
     assert link.reading is before
     assert link.status.thrust == 1.0
-    assert link.heard >= heard
+    assert link.last_message >= reply
     assert link.ignored > 1400  # the others were of ports that nobody listens to
     says(wire, link, STATES, 5_000_020, state((0.1, 0.0, 1.0)))
     assert link.reading.p[0] == pytest.approx(0.1)
@@ -118,7 +118,7 @@ def firmware(names, *, version=12, refuses=0):
     """What answers like one, to the questions of a start."""
 
     def answer(data):
-        packet = answered(crtp.unpacked(data))
+        packet = answered(crtp.unpack(data))
         return None if packet is None else packet.pack()
 
     def answered(packet):
@@ -141,15 +141,15 @@ def test_logs_are_asked_for_by_the_numbers_of_their_names(wire, link):
     names = ["other.one", *reversed(crtp.STATE_LOG), "other.two", *crtp.STATUS_LOG, "other.three"]
     wire.answer = firmware(names)
     link.start_logs(1.0, lambda: True)
-    made = [packet.body for packet in sent(wire) if (packet.port, packet.channel) == (crtp.LOG, crtp.CONTROL)]
-    listed = [
-        n for body in made if body[0] in (crtp.CREATE, crtp.APPEND) for _, n in struct.iter_unpack("<BH", body[2:])
+    setup = [packet.body for packet in send(wire) if (packet.port, packet.channel) == (crtp.LOG, crtp.CONTROL)]
+    listed_rows = [
+        n for body in setup if body[0] in (crtp.CREATE, crtp.APPEND) for _, n in struct.iter_unpack("<BH", body[2:])
     ]
-    assert [names[n] for n in listed] == [*crtp.STATE_LOG, *crtp.STATUS_LOG]
-    assert [body for body in made if body[0] == crtp.START] == [bytes([3, 1, 1]), bytes([3, 2, 5])]
+    assert [names[n] for n in listed_rows] == [*crtp.STATE_LOG, *crtp.STATUS_LOG]
+    assert [body for body in setup if body[0] == crtp.START] == [bytes([3, 1, 1]), bytes([3, 2, 5])]
     assert link.version == 12
-    asked = [packet.body for packet in sent(wire) if packet[:2] == (crtp.LOG, crtp.TOC) and packet.body[0] == crtp.ITEM]
-    assert len(asked) == len(names) - 1  # no further than they are
+    calls = [packet.body for packet in send(wire) if packet[:2] == (crtp.LOG, crtp.TOC) and packet.body[0] == crtp.ITEM]
+    assert len(calls) == len(names) - 1  # no further than they are
 
 
 @pytest.mark.parametrize(
@@ -174,4 +174,4 @@ def test_giving_up_is_noticed_while_nobody_answers(link):
 def test_its_words_are_kept(wire, link):
     wire.inbox.append((Packet(crtp.CONSOLE, 0, b"SYS: low \nbattery\n").pack(), HERE))
     link.pump(0.0)
-    assert link.said() == "; it said: SYS: low battery"
+    assert link.console_text() == "; it said: SYS: low battery"

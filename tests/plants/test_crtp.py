@@ -34,8 +34,8 @@ def test_states_come_back_to_a_millimetre():
     R = Rotation.from_rotvec([0.3, -0.2, 2.0]).as_matrix()
     values = crtp.state_values(p, R, v, omega)
     assert len(values) == 22  # of the 26 that a log packet has room for
-    for found, true in zip(crtp.state_of(values), (p, R, v, omega), strict=True):
-        np.testing.assert_allclose(found, true, atol=5e-3)
+    for result, true in zip(crtp.state_of(values), (p, R, v, omega), strict=True):
+        np.testing.assert_allclose(result, true, atol=5e-3)
 
 
 def test_a_setpoint_of_rates_has_the_pitch_up():
@@ -68,7 +68,7 @@ def test_a_setpoint_of_rates_has_the_pitch_up():
 )
 def test_orders_are_those_of_its_protocol(packet, data):
     assert packet.pack() == bytes.fromhex(data)
-    assert crtp.unpacked(packet.pack()) == packet
+    assert crtp.unpack(packet.pack()) == packet
 
 
 def test_a_block_that_does_not_fit_into_a_packet_is_appended_to():
@@ -81,8 +81,8 @@ def test_a_block_that_does_not_fit_into_a_packet_is_appended_to():
 @pytest.mark.parametrize(
     ("what", "why"),
     [
-        (lambda: crtp.unpacked(b""), "0 bytes are no packet"),
-        (lambda: crtp.unpacked(bytes(32)), "32 bytes are no packet"),
+        (lambda: crtp.unpack(b""), "0 bytes are no packet"),
+        (lambda: crtp.unpack(bytes(32)), "32 bytes are no packet"),
         (lambda: crtp.state_of(bytes(21)), "21 bytes are no state"),
         (lambda: crtp.status_of(bytes(9)), "9 bytes are no status"),
         (lambda: crtp.status_of(struct.pack("<fHf", np.nan, 0, 4.0)), "not finite"),
@@ -98,4 +98,4 @@ def test_packets_say_their_port_and_channel():
     for port in range(16):
         for channel in range(4):
             packet = Packet(port, channel, b"ab")
-            assert crtp.unpacked(packet.pack()) == packet
+            assert crtp.unpack(packet.pack()) == packet

@@ -26,8 +26,8 @@ def test_each_change_of_frame_is_its_own_inverse(v):
 
 @given(vectors, vectors)
 def test_frames_are_right_handed(a, b):
-    for turned in (frames.turned_world, frames.turned_body):
-        np.testing.assert_allclose(turned(np.cross(a, b)), np.cross(turned(a), turned(b)), atol=1e-9)
+    for rotation in (frames.turned_world, frames.turned_body):
+        np.testing.assert_allclose(rotation(np.cross(a, b)), np.cross(rotation(a), rotation(b)), atol=1e-9)
 
 
 @given(quaternions)
@@ -56,8 +56,8 @@ def test_level_and_to_the_north_as_everybody_knows_it():
 
 @pytest.mark.parametrize(("axis", "in_our_body"), [(0, [1, 0, 0]), (1, [0, -1, 0]), (2, [0, 0, -1])])
 def test_turns_have_their_signs(axis, in_our_body):
-    level, turned = frames.attitude_of(about(0, 0.0)), frames.attitude_of(about(axis, 1e-4))
-    rate = (level.T @ turned - np.eye(3)) / 1e-4
-    found = np.array([rate[2, 1], rate[0, 2], rate[1, 0]])
-    np.testing.assert_allclose(found, in_our_body, atol=1e-3)
-    np.testing.assert_allclose(found, frames.turned_body(np.eye(3)[axis]), atol=1e-3)
+    level, rotation = frames.attitude_of(about(0, 0.0)), frames.attitude_of(about(axis, 1e-4))
+    rate = (level.T @ rotation - np.eye(3)) / 1e-4
+    result = np.array([rate[2, 1], rate[0, 2], rate[1, 0]])
+    np.testing.assert_allclose(result, in_our_body, atol=1e-3)
+    np.testing.assert_allclose(result, frames.turned_body(np.eye(3)[axis]), atol=1e-3)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from made_up_wire import Wire
+from fake_wire import Wire
 from retrim.plants.bridges import frames
 from retrim.plants.bridges.mavlink_link import MavlinkLink
 
@@ -18,9 +18,9 @@ TURNED = np.array([0.9, 0.1, -0.2, math.sqrt(1 - 0.81 - 0.01 - 0.04)])
 
 @pytest.fixture
 def wire():
-    made = Wire()
-    yield made
-    made.close()
+    setup = Wire()
+    yield setup
+    setup.close()
 
 
 class Speaker:
@@ -56,14 +56,14 @@ def px4(wire, link):
     return speaker
 
 
-def heard_back(wire):
+def parse_replies(wire):
     """What was said, read by a parser of its own."""
     parser = mavlink.MAVLink(None)
-    return [m for data, _ in wire.sent for m in parser.parse_buffer(data) or []]
+    return [m for data, _ in wire.packets for m in parser.parse_buffer(data) or []]
 
 
-def said(wire, kind):
-    return [m for m in heard_back(wire) if m.get_type() == kind]
+def read_messages(wire, kind):
+    return [m for m in parse_replies(wire) if m.get_type() == kind]
 
 
 def test_the_first_autopilot_is_the_one(wire, link):
@@ -120,7 +120,7 @@ def test_messages_in_frames_that_are_not_known_are_counted_and_named_once(px4, l
     np.testing.assert_allclose(link.reading.p, [5.0, 4.0, 6.0], atol=1e-6)
 
 
-def framed(kind, payload):
+def frame_packet(kind, payload):
     """A whole packet of any kind of message, with any content."""
     head = bytes([len(payload), 0, 0, 0, 1, 1]) + kind.id.to_bytes(3, "little")
     crc = mavlink.x25crc(head + payload + bytes([kind.crc_extra])).crc
@@ -132,7 +132,7 @@ def test_no_message_of_the_dialect_ends_a_flight(px4, wire, link):
     for kind in mavlink.mavlink_map.values():
         length = kind.unpacker.size
         for payload in (bytes(length), b"\xff" * length, *(rng.bytes(length) for _ in range(8))):
-            wire.inbox.append((framed(kind, payload), px4.peer))
+            wire.inbox.append((frame_packet(kind, payload), px4.peer))
         link.pump(0.0)
     assert link.system == (1, 1)
     assert link.reading is None or np.isfinite(link.reading.p).all()
@@ -156,21 +156,21 @@ def test_stamps_are_of_our_clock(px4, wire, link):
     began = time.monotonic()
     for _ in range(12):
         link.pump(time.monotonic() + 0.03)
-        for asked in said(wire, "TIMESYNC"):
-            if asked.tc1 == 0:
-                remote = 50.0 + 0.99 * (1e-9 * asked.ts1 - began)
-                px4.says(px4.out.timesync_encode(int(1e9 * remote), asked.ts1))
-        wire.sent.clear()
-    sent = time.monotonic()
-    px4.odometry(us=int(1e6 * (50.0 + 0.99 * (sent - 0.2 - began))))
-    assert link.reading.stamp == pytest.approx(sent - 0.2, abs=0.01)
+        for calls in read_messages(wire, "TIMESYNC"):
+            if calls.tc1 == 0:
+                remote = 50.0 + 0.99 * (1e-9 * calls.ts1 - began)
+                px4.says(px4.out.timesync_encode(int(1e9 * remote), calls.ts1))
+        wire.packets.clear()
+    sending = time.monotonic()
+    px4.odometry(us=int(1e6 * (50.0 + 0.99 * (sending - 0.2 - began))))
+    assert link.reading.stamp == pytest.approx(sending - 0.2, abs=0.01)
 
 
 def test_it_says_that_it_is_there(px4, wire, link):
     link.pump(time.monotonic() + 1.2)
-    assert 2 <= len(said(wire, "HEARTBEAT")) <= 4
-    assert len(said(wire, "TIMESYNC")) >= 8
-    assert {to for _, to in wire.sent} == {HERE}
+    assert 2 <= len(read_messages(wire, "HEARTBEAT")) <= 4
+    assert len(read_messages(wire, "TIMESYNC")) >= 8
+    assert {to for _, to in wire.packets} == {HERE}
 
 
 def test_nothing_is_said_to_nobody(wire, link):
@@ -178,21 +178,21 @@ def test_nothing_is_said_to_nobody(wire, link):
     link.fly_rates(0.5, np.zeros(3))
     link.fly_to(np.zeros(3), 0.0)
     link.command(400, 1.0)
-    assert wire.sent == []
+    assert wire.packets == []
 
 
 def test_commands_are_told_in_its_frames(px4, wire, link):
     link.fly_rates(0.4, np.array([0.1, 0.2, 0.3]))
-    (rates,) = said(wire, "SET_ATTITUDE_TARGET")
+    (rates,) = read_messages(wire, "SET_ATTITUDE_TARGET")
     assert rates.type_mask == 128
-    told = [rates.thrust, rates.body_roll_rate, rates.body_pitch_rate, rates.body_yaw_rate]
-    assert told == pytest.approx([0.4, 0.1, -0.2, -0.3])
+    message = [rates.thrust, rates.body_roll_rate, rates.body_pitch_rate, rates.body_yaw_rate]
+    assert message == pytest.approx([0.4, 0.1, -0.2, -0.3])
     link.fly_to(np.array([1.0, 2.0, 3.0]), 0.0)
-    (place,) = said(wire, "SET_POSITION_TARGET_LOCAL_NED")
+    (place,) = read_messages(wire, "SET_POSITION_TARGET_LOCAL_NED")
     assert [place.x, place.y, place.z, place.yaw] == pytest.approx([2.0, 1.0, -3.0, math.pi / 2])
 
 
-def damaged(rng, whole, *, kinds=5):
+def damage(rng, whole, *, kinds=5):
     """A packet that is not whole."""
     kind = rng.integers(kinds)
     packet = bytearray(whole[rng.integers(len(whole))])
@@ -227,7 +227,7 @@ def test_of_2000_damaged_packets_none_is_believed(wire, datagrams):
     ]
     before = link.reading
     for _ in range(2000):
-        wire.inbox.append((damaged(rng, whole, kinds=5 if datagrams else 4), HERE))
+        wire.inbox.append((damage(rng, whole, kinds=5 if datagrams else 4), HERE))
         link.pump(0.0)
     assert link.reading is before
     assert (link.mode, link.armed, list(link.thrusts), list(link.texts)) == ((6, 0), True, [], [])

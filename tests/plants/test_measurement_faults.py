@@ -16,7 +16,7 @@ START = State.at(jnp.array([0.3, -0.2, 1.5]))
 TICKS = 260
 
 
-def reported(fault, tick, rows=30):
+def report(fault, tick, rows=30):
     """What is reported at a tick of a sequence of random states, and the sequence, newest last."""
     xs = [random_state(random.key(k)) for k in range(rows)]
     past = jax.tree.map(lambda *leaves: jnp.stack(leaves), *xs[-(fault.memory + 1) :])
@@ -32,46 +32,46 @@ def test_a_spike_adds_its_size_to_one_velocity_in_so_many(name):
     fault = measurement_fault(f"{name}=1.5")
     every = int(fault.every)
     for tick in range(0, 3 * every, 7):
-        x, xs = reported(fault, tick)
+        x, xs = report(fault, tick)
         wrong = tick % every == every - 1
         np.testing.assert_allclose(x.v - xs[-1].v, [1.5 * wrong, 0.0, 0.0], atol=1e-12)
         same((x.p, x.R), (xs[-1].p, xs[-1].R))
 
 
 def test_swapped_markers_turn_the_pose_and_leave_a_rotation():
-    x, xs = reported(measurement_fault("swapped-markers=1.5"), 49)
+    x, xs = report(measurement_fault("swapped-markers=1.5"), 49)
     np.testing.assert_allclose(x.R.T @ x.R, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(so3.log(xs[-1].R.T @ x.R), [0.0, 0.0, 1.5], atol=1e-9)
-    same(reported(measurement_fault("swapped-markers"), 10)[0], xs[-1])
+    same(report(measurement_fault("swapped-markers"), 10)[0], xs[-1])
 
 
 @pytest.mark.parametrize("ticks", [1, 3, 7])
 def test_late_measurements_are_so_many_ticks_old(ticks):
-    x, xs = reported(measurement_fault(f"late={ticks}"), 40)
+    x, xs = report(measurement_fault(f"late={ticks}"), 40)
     same(x, xs[-1 - ticks])
 
 
 def test_a_frozen_system_repeats_the_state_before_its_stop():
     fault = measurement_fault("frozen=15")
     for tick, back in ((199, 0), (200, 1), (207, 8), (214, 15), (215, 0), (3, 0)):
-        x, xs = reported(fault, tick)
+        x, xs = report(fault, tick)
         same(x, xs[-1 - back])
 
 
 def test_repeated_measurements_have_their_probability():
     fault = measurement_fault("repeated=0.3")
-    stale = [np.array_equal(x.p, xs[-2].p) for x, xs in (reported(fault, k, rows=2) for k in range(400))]
+    stale = [np.array_equal(x.p, xs[-2].p) for x, xs in (report(fault, k, rows=2) for k in range(400))]
     assert 0.23 < np.mean(stale) < 0.37
 
 
 def test_scale_biases_and_drift():
-    x, xs = reported(measurement_fault("scaled-velocity=0.5"), 3)
+    x, xs = report(measurement_fault("scaled-velocity=0.5"), 3)
     np.testing.assert_allclose(x.v, 0.5 * xs[-1].v)
-    x, xs = reported(measurement_fault("velocity-bias=0.2"), 3)
+    x, xs = report(measurement_fault("velocity-bias=0.2"), 3)
     np.testing.assert_allclose(x.v - xs[-1].v, [0.2, 0.0, 0.0], atol=1e-12)
-    x, xs = reported(measurement_fault("attitude-bias=0.03"), 3)
+    x, xs = report(measurement_fault("attitude-bias=0.03"), 3)
     np.testing.assert_allclose(so3.log(xs[-1].R.T @ x.R), [0.03, 0.0, 0.0], atol=1e-12)
-    drifts = [float((reported(measurement_fault("drift=0.1"), k)[0].p - random_state(random.key(29)).p)[0]) for k in
+    drifts = [float((report(measurement_fault("drift=0.1"), k)[0].p - random_state(random.key(29)).p)[0]) for k in
               (0, 62, 63, 125, 187, 188)]  # fmt: skip
     np.testing.assert_allclose(
         drifts, 0.1 * np.sin(2.0 * np.pi * np.array([0, 62, 63, 125, 187, 188]) / 250), atol=1e-9

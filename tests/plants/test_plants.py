@@ -99,8 +99,8 @@ def test_command_acts_after_the_delay_and_is_accepted(plant):
         plant.reset(START)
         for _ in range(4):
             u = Command(jnp.array(9.81), rates)
-            measurement, accepted = plant.step(u)
-            assert accepted is u
+            measurement, accepted_command = plant.step(u)
+            assert accepted_command is u
             into.append(np.asarray(measurement.x.R))
     assert np.array_equal(rolling[0], plain[0])  # 20 ms of delay: one tick
     assert not np.array_equal(rolling[1], plain[1])
@@ -109,41 +109,41 @@ def test_command_acts_after_the_delay_and_is_accepted(plant):
 @pytest.mark.parametrize("axis", range(3))
 def test_rates_turn_it_about_its_own_axes(plant, axis):
     """1 rad/s for 0.4 s, less the delay and the rate loop's lag."""
-    turned = so3.log(after(plant, 20, omega=jnp.zeros(3).at[axis].set(1.0)).R)
-    assert 0.25 < float(turned[axis]) < 0.4
-    assert float(jnp.linalg.norm(turned)) == pytest.approx(float(turned[axis]), rel=0.05)
+    rotation = so3.log(after(plant, 20, omega=jnp.zeros(3).at[axis].set(1.0)).R)
+    assert 0.25 < float(rotation[axis]) < 0.4
+    assert float(jnp.linalg.norm(rotation)) == pytest.approx(float(rotation[axis]), rel=0.05)
 
 
 def test_it_measures_how_fast_it_turns_and_how_it_is_accelerated(plant):
     """Rates at the end of a tick, the mean acceleration over it: its attitudes and velocities say so, too."""
-    passed = [plant.reset(START)]
+    elapsed_time = [plant.reset(START)]
     for k in range(16):
         rates = jnp.array([1.5, -1.0, 0.5]) * (1.0 if k < 8 else -1.0)
-        passed.append(plant.step(Command(jnp.array(11.0), rates))[0])
-    for before, now in pairwise(passed):
-        turned = so3.log(before.R.T @ now.R) / plant.dt
+        elapsed_time.append(plant.step(Command(jnp.array(11.0), rates))[0])
+    for before, now in pairwise(elapsed_time):
+        rotation = so3.log(before.R.T @ now.R) / plant.dt
         ends = np.stack([before.omega, now.omega])
         slack = 0.15 + 0.25 * np.ptp(ends, axis=0)  # it may have turned faster within the tick
-        assert np.all(turned > ends.min(axis=0) - slack)
-        assert np.all(turned < ends.max(axis=0) + slack)
+        assert np.all(rotation > ends.min(axis=0) - slack)
+        assert np.all(rotation < ends.max(axis=0) + slack)
         np.testing.assert_allclose(now.a, (now.v - before.v) / plant.dt, atol=0.02)
-    assert float(jnp.linalg.norm(passed[8].omega)) > 1.0
-    assert float(passed[-1].omega @ passed[8].omega) < 0.0
+    assert float(jnp.linalg.norm(elapsed_time[8].omega)) > 1.0
+    assert float(elapsed_time[-1].omega @ elapsed_time[8].omega) < 0.0
 
 
 def test_what_is_beyond_its_limits_does_what_is_accepted(plant):
     low, high = small().command_min, small().command_max
-    for asked in (Command(jnp.array(500.0), 1e3 * high.omega), Command(jnp.array(-5.0), 1e3 * low.omega)):
+    for calls in (Command(jnp.array(500.0), 1e3 * high.omega), Command(jnp.array(-5.0), 1e3 * low.omega)):
         plant.reset(START)
-        plant.step(asked)
-        _, accepted = plant.step(asked)
-        assert 0.0 <= float(accepted.c) < 150.0
-        beyond = plant.step(asked)[0]
+        plant.step(calls)
+        _, accepted_command = plant.step(calls)
+        assert 0.0 <= float(accepted_command.c) < 150.0
+        beyond = plant.step(calls)[0]
         plant.reset(START)
         for _ in range(3):
-            told, again = plant.step(accepted)
-            assert again is accepted
-        np.testing.assert_array_equal(beyond.x.vector(), told.x.vector())
+            message, again = plant.step(accepted_command)
+            assert again is accepted_command
+        np.testing.assert_array_equal(beyond.x.vector(), message.x.vector())
 
 
 def test_thrust_is_per_mass(plant):
@@ -154,16 +154,16 @@ def test_thrust_is_per_mass(plant):
 
 def test_push_accelerates(make):
     """0.5 m/s^2 per axis for 0.1 s."""
-    pushed, calm = after(make("small"), 5), after(make("none"), 5)
-    np.testing.assert_allclose(pushed.v - calm.v, 0.05, rtol=0.1)
+    with_push, calm = after(make("small"), 5), after(make("none"), 5)
+    np.testing.assert_allclose(with_push.v - calm.v, 0.05, rtol=0.1)
 
 
 def test_wind_moves_it_downwind(make):
     """It blows along (1, 1, 0)."""
     blown, calm = after(make("wind"), 50), after(make("none"), 50)
-    moved = blown.p - calm.p
-    assert float(moved[0] + moved[1]) / 2**0.5 > 0.03
-    assert abs(float(moved[0] - moved[1])) < 0.1 * float(moved[0] + moved[1])
+    shift = blown.p - calm.p
+    assert float(shift[0] + shift[1]) / 2**0.5 > 0.03
+    assert abs(float(shift[0] - shift[1])) < 0.1 * float(shift[0] + shift[1])
 
 
 def test_wind_is_in_the_world_frame(make):
@@ -172,12 +172,12 @@ def test_wind_is_in_the_world_frame(make):
     plant.reset(State(START.p, so3.exp(jnp.array([0.0, 0.0, 2.5])), START.v))
     for _ in range(50):
         measurement, _ = plant.step(Command.hover())
-    moved = measurement.x.p - START.p
-    assert float(moved[0]) > 0.02
-    assert float(moved[1]) > 0.02
+    shift = measurement.x.p - START.p
+    assert float(shift[0]) > 0.02
+    assert float(shift[1]) > 0.02
 
 
-def supported(make, disturbance):
+def support(make, disturbance):
     try:
         return after(make(disturbance), 10)
     except PlantError as error:
@@ -186,12 +186,12 @@ def supported(make, disturbance):
 
 def test_load_pulls_it_down(make):
     """70 g more than the thrust carries."""
-    assert float(supported(make, "payload").v[2] - after(make("none"), 10).v[2]) < -0.3
+    assert float(support(make, "payload").v[2] - after(make("none"), 10).v[2]) < -0.3
 
 
 def test_weak_rotor_tilts_it_towards_itself(make):
     """Front right."""
-    up = supported(make, "weak-rotor").R[:, 2] - after(make("none"), 10).R[:, 2]
+    up = support(make, "weak-rotor").R[:, 2] - after(make("none"), 10).R[:, 2]
     assert float(up[0]) > 1e-3
     assert float(up[1]) < -1e-3
 
@@ -215,8 +215,8 @@ def test_flights_in_threads_are_the_same_flights(make):
         return after(make("wind"), 30, 10.0, (0.5, 0.2, 0.1)).vector()
 
     with ThreadPoolExecutor(2) as pool:
-        for found in pool.map(flight, range(4)):
-            np.testing.assert_array_equal(found, flight(None))
+        for result in pool.map(flight, range(4)):
+            np.testing.assert_array_equal(result, flight(None))
 
 
 def test_flights_are_in_the_dtype_of_their_start(make):
@@ -267,8 +267,8 @@ def test_flight_stops_the_plant_whatever_happens(plant):
 
 
 def test_leaving_the_context_stops_the_plant(plant):
-    with plant as entered:
-        assert entered is plant
+    with plant as entries:
+        assert entries is plant
         plant.reset(START)
         plant.step(Command.hover())
     with pytest.raises(PlantError, match="call reset first"):
@@ -296,10 +296,12 @@ def test_a_command_beyond_the_limits_is_clipped_and_reported(name):
         (Command(jnp.array(-5.0), jnp.array([0.0, -50.0, 0.0])), (low.c, 0.0, low.omega[1], 0.0)),
     ):
         plant.reset(START)
-        _, accepted = plant.step(wild)
-        np.testing.assert_allclose(accepted.vector(), within)
-        moved = after(plant, 5, wild.c, wild.omega)
-        np.testing.assert_array_equal(moved.vector(), after(plant, 5, accepted.c, accepted.omega).vector())
+        _, accepted_command = plant.step(wild)
+        np.testing.assert_allclose(accepted_command.vector(), within)
+        shift = after(plant, 5, wild.c, wild.omega)
+        np.testing.assert_array_equal(
+            shift.vector(), after(plant, 5, accepted_command.c, accepted_command.omega).vector()
+        )
 
 
 # ---- plants that need an extra
@@ -312,8 +314,8 @@ IMPORTED = {"rotorpy": "rotorpy.vehicles.hummingbird_params", "mujoco": "mujoco"
 def test_missing_extra_names_the_command_that_installs_it(name, monkeypatch):
     monkeypatch.setitem(sys.modules, IMPORTED[name], None)
     monkeypatch.setattr(crazyflow, "_simulator", crazyflow._simulator.__wrapped__)  # which remembers what it imported
-    wanted = rf"plant '{name}' needs the package '{name}' .*`uv pip install -e '\.\[{name}\]'`.*`pip install {name}`"
-    with pytest.raises(PlantError, match=wanted) as error:
+    expected = rf"plant '{name}' needs the package '{name}' .*`uv pip install -e '\.\[{name}\]'`.*`pip install {name}`"
+    with pytest.raises(PlantError, match=expected) as error:
         PLANTS[name]("none")
     assert isinstance(error.value.__cause__, ImportError)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import random_command, stacked
+from helpers import random_command, stack_trees
 from retrim import testing
 from retrim.config import Scenario, VehicleSpec
 from retrim.learn.stacking import stack
@@ -56,9 +56,9 @@ def test_measured_rates_are_the_analytical_step_response(delay, zeta):
     flying.reset(START)
     u = Command(jnp.array(9.81), jnp.array([1.0, -0.5, 0.3]))
     rates = np.array([flying.step(u)[0].omega for _ in range(30)])
-    risen = second_order(DT * np.arange(1, 31) - delay, 0.1, zeta)
+    rise = second_order(DT * np.arange(1, 31) - delay, 0.1, zeta)
     whole = abs(1e3 * delay - round(1e3 * delay)) < 1e-9
-    np.testing.assert_allclose(rates, risen[:, None] * np.asarray(u.omega), atol=1e-10 if whole else 1e-4)
+    np.testing.assert_allclose(rates, rise[:, None] * np.asarray(u.omega), atol=1e-10 if whole else 1e-4)
 
 
 def by_hand(response, us, delay, push, h=2e-4, gravity=9.81):
@@ -90,8 +90,8 @@ def test_a_flight_equals_one_by_hand(delay):
     us = np.array([9.81, 0.0, 0.0, 0.0]) + draw.normal(size=(40, 4)) * np.array([2.0, 1.5, 1.5, 1.0])
     flying = plant(disturbance=Constant(jnp.array(push)), delay_s=delay)
     flying.reset(START)
-    found = [flying.step(Command(jnp.array(u[0]), jnp.array(u[1:])))[0].x.vector() for u in us]
-    np.testing.assert_allclose(found, by_hand(SLOW, us, delay, push), atol=2e-3)
+    result = [flying.step(Command(jnp.array(u[0]), jnp.array(u[1:])))[0].x.vector() for u in us]
+    np.testing.assert_allclose(result, by_hand(SLOW, us, delay, push), atol=2e-3)
 
 
 def test_acceleration_is_measured_and_rotors_are_not():
@@ -131,7 +131,7 @@ def fly(simulation, us):
 
 
 def draw(n=15):
-    return stacked([random_command(k) for k in random.split(random.key(0), n)])
+    return stack_trees([random_command(k) for k in random.split(random.key(0), n)])
 
 
 VEHICLES = [(0.0, 0.015, 0.0, 1.0), (0.0374, 0.06, 2.0, 0.8), (0.06, 0.1, 1.0, 1.2), (0.08, 0.25, 0.5, 1.6)]
@@ -146,10 +146,10 @@ def simulations():
 def test_a_batch_of_vehicles_equals_its_members():
     us = draw()
     together = eqx.filter_jit(lambda many: eqx.filter_vmap(lambda each: fly(each, us))(many))
-    found = together(stack(list(simulations())))
+    result = together(stack(list(simulations())))
     for i, each in enumerate(simulations()):
         alone = eqx.filter_jit(fly)(each, us)
-        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(alone), strict=True):
+        for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-10, atol=1e-12)
 
 
@@ -175,22 +175,22 @@ def test_another_vehicle_is_never_another_program():
 def test_gradients_against_finite_differences():
     """Of the last state, in commands, start, delay and response."""
     us = draw(8)
-    given, simulation = (jnp.array(0.033), SLOW, us), plant().simulation
+    argument, simulation = (jnp.array(0.033), SLOW, us), plant().simulation
 
-    def cost(given):
-        delay, response, us = given
+    def cost(argument):
+        delay, response, us = argument
         vehicle = dataclasses.replace(simulation.model, response=response)
         x, rates = fly(dataclasses.replace(simulation, delay=delay, model=vehicle), us)
         return jnp.sum(x.p[-1] + 0.3 * x.v[-1] + 0.1 * rates[-1]) + jnp.sum(x.R[-1, 2])
 
     cost = jax.jit(cost)
-    slope = jax.grad(cost)(given)
-    leaves, shape = jax.tree.flatten(given)
+    slope = jax.grad(cost)(argument)
+    leaves, shape = jax.tree.flatten(argument)
     for k in random.split(random.key(3), 4):
         way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
         way = shape.unflatten([0.01 * each for each in way])
         h = 1e-3
-        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, given, way)) for s in (h, -h))
+        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, argument, way)) for s in (h, -h))
         expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
         assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-4)
     assert abs(float(slope[0])) > 1e-3

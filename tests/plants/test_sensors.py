@@ -50,11 +50,11 @@ def test_noise_has_the_stated_deviation(key):
     @jax.jit
     @jax.vmap
     def errors(key):
-        seen = sensors.noisy(x, key)
-        return (seen.p - x.p, seen.v - x.v, so3.log(x.R.T @ seen.R)), seen.R
+        observation = sensors.noisy(x, key)
+        return (observation.p - x.p, observation.v - x.v, so3.log(x.R.T @ observation.R)), observation.R
 
-    found, R = jax.tree.map(np.asarray, errors(random.split(key, n)))
-    for error, sigma in zip(found, (0.01, 0.2, 0.03), strict=True):
+    result, R = jax.tree.map(np.asarray, errors(random.split(key, n)))
+    for error, sigma in zip(result, (0.01, 0.2, 0.03), strict=True):
         np.testing.assert_allclose(error.std(axis=0), sigma, rtol=0.03)
         np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=5 * sigma / n**0.5)
         correlation = np.corrcoef(error.T) - np.eye(3)
@@ -99,10 +99,10 @@ def test_a_sample_is_as_old_as_it_says(latency):
 
 def test_dropout_holds_the_last_sample():
     flight = samples(plant(SensorModel.of(dropout=0.5), seed=3), ticks=400)
-    seen = np.stack([s.x.vector() for s in flight[1:]])
-    held = np.mean((seen[1:] == seen[:-1]).all(axis=1))
-    assert held == pytest.approx(0.25, abs=0.08)  # both samples of a tick lost
-    fresh = np.mean((seen == np.stack([s.truth.vector() for s in flight[1:]])).all(axis=1))
+    observation = np.stack([s.x.vector() for s in flight[1:]])
+    hold = np.mean((observation[1:] == observation[:-1]).all(axis=1))
+    assert hold == pytest.approx(0.25, abs=0.08)  # both samples of a tick lost
+    fresh = np.mean((observation == np.stack([s.truth.vector() for s in flight[1:]])).all(axis=1))
     assert fresh == pytest.approx(0.5, abs=0.1)
 
 
@@ -147,13 +147,13 @@ def test_impossible_times():
 
 
 def test_log_keeps_what_was_true_and_what_was_measured():
-    seen = []
+    observation = []
     rough = SensorModel.of(position=0.05, latency=20)
-    pilot = FunctionPilot(lambda measurement: seen.append(measurement) or TURN)
+    pilot = FunctionPilot(lambda measurement: observation.append(measurement) or TURN)
     log = fly(plant(rough), pilot, START, ticks=10)
     truth = samples(plant(), ticks=10)
     np.testing.assert_array_equal(log.p, np.stack([s.x.p for s in truth]))
     np.testing.assert_array_equal(log.R, np.stack([s.x.R for s in truth]))
-    np.testing.assert_array_equal(log.measured.p[:-1], np.stack([s.x.p for s in seen]))
-    assert not np.array_equal(seen[-1].x.p, log.p[-2])  # the pilot sees what the sensors show
-    same(seen[-1].true_state.p, log.p[-2])
+    np.testing.assert_array_equal(log.measured.p[:-1], np.stack([s.x.p for s in observation]))
+    assert not np.array_equal(observation[-1].x.p, log.p[-2])  # the pilot sees what the sensors show
+    same(observation[-1].true_state.p, log.p[-2])

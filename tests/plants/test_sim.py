@@ -17,21 +17,21 @@ MODELS = {"bem": BemQuadrotor, "simple": LinearDragQuadrotor}
 WILD = Command(jnp.array(12.0), jnp.array([1.0, -0.5, 0.3]))
 
 
-def simulated(model="simple", **options):
+def simulate(model="simple", **options):
     return SimPlant(MODELS[model].of(small(), 0.02), CALM, **options)
 
 
-def flown(delay_s, ticks=40):
-    plant = simulated(delay_s=delay_s)
+def fly_once(delay_s, ticks=40):
+    plant = simulate(delay_s=delay_s)
     plant.reset(START)
     return [plant.step(Command(jnp.array(9.81), jnp.array([1.0, 0.0, 0.0])))[0].x.R for _ in range(ticks)]
 
 
 def test_delay_shifts_the_response():
-    now, late, later = flown(0.0), flown(0.02), flown(0.04)
+    now, late, later = fly_once(0.0), fly_once(0.02), fly_once(0.04)
     np.testing.assert_allclose(late[1:], now[:-1], atol=1e-12)
     np.testing.assert_allclose(later[2:], now[:-2], atol=1e-12)
-    between = flown(0.025)  # not a whole tick: between one and two
+    between = fly_once(0.025)  # not a whole tick: between one and two
     angle = lambda Rs: float(Rs[4][2, 1])  # noqa: E731
     assert angle(later) < angle(between) < angle(late)
 
@@ -39,7 +39,7 @@ def test_delay_shifts_the_response():
 @pytest.mark.parametrize("delay_s", [-0.01, float("nan"), float("inf")])
 def test_impossible_delays(delay_s):
     with pytest.raises(ValueError, match="finite, non-negative number of seconds"):
-        simulated(delay_s=delay_s)
+        simulate(delay_s=delay_s)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.001, 0.02, 0.0213, 0.035, 0.0996, 0.2, 0.25])
@@ -48,15 +48,15 @@ def test_a_delay_is_exact_in_each_millisecond(dt, delay_s):
     """The commands that the model is given are those of a clock that counts in microseconds."""
     plant = SimPlant(CheapModel(dt), CALM, delay_s=delay_s)
     ticks, per_tick = round(0.3 / dt), round(1e3 * dt)
-    issued = 9.81 + np.arange(1.0, ticks + 1)
-    queue, found = plant.simulation.launch(START).queue, []
+    commands = 9.81 + np.arange(1.0, ticks + 1)
+    queue, result = plant.simulation.launch(START).queue, []
     arriving = eqx.filter_jit(lambda queue, delay: queue.substeps(delay, dt, per_tick))
-    for c in issued:
+    for c in commands:
         queue = queue.push(Command(jnp.array(c), jnp.zeros(3)))
-        found.append(np.asarray(arriving(queue, plant.simulation.delay).c))
+        result.append(np.asarray(arriving(queue, plant.simulation.delay).c))
     edges = np.arange(ticks * per_tick * 1000)  # [us]
-    acting = np.concatenate([np.full(round(1e6 * delay_s), 9.81), np.repeat(issued, round(1e6 * dt))])[: len(edges)]
-    np.testing.assert_allclose(np.concatenate(found), acting.reshape(-1, 1000).mean(axis=1), rtol=1e-9)
+    acting = np.concatenate([np.full(round(1e6 * delay_s), 9.81), np.repeat(commands, round(1e6 * dt))])[: len(edges)]
+    np.testing.assert_allclose(np.concatenate(result), acting.reshape(-1, 1000).mean(axis=1), rtol=1e-9)
 
 
 def test_another_delay_is_never_another_program():
@@ -101,7 +101,7 @@ def test_any_function_of_time_and_state_is_a_disturbance():
 @pytest.mark.parametrize("name", MODELS)
 def test_rates_acceleration_and_rotor_speeds_are_the_models(name):
     """Rates turn the attitude, the acceleration moves the velocity, and the rotors carry the weight at hover."""
-    plant = simulated(name)
+    plant = simulate(name)
     first = plant.reset(START)
     np.testing.assert_array_equal(first.omega, 0.0)
     np.testing.assert_array_equal(first.a, 0.0)
@@ -111,9 +111,9 @@ def test_rates_acceleration_and_rotor_speeds_are_the_models(name):
     for _ in range(10):
         measurement, _ = plant.step(WILD)
         np.testing.assert_allclose(measurement.a, (measurement.v - before.v) / 0.02, atol=1e-9)
-        turned = so3.log(before.R.T @ measurement.R) / 0.02  # the mean over the tick
+        rotation = so3.log(before.R.T @ measurement.R) / 0.02  # the mean over the tick
         low, high = jnp.minimum(before.omega, measurement.omega), jnp.maximum(before.omega, measurement.omega)
-        assert bool(jnp.all((turned > low - 0.1) & (turned < high + 0.1)))
+        assert bool(jnp.all((rotation > low - 0.1) & (rotation < high + 0.1)))
         before = measurement
     np.testing.assert_allclose(measurement.omega, WILD.omega, atol=0.35)
     assert bool(jnp.all(measurement.motor_speeds > first.motor_speeds))
@@ -121,7 +121,7 @@ def test_rates_acceleration_and_rotor_speeds_are_the_models(name):
 
 def test_rotor_speeds_give_the_thrust():
     """Of the simple model: 4 c_T Omega^2 (1 + thrust error) = m c, once the motors have settled."""
-    vehicle, plant = small(), simulated()
+    vehicle, plant = small(), simulate()
     plant.reset(START)
     for _ in range(25):
         measurement, _ = plant.step(Command(jnp.array(11.0), jnp.zeros(3)))
@@ -131,7 +131,7 @@ def test_rotor_speeds_give_the_thrust():
 
 def test_the_first_sample_is_as_noisy_as_the_others():
     sensors = SensorModel.of(position=0.01, gyro=0.1, accelerometer=0.5)
-    firsts = [simulated(sensors=sensors, seed=seed).reset(START) for seed in range(60)]
+    firsts = [simulate(sensors=sensors, seed=seed).reset(START) for seed in range(60)]
     errors = np.stack([m.x.p for m in firsts]) - np.asarray(START.p)
     np.testing.assert_allclose(errors.std(), 0.01, rtol=0.25)
     for m in firsts:
@@ -143,7 +143,7 @@ def test_the_first_sample_is_as_noisy_as_the_others():
 def test_inertial_noise_has_the_stated_deviation():
     """Around the true rates and accelerations, fresh every tick, and never in the state or the motion."""
     sensors = SensorModel.of(gyro=0.05, accelerometer=0.4)
-    noisy, exact = simulated(sensors=sensors), simulated()
+    noisy, exact = simulate(sensors=sensors), simulate()
     pairs = [(noisy.reset(START), exact.reset(START))]
     pairs += [(noisy.step(Command.hover())[0], exact.step(Command.hover())[0]) for _ in range(400)]
     for name, sigma in (("omega", 0.05), ("a", 0.4)):
@@ -157,7 +157,7 @@ def test_inertial_noise_has_the_stated_deviation():
 
 @pytest.mark.parametrize(("name", "age"), [("mocap", 0.0), ("rough", 0.01)])
 def test_a_measurement_tells_its_age(name, age):
-    plant = simulated(sensors=SENSORS.find(name)())
+    plant = simulate(sensors=SENSORS.find(name)())
     assert plant.reset(START).age == age
     assert plant.step(WILD)[0].age == age
 
@@ -165,13 +165,13 @@ def test_a_measurement_tells_its_age(name, age):
 def test_the_clock_of_a_long_flight_is_its_ticks_in_single_precision():
     """Ticks, not a sum of them: that drifts by milliseconds in a minute, and a tracking error with it."""
     model = CheapModel(0.02)
-    felt = Push(lambda t, x: t * jnp.ones(3, jnp.float32))
-    simulation = SimPlant(model, felt, delay_s=0.0).simulation
+    specific_force = Push(lambda t, x: t * jnp.ones(3, jnp.float32))
+    simulation = SimPlant(model, specific_force, delay_s=0.0).simulation
     x0 = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
-    launched = simulation.launch(x0)
+    launch = simulation.launch(x0)
     advance = eqx.filter_jit(simulation.advance)
     for tick in (0, 2999, 89_999):
-        after = advance(launched, Command.hover(jnp.float32), tick)
+        after = advance(launch, Command.hover(jnp.float32), tick)
         now = simulation.time(tick + 1, jnp.float32)
         assert now.dtype == jnp.float32
         np.testing.assert_allclose(now, 0.02 * (tick + 1), rtol=2e-7)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from made_up_vehicle import PointVehicle
+from fake_vehicle import PointVehicle
 from retrim.estimation.prediction import Prediction, Underway
 from retrim.live.processes.vehicle import _sample
 from retrim.onboard.guard import Limits
@@ -22,44 +22,44 @@ ages = st.floats(0.0, LONGEST_S)
 LEANING, THRUST, SPIN = (0.3, -0.2, 1.0), 12.0, (0.0, 0.0, 1.5)  # about its thrust axis, so that the motion is known
 
 
-def state(age, omega=(0.0, 0.0, 0.0), turned=(0.3, -0.2, 1.0), v=(1.0, -2.0, 0.5)):
-    R = Rotation.from_rotvec(turned).as_matrix()
+def state(age, omega=(0.0, 0.0, 0.0), rotation=(0.3, -0.2, 1.0), v=(1.0, -2.0, 0.5)):
+    R = Rotation.from_rotvec(rotation).as_matrix()
     return VehicleState(np.array([0.1, 0.2, 1.5]), R, np.array(v), np.array(omega), age)
 
 
 def test_what_is_new_stays_as_it_is():
     x = state(0.0, omega=(1.0, 2.0, 3.0))
-    for found, told in zip(x.carried_on(12.0)[:4], x[:4], strict=True):
-        np.testing.assert_allclose(found, told, atol=1e-12)
+    for result, message in zip(x.extrapolate(12.0)[:4], x[:4], strict=True):
+        np.testing.assert_allclose(result, message, atol=1e-12)
 
 
 @given(ages, st.lists(st.floats(-8.0, 8.0), min_size=3, max_size=3))
 def test_it_turns_by_its_body_rates(age, omega):
     x = state(age, omega)
-    turned = x.carried_on(9.81).R
-    np.testing.assert_allclose(turned, x.R @ Rotation.from_rotvec(age * np.array(omega)).as_matrix(), atol=1e-9)
+    rotation = x.extrapolate(9.81).R
+    np.testing.assert_allclose(rotation, x.R @ Rotation.from_rotvec(age * np.array(omega)).as_matrix(), atol=1e-9)
 
 
 @given(ages)
 def test_it_falls_without_thrust_and_hovers_with_it(age):
-    x = state(age, turned=(0.0, 0.0, 0.4))
-    fallen, hovered = x.carried_on(0.0), x.carried_on(9.81)
-    np.testing.assert_allclose(hovered.p, x.p + age * x.v, atol=1e-9)
-    np.testing.assert_allclose(hovered.v, x.v, atol=1e-9)
-    np.testing.assert_allclose(hovered.p - fallen.p, [0.0, 0.0, 0.5 * 9.81 * age**2], atol=1e-9)
-    np.testing.assert_allclose(hovered.v - fallen.v, [0.0, 0.0, 9.81 * age], atol=1e-9)
+    x = state(age, rotation=(0.0, 0.0, 0.4))
+    fall_state, hover_state = x.extrapolate(0.0), x.extrapolate(9.81)
+    np.testing.assert_allclose(hover_state.p, x.p + age * x.v, atol=1e-9)
+    np.testing.assert_allclose(hover_state.v, x.v, atol=1e-9)
+    np.testing.assert_allclose(hover_state.p - fall_state.p, [0.0, 0.0, 0.5 * 9.81 * age**2], atol=1e-9)
+    np.testing.assert_allclose(hover_state.v - fall_state.v, [0.0, 0.0, 9.81 * age], atol=1e-9)
 
 
 def test_no_age_is_left_the_news_keep_theirs_and_a_truth_is_carried_on_by_its_own():
     x = state(0.02)._replace(truth=state(0.01))
-    found = x.carried_on(9.81)
-    assert (found.age, found.truth.age) == (0.0, 0.0)
-    assert (found.news, found.truth.news) == (0.02, 0.01)
-    assert np.linalg.norm(found.p - found.truth.p) == pytest.approx(0.01 * np.linalg.norm(x.v), rel=0.1)
+    result = x.extrapolate(9.81)
+    assert (result.age, result.truth.age) == (0.0, 0.0)
+    assert (result.news, result.truth.news) == (0.02, 0.01)
+    assert np.linalg.norm(result.p - result.truth.p) == pytest.approx(0.01 * np.linalg.norm(x.v), rel=0.1)
 
 
 def test_what_is_old_is_not_carried_on_for_long():
-    old, older = state(LONGEST_S).carried_on(9.81), state(5.0).carried_on(9.81)
+    old, older = state(LONGEST_S).extrapolate(9.81), state(5.0).extrapolate(9.81)
     np.testing.assert_allclose(older.p, old.p)
     assert (old.age, older.age) == (0.0, 5.0 - LONGEST_S)
     assert older.news == 5.0
@@ -90,7 +90,7 @@ def at(t):
     return x._replace(p=x.p + t * x.v + 0.5 * t * t * a, R=R, v=x.v + t * a)
 
 
-def worked_with(x, age):
+def use(x, age):
     """What a controller that looks ahead takes for the present state."""
     acting = Command(jnp.array(THRUST), jnp.array(SPIN))
     prediction = Prediction.of(CommandPath.of(), 0.02).with_age(age)
@@ -98,8 +98,8 @@ def worked_with(x, age):
     return prediction(Underway(ActuatorState.at(acting), queue), x, jnp.zeros(3))[0]
 
 
-def agrees(found, true):
-    for one, other in zip((found.p, found.R, found.v), true[:3], strict=True):
+def agrees(result, true):
+    for one, other in zip((result.p, result.R, result.v), true[:3], strict=True):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
 
 
@@ -109,7 +109,7 @@ def test_a_controller_that_looks_ahead_works_with_the_present_state(late):
     plant = Spinning(late)
     plant.reset(None)
     measurement, _ = plant.step(Command(jnp.array(THRUST), jnp.array(SPIN)))
-    agrees(worked_with(measurement.x, measurement.age), at(0.0))
+    agrees(use(measurement.x, measurement.age), at(0.0))
 
 
 @pytest.mark.parametrize("late", [0.0, 0.02, 0.08, 0.099])
@@ -118,7 +118,7 @@ def test_so_does_one_in_a_live_flight(late):
     plant.send(np.array([THRUST, *SPIN]))
     sample = _sample(3, 0.02, plant.now(), np.zeros(4))
     p, R, v = np.split(jnp.asarray(sample.state), [3, 12])
-    agrees(worked_with(State(p, R.reshape(3, 3), v), sample.age), at(0.0))
+    agrees(use(State(p, R.reshape(3, 3), v), sample.age), at(0.0))
     assert sample.age <= Limits.state_age
 
 

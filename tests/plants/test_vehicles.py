@@ -20,7 +20,7 @@ PORT = 24560
 against_the_clock = pytest.mark.slow
 
 
-def flown_by(speaks="mavlink", *words, port=PORT):
+def start_vehicle(speaks="mavlink", *words, port=PORT):
     """A process that stands in for an autopilot and its vehicle."""
     if speaks == "mavlink" and importlib.util.find_spec("pymavlink") is None:
         pytest.skip("the extra mavlink is not installed")
@@ -33,19 +33,19 @@ def link(port=PORT, speaks="mavlink", **changes):
 
 @against_the_clock
 def test_mavlink_conforms():
-    with flown_by():
+    with start_vehicle():
         testing.check_vehicle(link)
 
 
 @against_the_clock
 def test_a_crazyflie_conforms():
-    with flown_by("crazyflie", port=PORT + 5):
+    with start_vehicle("crazyflie", port=PORT + 5):
         testing.check_vehicle(lambda: link(PORT + 5, "crazyflie"))
 
 
 @against_the_clock
 def test_another_vehicle_conforms():
-    testing.check_vehicle(lambda: Scenario(plant="made_up_vehicle:calm").make("small"))
+    testing.check_vehicle(lambda: Scenario(plant="fake_vehicle:calm").make("small"))
 
 
 def hovering(plant):
@@ -62,7 +62,7 @@ def step_for(plant, seconds):
 
 @against_the_clock
 def test_hover_thrust_is_learnt_and_a_pilot_who_takes_over_is_left_alone():
-    with flown_by("mavlink", "--takes-over", "1.0"):
+    with start_vehicle("mavlink", "--takes-over", "1.0"):
         plant = hovering(link())
         vehicle = Scenario(plant="simple").make_vehicle("small")  # whose thrust is 3.5 % more than commanded
         assert plant.thrust.hover == pytest.approx(float(9.81 * vehicle.mass / vehicle.thrust_max / 1.035), rel=0.02)
@@ -75,7 +75,7 @@ def test_hover_thrust_is_learnt_and_a_pilot_who_takes_over_is_left_alone():
 
 @against_the_clock
 def test_silence_is_noticed():
-    with flown_by("mavlink", "--cut", "0.5", "60"):
+    with start_vehicle("mavlink", "--cut", "0.5", "60"):
         plant = hovering(link())
         with pytest.raises(PlantError, match="silent for 2 s"):
             step_for(plant, 10.0)
@@ -84,7 +84,7 @@ def test_silence_is_noticed():
 
 @against_the_clock
 def test_a_crazyflie_that_is_silent_is_noticed():
-    with flown_by("crazyflie", "--cut", "0.5", "60", port=PORT + 6):
+    with start_vehicle("crazyflie", "--cut", "0.5", "60", port=PORT + 6):
         plant = hovering(link(PORT + 6, "crazyflie"))
         vehicle = Scenario(plant="simple").make_vehicle("small")
         share = float(9.81 * vehicle.mass / vehicle.thrust_max / 1.035)
@@ -101,7 +101,7 @@ def test_no_crazyflie_there_is_named(monkeypatch):
 
 
 def test_nobody_there_is_named(monkeypatch):
-    monkeypatch.setattr(mavlink, "HEARD_S", 0.3)
+    monkeypatch.setattr(mavlink, "LISTENS_S", 0.3)
     with link(PORT + 1) as plant, pytest.raises(PlantError, match=r"no autopilot was heard there in 0\.3 s"):
         plant.connect()
 
@@ -134,13 +134,13 @@ def test_a_vehicle_is_known_by_its_name_and_address(plant):
     assert Scenario(plant=plant).entry.is_vehicle
 
 
-@pytest.mark.parametrize("plant", ["bem", "simple", "made_up_vehicle:point"])
+@pytest.mark.parametrize("plant", ["bem", "simple", "fake_vehicle:point"])
 def test_what_can_be_stopped_in_time_is_no_vehicle(plant):
-    assert is_vehicle(plant) == plant.startswith("made_up")
+    assert is_vehicle(plant) == plant.startswith("fake")
 
 
 @pytest.mark.parametrize(
-    ("asked", "why"),
+    ("calls", "why"),
     [
         ({"disturbance": "large"}, "a vehicle, whose world nobody can disturb by name"),
         ({"sensors": "rough"}, "sensors 'rough' need bem, simple or second-order"),
@@ -148,9 +148,9 @@ def test_what_can_be_stopped_in_time_is_no_vehicle(plant):
         ({"delay": 0.05}, "its own command delay"),
     ],
 )
-def test_what_a_vehicle_cannot_be_asked_is_refused_before_it_flies(asked, why):
+def test_what_a_vehicle_cannot_be_asked_is_refused_before_it_flies(calls, why):
     with pytest.raises(ConfigError, match=why):
-        Scenario(plant="mavlink", **asked)
+        Scenario(plant="mavlink", **calls)
 
 
 @pytest.mark.parametrize("address", ["udp:nowhere", "14540", "tcp:127.0.0.1:5760"])
@@ -184,12 +184,12 @@ def test_commands_stay_within_what_the_vehicle_takes():
 
     class Deaf(MavlinkLink):
         def __init__(self):
-            self.sent, self.reading, self.heard = None, None, 0.0
+            self.transmission, self.reading, self.last_message = None, None, 0.0
 
         def fly_rates(self, thrust, omega):
-            self.sent = thrust, omega
+            self.transmission = thrust, omega
 
     plant._link = deaf = Deaf()
-    taken = plant.send(np.array([1e3, 99.0, -99.0, 0.0]))
-    assert deaf.sent[0] == 1.0
-    assert taken == pytest.approx([2 * 9.81, plant.high[1], plant.low[2], 0.0])
+    extract = plant.send(np.array([1e3, 99.0, -99.0, 0.0]))
+    assert deaf.transmission[0] == 1.0
+    assert extract == pytest.approx([2 * 9.81, plant.high[1], plant.low[2], 0.0])

@@ -20,34 +20,34 @@ VEHICLE = VehicleSpec(
 
 
 @pytest.fixture(scope="module")
-def flown(as_a_user):
+def sample_flight(as_a_user):
     """A flight of a vehicle of second order by a geometric controller, and a set-up that does not know the vehicle."""
     scenario = Scenario("kick", plant="second-order", vehicle=VEHICLE, delay=0.03)
-    known = dataclasses.replace(load("hover/retrim"), vehicle=VEHICLE)
-    policy = Setup.from_preset(known).new_policy(jax.random.key(0))
-    (flight,) = Fleet(known, policy, [scenario], methods=("geometric",), starts=1, seconds=12.0).run().flown
+    model = dataclasses.replace(load("hover/retrim"), vehicle=VEHICLE)
+    policy = Setup.from_preset(model).new_policy(jax.random.key(0))
+    (flight,) = Fleet(model, policy, [scenario], methods=("geometric",), starts=1, seconds=12.0).run().flights
     return flight, Setup.from_preset("hover/retrim")
 
 
-def test_the_file_has_the_delay_the_lags_and_the_damping_of_the_vehicle(flown, tmp_path):
-    flight, setup = flown
+def test_the_file_has_the_delay_the_lags_and_the_damping_of_the_vehicle(sample_flight, tmp_path):
+    flight, setup = sample_flight
     path = tmp_path / "found.toml"
     assert save_flight_vehicle(flight, setup, path) == ([path], 0)
-    found = read_vehicle(path)
-    assert found.command_delay == pytest.approx(0.03, abs=0.002)
-    assert found.rate_lag[0] == pytest.approx(0.08, rel=0.05)
-    assert found.rate_damping[0] == pytest.approx(0.7, rel=0.1)
-    assert found.motor_tau == pytest.approx(0.04, rel=0.15)
-    assert found.mass == pytest.approx(float(setup.vehicle.mass))  # a flight does not show it
+    result = read_vehicle(path)
+    assert result.command_delay == pytest.approx(0.03, abs=0.002)
+    assert result.rate_lag[0] == pytest.approx(0.08, rel=0.05)
+    assert result.rate_damping[0] == pytest.approx(0.7, rel=0.1)
+    assert result.motor_tau == pytest.approx(0.04, rel=0.15)
+    assert result.mass == pytest.approx(float(setup.vehicle.mass))  # a flight does not show it
 
 
-def test_without_the_option_nothing_is_written(flown):
-    assert save_flight_vehicle(*flown, None) == ([], 0)
+def test_without_the_option_nothing_is_written(sample_flight):
+    assert save_flight_vehicle(*sample_flight, None) == ([], 0)
     check_vehicle_file(None)
 
 
-def test_a_flight_that_is_too_short_is_refused_in_one_line(flown, tmp_path, capsys):
-    flight, setup = flown
+def test_a_flight_that_is_too_short_is_refused_in_one_line(sample_flight, tmp_path, capsys):
+    flight, setup = sample_flight
     log = flight.log
     cut = lambda states: type(states)(*(part[:20] for part in states))  # noqa: E731
     short = log._replace(

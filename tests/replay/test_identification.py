@@ -42,15 +42,15 @@ def driven(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0
     c = 9.81 / gain + size * wander(rng, n, 1.5, 0.3)
     w = size * np.stack([wander(rng, n, 0.8, 0.2), wander(rng, n, 0.8, 0.2), wander(rng, n, 0.5, 0.5)], axis=1)
     j = np.maximum(0, np.arange(n * SUB) - round(delay / h)) // SUB
-    keep, started = np.exp(-h / np.array([lag, *rate_lag])), np.array([9.81 / gain, 0.0, 0.0, 0.0])
+    keep, start_time = np.exp(-h / np.array([lag, *rate_lag])), np.array([9.81 / gain, 0.0, 0.0, 0.0])
     acts = np.stack(
-        [_following(u, k, at) for u, k, at in zip(np.column_stack([c, w])[j].T, keep, started, strict=True)]
+        [_following(u, k, at) for u, k, at in zip(np.column_stack([c, w])[j].T, keep, start_time, strict=True)]
     )
     thrust, turns = acts[0], _turns(h * acts[1:].T)
     R = np.stack(list(accumulate(turns[:-1], np.matmul, initial=np.eye(3))))
-    gained = h * (gain * thrust[:, None] * R[:, :, 2] - np.array([0, 0, 9.81]))
-    kept = np.eye(3) - h * (R * np.array(drag)) @ np.swapaxes(R, 1, 2)
-    steps = zip(kept[:-1], gained[:-1], strict=True)
+    speed_gain = h * (gain * thrust[:, None] * R[:, :, 2] - np.array([0, 0, 9.81]))
+    rest = np.eye(3) - h * (R * np.array(drag)) @ np.swapaxes(R, 1, 2)
+    steps = zip(rest[:-1], speed_gain[:-1], strict=True)
     v = np.stack(list(accumulate(steps, lambda v, step: step[0] @ v + step[1], initial=np.zeros(3))))
     p = h * (np.cumsum(v, axis=0) - v)
     p, v, R = (x[::SUB] for x in (p, v, R))
@@ -60,9 +60,9 @@ def driven(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0
     return FlightLog(DT * np.arange(n), p, R, v, np.zeros_like(v), c, np.zeros((n, 3)), w, valid, DT, None, ())
 
 
-def _following(wanted, keep, y):
+def _following(expected, keep, y):
     """What follows ``setpoint`` and keeps that share of its distance to it in a step; ``y`` is where it begins."""
-    return lfilter([1 - keep], [1, -keep], wanted, zi=[keep * y])[0]
+    return lfilter([1 - keep], [1, -keep], expected, zi=[keep * y])[0]
 
 
 def _turns(phi):
@@ -79,17 +79,17 @@ def _turns(phi):
     ],
 )
 def test_what_was_put_in_is_found(seed, truth):
-    found = identify(driven(seed, **truth))
-    assert found.delay.value == pytest.approx(truth["delay"], abs=0.003)
-    assert found.thrust_lag.value == pytest.approx(truth["lag"], abs=0.004)
-    assert found.thrust_gain.value == pytest.approx(truth["gain"], abs=0.01)
-    assert found.rate_lag.value == pytest.approx(truth["rate_lag"][0], abs=0.004)
-    assert found.yaw_lag.value == pytest.approx(truth["rate_lag"][2], rel=0.1)
-    assert found.rate_gain.value == pytest.approx(1.0, abs=0.02)
-    np.testing.assert_allclose([d.value for d in found.drag], truth["drag"], atol=0.02)
-    for each in (found.delay, found.thrust_lag, found.thrust_gain, found.rate_lag, *found.drag):
+    result = identify(driven(seed, **truth))
+    assert result.delay.value == pytest.approx(truth["delay"], abs=0.003)
+    assert result.thrust_lag.value == pytest.approx(truth["lag"], abs=0.004)
+    assert result.thrust_gain.value == pytest.approx(truth["gain"], abs=0.01)
+    assert result.rate_lag.value == pytest.approx(truth["rate_lag"][0], abs=0.004)
+    assert result.yaw_lag.value == pytest.approx(truth["rate_lag"][2], rel=0.1)
+    assert result.rate_gain.value == pytest.approx(1.0, abs=0.02)
+    np.testing.assert_allclose([d.value for d in result.drag], truth["drag"], atol=0.02)
+    for each in (result.delay, result.thrust_lag, result.thrust_gain, result.rate_lag, *result.drag):
         assert each.low <= each.value <= each.high
-    gain = found.thrust_gain
+    gain = result.thrust_gain
     assert gain.low - 0.005 <= truth["gain"] <= gain.high + 0.005
 
 
@@ -101,17 +101,17 @@ def test_a_controller_that_answers_noise_is_no_vehicle_that_follows():
     R = Rotation.from_rotvec(tilt).as_matrix()
     command, c = -8.0 * tilt, 9.81 - 4.0 * v[:, 2]
     log = FlightLog(DT * np.arange(n), v * 0, R, v, v * 0, c, v * 0, command, np.ones(n, bool), DT, None, ())
-    found = identify(log)
-    assert found.delay is found.thrust_gain is found.rate_lag is found.yaw_lag is None
-    assert found.drag == (None, None, None)
+    result = identify(log)
+    assert result.delay is result.thrust_gain is result.rate_lag is result.yaw_lag is None
+    assert result.drag == (None, None, None)
 
 
 def test_without_commanded_rates_the_thrust_is_still_known():
     truth = {"delay": 0.03, "lag": 0.06, "rate_lag": (0.05, 0.05, 0.2), "gain": 0.9, "drag": (0.3, 0.3, 0.1)}
-    found = identify(dataclasses.replace(driven(2, **truth), command=None))
-    assert found.rate_lag is None
-    assert found.thrust_gain.value == pytest.approx(0.9, abs=0.01)
-    assert found.delay.value + found.thrust_lag.value == pytest.approx(0.09, abs=0.01)
+    result = identify(dataclasses.replace(driven(2, **truth), command=None))
+    assert result.rate_lag is None
+    assert result.thrust_gain.value == pytest.approx(0.9, abs=0.01)
+    assert result.delay.value + result.thrust_lag.value == pytest.approx(0.09, abs=0.01)
 
 
 def test_a_short_flight_is_refused():

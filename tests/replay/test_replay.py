@@ -9,20 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fake_log import MAP, columns, fly_once, write_csv, write_map
 from helpers import tiny_preset
-from made_up_log import MAP, columns, flown, write_csv, write_map
 from retrim.config.loading import load
 from retrim.config.setup import Setup
 from retrim.config.vehicle_file import read_vehicle
 from retrim.config.vehicles import make_vehicle
 from retrim.errors import ConfigError, LogError
 from retrim.io.logs import read_flight_log, read_map
-from retrim.io.trained import save_policy
+from retrim.io.policies import save_policy
 from retrim.replay import identification
-from retrim.replay.adaptation import Adapted, adapt_to
-from retrim.replay.identification import Estimate, Identified
+from retrim.replay.adaptation import AdaptationResult, adapt_to
+from retrim.replay.identification import Estimate, IdentifiedVehicle
 from retrim.replay.prediction import Protocol, predict_log
-from retrim.replay.predictors import learnt, mean_of, ridge, yardsticks
+from retrim.replay.predictors import mean_of, model_factory, ridge, yardsticks
 from retrim.replay.replay import Replay, replay
 from retrim.replay.rows import rows_of
 from retrim.runkit.reporter import Silent
@@ -38,13 +38,13 @@ SHORT = Protocol(buffer=2.0, horizon=1.0, every=1.0)
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("log")
-    return write_csv(folder / "log.csv", columns(flown(14.0, wind=PUSH))), write_map(folder / "map.toml", MAP)
+    return write_csv(folder / "log.csv", columns(fly_once(14.0, wind=PUSH))), write_map(folder / "map.toml", MAP)
 
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory):
     """A log that is long enough to be foretold, and too short to be identified."""
-    return write_csv(tmp_path_factory.mktemp("brief") / "log.csv", columns(flown(7.0, wind=PUSH)))
+    return write_csv(tmp_path_factory.mktemp("brief") / "log.csv", columns(fly_once(7.0, wind=PUSH)))
 
 
 @pytest.fixture(scope="module")
@@ -60,28 +60,30 @@ def test_the_residual_of_a_push_is_the_push(log):
 
 
 def test_a_push_is_foretold_and_zero_misses_all_of_it(log):
-    found = {each.name: each for each in predict_log(rows_of(log), log.dt, yardsticks(log.dt), SHORT)}
-    assert found["zero"].rmse == pytest.approx(np.linalg.norm(PUSH), rel=1e-2)
+    result = {each.name: each for each in predict_log(rows_of(log), log.dt, yardsticks(log.dt), SHORT)}
+    assert result["zero"].rmse == pytest.approx(np.linalg.norm(PUSH), rel=1e-2)
     for name in ("last second", "mean of the buffer", "ridge"):
-        assert found[name].rmse < 0.02
-    assert found["zero"].per_axis == pytest.approx(np.abs(PUSH), abs=0.01)
-    assert found["zero"].times == tuple(np.arange(2.0, 6.5, 1.0)[: len(found["zero"].times)])
+        assert result[name].rmse < 0.02
+    assert result["zero"].per_axis == pytest.approx(np.abs(PUSH), abs=0.01)
+    assert result["zero"].times == tuple(np.arange(2.0, 6.5, 1.0)[: len(result["zero"].times)])
 
 
 @pytest.mark.parametrize("name", ["regression", "linear", "ensemble"])
 def test_residual_models_foretell_a_push(log, name):
     preset = load("hover/retrim")
-    begin = learnt(name, preset, make_vehicle("small"), 0, window=100, fit_every=1.0, fit_steps=100)
-    (found,) = predict_log(rows_of(log), log.dt, {name: begin}, SHORT)
-    assert found.rmse < 0.35
+    begin = model_factory(name, preset, make_vehicle("small"), 0, window=100, fit_every=1.0, fit_steps=100)
+    (result,) = predict_log(rows_of(log), log.dt, {name: begin}, SHORT)
+    assert result.rmse < 0.35
 
 
 def test_only_valid_rows_count(log):
     rows = rows_of(log)
     spoilt = jnp.arange(rows.valid.shape[0]) % 7 == 0
-    damaged = type(rows)(rows.x, rows.u, jnp.where(spoilt[:, None], 99.0, rows.a_res), rows.omega, rows.valid & ~spoilt)
+    bad_file = type(rows)(
+        rows.x, rows.u, jnp.where(spoilt[:, None], 99.0, rows.a_res), rows.omega, rows.valid & ~spoilt
+    )
     for name, begin in (("mean", lambda: mean_of), ("ridge", lambda: ridge)):
-        (a,) = predict_log(damaged, log.dt, {name: begin}, SHORT)
+        (a,) = predict_log(bad_file, log.dt, {name: begin}, SHORT)
         assert a.rmse < 0.02
 
 
@@ -91,7 +93,7 @@ def test_a_log_that_is_too_short_says_what_to_choose(log):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "text"),
     [
         ({"buffer": 0.0}, "--buffer 0"),
         ({"delay": 2.0}, "--delay 2"),
@@ -100,49 +102,49 @@ def test_a_log_that_is_too_short_says_what_to_choose(log):
         ({"updates": 0}, "--updates 0"),
     ],
 )
-def test_what_cannot_be_asked_is_named(wrong, said):
-    with pytest.raises(ConfigError, match=said):
+def test_what_cannot_be_asked_is_named(wrong, text):
+    with pytest.raises(ConfigError, match=text):
         Replay(**wrong)
 
 
 def test_a_report_is_a_table_a_picture_and_json(files, tmp_path, monkeypatch):
     monkeypatch.setattr(identification, "DRAWS", 20)
-    path, chosen = files
+    path, choice = files
     run = Run("replay", tmp_path)
-    replay(path, Replay(map=str(chosen), buffer=2.0, horizon=1.0, identify=True), run, Silent())
+    replay(path, Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True), run, Silent())
     text = (tmp_path / "replay.md").read_text()
     assert "What the point mass missed" in text
     assert "| linear |" in text
     assert (tmp_path / "replay.png").stat().st_size > 10_000
-    found = json.loads((tmp_path / "replay.json").read_text())
-    assert {row["name"] for row in found["rows"]} >= {"zero", "ridge", "regression", "ensemble", "linear"}
-    assert found["identified"]["thrust_gain"][0] == pytest.approx(1.0, abs=0.02)
+    result = json.loads((tmp_path / "replay.json").read_text())
+    assert {row["name"] for row in result["rows"]} >= {"zero", "ridge", "regression", "ensemble", "linear"}
+    assert result["identified"]["thrust_gain"][0] == pytest.approx(1.0, abs=0.02)
     assert "# Identified from log.csv" in (tmp_path / "vehicle.toml").read_text()
 
 
 def test_a_slower_log_has_its_own_tick_and_no_policy_adapts_to_it(tmp_path):
-    path = write_csv(tmp_path / "log.csv", columns(flown(6.0, dt=1 / 30, wind=PUSH)))
-    asked = Replay(map=str(write_map(tmp_path / "map.toml")), buffer=100 / 30, horizon=50 / 30)
-    document = replay(path, asked, Run("replay", tmp_path), Silent())
+    path = write_csv(tmp_path / "log.csv", columns(fly_once(6.0, dt=1 / 30, wind=PUSH)))
+    calls = Replay(map=str(write_map(tmp_path / "map.toml")), buffer=100 / 30, horizon=50 / 30)
+    document = replay(path, calls, Run("replay", tmp_path), Silent())
     assert "a tick of 33.33 ms" in document.sections[1].about
     save_policy(
         tmp_path / "p.safetensors", Setup.from_preset(tiny_preset()).new_policy(jax.random.key(0)), tiny_preset()
     )
-    asked = dataclasses.replace(asked, adapt="full", policy=tmp_path / "p.safetensors")
+    calls = dataclasses.replace(calls, adapt="full", policy=tmp_path / "p.safetensors")
     with pytest.raises(LogError, match=r"a sample every 33.3 ms, but the policy's tick is 20 ms"):
-        replay(path, asked, Run("replay", tmp_path), Silent())
+        replay(path, calls, Run("replay", tmp_path), Silent())
 
 
 def test_a_buffer_that_holds_too_few_samples_is_named(files, tmp_path, monkeypatch):
     """0.2 s are ten samples at 50 Hz; what is enough is said, and is enough."""
-    path, chosen = files
+    path, choice = files
     with pytest.raises(ConfigError, match=r"--buffer 0\.2: must be 0\.26 to .* every 20 ms") as error:
-        replay(path, Replay(map=str(chosen), buffer=0.2, horizon=1.0), Run("replay", tmp_path), Silent())
+        replay(path, Replay(map=str(choice), buffer=0.2, horizon=1.0), Run("replay", tmp_path), Silent())
     assert "\n" not in str(error.value)
-    made = []
-    monkeypatch.setattr(replays, "predict_log", lambda rows, dt, predictors, protocol: made.extend(predictors) or ())
-    replay(path, Replay(map=str(chosen), buffer=0.26, horizon=1.0), Run("replay", tmp_path), Silent())
-    assert "regression" in made
+    setup = []
+    monkeypatch.setattr(replays, "predict_log", lambda rows, dt, predictors, protocol: setup.extend(predictors) or ())
+    replay(path, Replay(map=str(choice), buffer=0.26, horizon=1.0), Run("replay", tmp_path), Silent())
+    assert "regression" in setup
 
 
 HEAVY = """
@@ -161,47 +163,47 @@ drag_area = [0.01, 0.02, 0.03]
 
 
 def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, monkeypatch):
-    path, chosen = files
+    path, choice = files
     (tmp_path / "heavy.toml").write_text(HEAVY)
     drag = Estimate(0.3, 0.2, 0.4)  # in a comment of the file
-    found = Identified(*[None] * 9, (drag, None, None), 0.1)
-    monkeypatch.setattr(replays, "identify", lambda log, seed: found)
-    monkeypatch.setattr(replays, "_foretold", lambda *asked: [])
+    result = IdentifiedVehicle(*[None] * 9, (drag, None, None), 0.1)
+    monkeypatch.setattr(replays, "identify", lambda log, seed: result)
+    monkeypatch.setattr(replays, "_foretold", lambda *calls: [])
     vehicle = str(tmp_path / "heavy.toml")
-    asked = Replay(map=str(chosen), buffer=2.0, horizon=1.0, identify=True, vehicle=vehicle)
-    replay(path, asked, Run("replay", tmp_path), Silent())
+    calls = Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True, vehicle=vehicle)
+    replay(path, calls, Run("replay", tmp_path), Silent())
     assert "0.3 1/s" in (tmp_path / "vehicle.toml").read_text()
-    told, kept = read_vehicle(tmp_path / "vehicle.toml"), read_vehicle(tmp_path / "heavy.toml")
-    assert told == dataclasses.replace(kept, name="heavy-identified")
+    message, rest = read_vehicle(tmp_path / "vehicle.toml"), read_vehicle(tmp_path / "heavy.toml")
+    assert message == dataclasses.replace(rest, name="heavy-identified")
 
 
 def test_no_vehicle_file_is_written_of_a_log_that_says_nothing(brief, files, tmp_path, monkeypatch):
-    monkeypatch.setattr(replays, "identify", lambda log, seed: Identified(*[None] * 9, (None, None, None), 0.1))
-    monkeypatch.setattr(replays, "_foretold", lambda *asked: [])
-    asked = Replay(map=str(files[1]), buffer=2.0, horizon=1.0, identify=True)
-    document = replay(brief, asked, Run("replay", tmp_path), Silent())
+    monkeypatch.setattr(replays, "identify", lambda log, seed: IdentifiedVehicle(*[None] * 9, (None, None, None), 0.1))
+    monkeypatch.setattr(replays, "_foretold", lambda *calls: [])
+    calls = Replay(map=str(files[1]), buffer=2.0, horizon=1.0, identify=True)
+    document = replay(brief, calls, Run("replay", tmp_path), Silent())
     assert "no vehicle file is written" in document.sections[-1].about
     assert not (tmp_path / "vehicle.toml").exists()
 
 
 def test_a_report_begins_with_what_is_doubtful_and_shows_every_figure(tmp_path, monkeypatch):
     """A column that is not the thrust, as a battery's voltage; then the thrust."""
-    monkeypatch.setattr(replays, "_foretold", lambda *asked: [])
-    flight = flown(7.0, size=3.0)
-    chosen = write_map(tmp_path / "map.toml", thrust__unit='"share"')
-    said = []
+    monkeypatch.setattr(replays, "_foretold", lambda *calls: [])
+    flight = fly_once(7.0, size=3.0)
+    choice = write_map(tmp_path / "map.toml", thrust__unit='"share"')
+    text = []
     for name, column in (("voltage", 4.1 - 0.01 * flight.t), ("thrust", 0.05 * flight.c)):
         path = write_csv(tmp_path / f"{name}.csv", columns(flight) | {"c": column})
         run = Run("replay", tmp_path / name)
-        document = replay(path, Replay(map=str(chosen), buffer=2.0, horizon=1.0), run, Silent())
-        said.append((tmp_path / name / "replay.md").read_text())
+        document = replay(path, Replay(map=str(choice), buffer=2.0, horizon=1.0), run, Silent())
+        text.append((tmp_path / name / "replay.md").read_text())
         figures = {row[0]: row[1] for row in document.sections[0].rows}
         assert figures["motion of the position, by the velocity"] == "100 %"
-        stored = json.loads((tmp_path / name / "replay.json").read_text())["agreement"]
-        assert set(stored) == {"motion", "lift", "climb", "turning"}
+        store = json.loads((tmp_path / name / "replay.json").read_text())["agreement"]
+        assert set(store) == {"motion", "lift", "climb", "turning"}
     warning = "**Warning: this log agrees badly with itself, and no figure below can be relied on: thrust explains "
-    assert said[0].index(warning) < said[0].index("## ")
-    assert "Warning" not in said[1]
+    assert text[0].index(warning) < text[0].index("## ")
+    assert "Warning" not in text[1]
 
 
 def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
@@ -225,14 +227,16 @@ def test_a_policy_is_adapted_with_its_own_residual_and_a_model_that_it_cannot_ho
     save_policy(tmp_path / "p.safetensors", policy, preset)
     used = []
 
-    def adapted(rows, setup, policy, **asked):
+    def adapt(rows, setup, policy, **calls):
         used.append(setup.preset.adapt.residual)
-        return Adapted(setup.learner.init(policy, jax.random.key(0)), 0, 5, 3.0, 3.0 if len(used) == 1 else 0.1)
+        return AdaptationResult(
+            setup.learner.init(policy, jax.random.key(0)), 0, 5, 3.0, 3.0 if len(used) == 1 else 0.1
+        )
 
-    monkeypatch.setattr(replays, "adapt_to", adapted)
-    said = []
+    monkeypatch.setattr(replays, "adapt_to", adapt)
+    text = []
     for residual in (None, "linear"):
-        asked = Replay(
+        calls = Replay(
             map=str(files[1]),
             buffer=2.0,
             horizon=1.0,
@@ -240,6 +244,6 @@ def test_a_policy_is_adapted_with_its_own_residual_and_a_model_that_it_cannot_ho
             policy=tmp_path / "p.safetensors",
             residual=residual,
         )
-        said.append(replay(brief, asked, Run("replay", tmp_path), Silent()).sections[-1].about)
+        text.append(replay(brief, calls, Run("replay", tmp_path), Silent()).sections[-1].about)
     assert used == ["regression", "linear"]
-    assert ["the policy does not hold" in each for each in said] == [True, False]
+    assert ["the policy does not hold" in each for each in text] == [True, False]

@@ -17,7 +17,7 @@ from retrim.adapt import PolicyUpdate, Rejection, ResidualUpdate, ResidualWorker
 from retrim.config import Scenario, Setup, changed
 from retrim.physics import Command
 from retrim.plants import Plant
-from retrim.runtime import AdaptivePilot, Learner, LockstepLearner, Scheduled, fly, lockstep
+from retrim.runtime import AdaptivePilot, Learner, LockstepLearner, ScheduledLearner, fly, lockstep
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
@@ -27,22 +27,22 @@ TRACES = []
 
 
 @pytest.fixture(scope="module")
-def trained():
+def trained_policy():
     """A set-up whose learner counts its traces, and a policy that was trained."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset(adapt=BRISK))
-        learner = eqx.tree_at(lambda l: l.env.task, setup.learner, counted(setup.env.task))
+        learner = eqx.tree_at(lambda l: l.env.task, setup.learner, count(setup.env.task))
         return dataclasses.replace(setup, learner=learner), setup.pretrained(1)
 
 
 @pytest.fixture(scope="module")
-def flown(trained):
+def sample_flight(trained_policy):
     """3.2 s of a flight that learns, and its pilot."""
     with jax.numpy_dtype_promotion("standard"):
-        return flight(*trained, 3.2)
+        return flight(*trained_policy, 3.2)
 
 
-def counted(task):
+def count(task):
     class Counting(type(task)):
         def reward(self, t, x, u):
             TRACES.append(1)
@@ -103,42 +103,42 @@ class QueueLearner(Learner):
 
     def __init__(self, answers=()):
         self._answers = deque(answers)  # (tick, update)
-        self.submitted, self.received, self.resets = [], [], 0
+        self.windows, self.updates, self.resets = [], [], 0
 
     def submit(self, window, tick):
-        self.submitted.append((tick, window))
+        self.windows.append((tick, window))
 
     def poll(self, tick):
-        found = []
+        result = []
         while self._answers and self._answers[0][0] <= tick:
-            found.append(self._answers.popleft()[1])
-        return found
+            result.append(self._answers.popleft()[1])
+        return result
 
     def receive(self, update):
-        self.received.append(update)
+        self.updates.append(update)
 
     def reset(self):
         self.resets += 1
 
 
-def queued(setup, policy, *learners, every_s=0.1, window=12):
+def queue_pilot(setup, policy, *learners, every_s=0.1, window=12):
     state = setup.learner.init(policy, random.key(2))
-    scheduled = tuple(Scheduled(learner, every_s) for learner in learners)
-    return AdaptivePilot(setup.controller, state, scheduled, dt=setup.preset.dt, window=window)
+    schedule = tuple(ScheduledLearner(learner, every_s) for learner in learners)
+    return AdaptivePilot(setup.controller, state, schedule, dt=setup.preset.dt, window=window)
 
 
-def biased(state, by):
+def bias(state, by):
     """The same policy with another output."""
     return eqx.tree_at(lambda s: s.policy.layers[-1].bias, state, state.policy.layers[-1].bias + by)
 
 
-def test_updates_of_any_learner_are_applied_in_order_and_told_to_all(trained):
-    setup, policy = trained
+def test_updates_of_any_learner_are_applied_in_order_and_told_to_all(trained_policy):
+    setup, policy = trained_policy
     state = setup.learner.init(policy, random.key(2))
-    fitted = jax.tree.map(lambda leaf: leaf + 1, state.residual)
-    first, second = biased(state.policy, 0.1), biased(state.policy, 0.2)
+    fit_result = jax.tree.map(lambda leaf: leaf + 1, state.residual)
+    first, second = bias(state.policy, 0.1), bias(state.policy, 0.2)
     updates = [
-        ResidualUpdate(0.1, 0.3, fitted),
+        ResidualUpdate(0.1, 0.3, fit_result),
         PolicyUpdate(0.1, 0.1, 0.2, first),
         Rejection(0.1, "residual", "why not"),
         PolicyUpdate(0.1, 0.1, 0.2, second),
@@ -146,14 +146,14 @@ def test_updates_of_any_learner_are_applied_in_order_and_told_to_all(trained):
     ]
     one = QueueLearner([(8, updates[0]), (8, updates[1]), (8, updates[2]), (15, updates[4])])
     other = QueueLearner([(8, updates[3])])
-    pilot = queued(setup, policy, one, other)
+    pilot = queue_pilot(setup, policy, one, other)
     log = fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=20)
-    assert [id(u) for u in one.received] == [id(u) for u in updates]
-    assert [id(u) for u in other.received] == [id(u) for u in updates]
+    assert [id(u) for u in one.updates] == [id(u) for u in updates]
+    assert [id(u) for u in other.updates] == [id(u) for u in updates]
     assert [e.kind for e in log.events] == ["residual", "policy", "rejected", "policy", "skipped"]
     np.testing.assert_allclose([e.t for e in log.events], [0.16, 0.16, 0.16, 0.16, 0.3])
     assert pilot.state.policy is second
-    assert pilot.state.residual is fitted
+    assert pilot.state.residual is fit_result
     # What is published at a tick flies from that tick on.
     plain = plain_flight(setup, policy, 0.4)
     np.testing.assert_array_equal(log.u[:9], plain.u[:9])
@@ -170,57 +170,57 @@ def test_updates_of_any_learner_are_applied_in_order_and_told_to_all(trained):
     np.testing.assert_allclose(u.vector(), log.u[9], rtol=1e-12)
 
 
-def test_learners_are_offered_windows_on_schedule_and_reset_at_each_flight(trained):
-    setup, policy = trained
+def test_learners_are_offered_windows_on_schedule_and_reset_at_each_flight(trained_policy):
+    setup, policy = trained_policy
     one, other = QueueLearner(), QueueLearner()
-    pilot = queued(setup, policy, one, other)
+    pilot = queue_pilot(setup, policy, one, other)
     for flights in (1, 2):
         log = fly(Odd(clock=37.0 * flights), pilot, setup.flight_starts(1)[0], ticks=18)
         assert (one.resets, other.resets) == (flights, flights)
-        assert [tick for tick, _ in one.submitted] == [5, 10, 15] * flights
-        tick, window = one.submitted[-2]
+        assert [tick for tick, _ in one.windows] == [5, 10, 15] * flights
+        tick, window = one.windows[-2]
         assert int(window.valid.sum()) == tick + 1  # nothing of an earlier flight
         np.testing.assert_allclose(window.t[np.asarray(window.valid)], 0.02 * np.arange(11), atol=1e-9)
-        tick, window = other.submitted[-1]
-        kept = log.window(12, end=16)
-        for a, b in zip(jax.tree.leaves(window), jax.tree.leaves(kept), strict=True):
+        tick, window = other.windows[-1]
+        rest = log.window(12, end=16)
+        for a, b in zip(jax.tree.leaves(window), jax.tree.leaves(rest), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
-def test_an_answer_at_once_is_published_in_the_same_tick(trained):
+def test_an_answer_at_once_is_published_in_the_same_tick(trained_policy):
     """As a skip is."""
-    setup, policy = trained
+    setup, policy = trained_policy
 
     class Busy(QueueLearner):
         def submit(self, window, tick):
             super().submit(window, tick)
             self._answers.append((tick, Skip(float(window.t[-1]), "policy")))
 
-    log = fly(Odd(), queued(setup, policy, Busy()), setup.flight_starts(1)[0], ticks=12)
+    log = fly(Odd(), queue_pilot(setup, policy, Busy()), setup.flight_starts(1)[0], ticks=12)
     np.testing.assert_allclose(times(log, "skipped"), [0.1, 0.2])
 
 
-def test_without_learners_it_flies_the_policy(trained):
-    setup, policy = trained
-    log = fly(Odd(), queued(setup, policy), setup.flight_starts(1)[0], ticks=20)
+def test_without_learners_it_flies_the_policy(trained_policy):
+    setup, policy = trained_policy
+    log = fly(Odd(), queue_pilot(setup, policy), setup.flight_starts(1)[0], ticks=20)
     np.testing.assert_array_equal(log.u, plain_flight(setup, policy, 0.4).u)
     assert log.events == ()
 
 
-def test_windows_are_of_measured_states_and_accepted_commands(trained):
+def test_windows_are_of_measured_states_and_accepted_commands(trained_policy):
     """What a learner saw is what the log's window says, with noisy sensors and a plant that limits commands."""
-    setup, policy = trained
+    setup, policy = trained_policy
     learner = QueueLearner()
     limit = lambda u: Command(jnp.clip(u.c, 9.6, 9.9), jnp.clip(u.omega, -0.05, 0.05))  # noqa: E731
     plant = Odd(limit=limit, sensors="rough")
-    log = fly(plant, queued(setup, policy, learner), setup.flight_starts(1)[0], ticks=16)
-    tick, window = learner.submitted[-1]
-    kept = log.window(12, end=tick + 1)
-    np.testing.assert_array_equal(window.x.p, kept.x.p)
+    log = fly(plant, queue_pilot(setup, policy, learner), setup.flight_starts(1)[0], ticks=16)
+    tick, window = learner.windows[-1]
+    rest = log.window(12, end=tick + 1)
+    np.testing.assert_array_equal(window.x.p, rest.x.p)
     np.testing.assert_array_equal(window.x.v, log.measured.v[4:16])
     assert not np.allclose(window.x.p, log.p[4:16], atol=1e-6)
     # The last command was issued, but not accepted yet; no fit uses it.
-    np.testing.assert_array_equal(window.u.c[:-1], kept.u.c[:-1])
+    np.testing.assert_array_equal(window.u.c[:-1], rest.u.c[:-1])
     np.testing.assert_array_equal(window.u.omega[:-1], log.u[5:16, 1:])
     assert float(window.u.c.max()) <= 9.9 or float(window.u.c[-1]) > 9.9
 
@@ -228,9 +228,9 @@ def test_windows_are_of_measured_states_and_accepted_commands(trained):
 # ---- on the virtual clock
 
 
-def test_lockstep_repeats_bit_for_bit(trained, flown):
-    first, one = flown
-    second, two = flight(*trained, 3.2)
+def test_lockstep_repeats_bit_for_bit(trained_policy, sample_flight):
+    first, one = sample_flight
+    second, two = flight(*trained_policy, 3.2)
     for name in ("t", "u"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     jax.tree.map(np.testing.assert_array_equal, (first.true, first.measured), (second.true, second.measured))
@@ -239,25 +239,25 @@ def test_lockstep_repeats_bit_for_bit(trained, flown):
     jax.tree.map(np.testing.assert_array_equal, one.state, two.state)
 
 
-def test_results_appear_only_after_their_latency(flown):
+def test_results_appear_only_after_their_latency(sample_flight):
     """Residuals are due every 0.6 s and take 0.1 s; policies every 1 s and take 0.3 s."""
-    log, _ = flown
+    log, _ = sample_flight
     np.testing.assert_allclose(times(log, "residual"), [0.7, 1.3, 1.9, 2.5, 3.1], atol=1e-9)
     np.testing.assert_allclose(times(log, "policy", "rejected"), [1.3, 2.3], atol=1e-9)
 
 
-def test_commands_are_the_old_policys_until_the_swap(trained, flown):
+def test_commands_are_the_old_policys_until_the_swap(trained_policy, sample_flight):
     """The flight equals an unadapted one up to the tick at which the first policy appears, and differs after it."""
-    log, _ = flown
-    plain = plain_flight(*trained, 3.2)
+    log, _ = sample_flight
+    plain = plain_flight(*trained_policy, 3.2)
     swap = round(times(log, "policy")[0] / 0.02)
     np.testing.assert_array_equal(log.u[: swap + 1], plain.u[: swap + 1])
     assert not np.array_equal(log.u[swap + 1], plain.u[swap + 1])
 
 
-def test_a_clock_that_starts_anywhere_gives_the_same_flight(trained, flown):
-    here, _ = flown
-    there, _ = flight(*trained, 3.2, Odd(clock=1.7e9))
+def test_a_clock_that_starts_anywhere_gives_the_same_flight(trained_policy, sample_flight):
+    here, _ = sample_flight
+    there, _ = flight(*trained_policy, 3.2, Odd(clock=1.7e9))
     assert there.t[0] == 0.0
     np.testing.assert_allclose(there.t, here.t, atol=1e-6)
     np.testing.assert_array_equal(there.u, here.u)
@@ -266,16 +266,16 @@ def test_a_clock_that_starts_anywhere_gives_the_same_flight(trained, flown):
     assert len(here.events) >= 4
 
 
-def test_a_busy_learner_is_skipped_not_queued(trained):
-    setup, policy = trained
+def test_a_busy_learner_is_skipped_not_queued(trained_policy):
+    setup, policy = trained_policy
     busy = rescheduled(setup, fit_every=10.0, update_every=0.5, update_latency=0.7)
     log, _ = flight(busy, policy, 2.5)
     np.testing.assert_allclose(times(log, "skipped"), [1.0, 2.0])
 
 
-def test_measured_latency_charges_what_the_clock_shows(trained, monkeypatch):
+def test_measured_latency_charges_what_the_clock_shows(trained_policy, monkeypatch):
     """Each reading of the clock is 0.17 s after the last."""
-    setup, policy = trained
+    setup, policy = trained_policy
     now = iter(0.17 * np.arange(1000))
     monkeypatch.setattr(lockstep, "time", types.SimpleNamespace(perf_counter=lambda: float(next(now))))
     log, _ = flight(setup, policy, 1.5, latency="measured")
@@ -283,16 +283,16 @@ def test_measured_latency_charges_what_the_clock_shows(trained, monkeypatch):
     np.testing.assert_allclose(times(log, "policy", "rejected"), [1.18])
 
 
-def test_one_trace_over_many_cycles(trained):
+def test_one_trace_over_many_cycles(trained_policy):
     """New weights, optimiser states, windows and keys never compile again."""
-    setup, policy = trained
+    setup, policy = trained_policy
     pilot = setup.adaptive_pilot(policy, random.key(3))
     fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=60)
-    compiled = len(TRACES)
-    assert compiled > 0
+    program = len(TRACES)
+    assert program > 0
     log = fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=250)
     assert len(times(log, "policy", "rejected")) >= 4
-    assert len(TRACES) == compiled
+    assert len(TRACES) == program
 
 
 def learning_at(setup, rate):
@@ -300,54 +300,54 @@ def learning_at(setup, rate):
     return dataclasses.replace(setup, learner=eqx.tree_at(lambda l: l.optimiser.rate, setup.learner, jnp.array(rate)))
 
 
-def test_adaptation_cuts_the_error_under_the_large_disturbance(trained):
+def test_adaptation_cuts_the_error_under_the_large_disturbance(trained_policy):
     """The whole loop, at reduced size: its updates bring it at least three times closer than the base policy."""
-    setup, _ = trained
+    setup, _ = trained_policy
     policy = Setup.from_preset(changed(setup.preset, pretrain={"num_updates": 300, "learning_rate": 0.01})).pretrained(
         0
     )
     often = rescheduled(learning_at(setup, 3e-3), fit_every=0.4, update_every=0.4, update_latency=0.2)
     base = plain_flight(setup, policy, 8.0)
-    adapted, _ = flight(often, policy, 8.0)
-    before, after = (np.linalg.norm(log.p[-50:] - setup.preset.goal, axis=1).mean() for log in (base, adapted))
+    adapted_policy, _ = flight(often, policy, 8.0)
+    before, after = (np.linalg.norm(log.p[-50:] - setup.preset.goal, axis=1).mean() for log in (base, adapted_policy))
     assert after < before / 3
 
 
-def test_a_refused_policy_is_logged_and_never_flies(trained):
+def test_a_refused_policy_is_logged_and_never_flies(trained_policy):
     """Steps that are not numbers go wrong at every update."""
-    setup, policy = trained
+    setup, policy = trained_policy
     log, pilot = flight(learning_at(setup, math.nan), policy, 3.0)
     np.testing.assert_array_equal(log.u, plain_flight(setup, policy, 3.0).u)
-    refused = [e for e in log.events if e.kind == "rejected"]
-    np.testing.assert_allclose([e.t for e in refused], [1.3, 2.3])
-    assert {e.note for e in refused} == {"a weight is not finite"}
+    refusal = [e for e in log.events if e.kind == "rejected"]
+    np.testing.assert_allclose([e.t for e in refusal], [1.3, 2.3])
+    assert {e.note for e in refusal} == {"a weight is not finite"}
     jax.tree.map(np.testing.assert_array_equal, pilot.state.policy.policy, policy)
 
 
-def test_a_second_flight_keeps_what_was_learnt_and_forgets_what_was_seen(trained):
-    setup, policy = trained
+def test_a_second_flight_keeps_what_was_learnt_and_forgets_what_was_seen(trained_policy):
+    setup, policy = trained_policy
     log, pilot = flight(setup, policy, 1.5)
-    learnt = pilot.state
+    learner_state = pilot.state
     assert times(log, "policy", "residual")
     again = fly(Odd(), pilot, setup.flight_starts(1)[0], ticks=10)
     assert again.events == ()
-    jax.tree.map(np.testing.assert_array_equal, pilot.state, learnt)
+    jax.tree.map(np.testing.assert_array_equal, pilot.state, learner_state)
     # It flies what it has learnt from the first tick on.
-    fresh = fly(Odd(), setup.pilot(learnt.policy.policy), setup.flight_starts(1)[0], ticks=10)
+    fresh = fly(Odd(), setup.pilot(learner_state.policy.policy), setup.flight_starts(1)[0], ticks=10)
     np.testing.assert_array_equal(again.u, fresh.u)
 
 
-def test_a_flight_goes_on_from_what_another_learnt(trained):
-    setup, policy = trained
+def test_a_flight_goes_on_from_what_another_learnt(trained_policy):
+    setup, policy = trained_policy
     _, pilot = flight(setup, policy, 1.5)
-    resumed = setup.adaptive_pilot(policy, random.key(3), state=pilot.state)
-    jax.tree.map(np.testing.assert_array_equal, resumed.state, pilot.state)
-    log = fly(Odd(), resumed, setup.flight_starts(1)[0], ticks=10)
+    resumed_pilot = setup.adaptive_pilot(policy, random.key(3), state=pilot.state)
+    jax.tree.map(np.testing.assert_array_equal, resumed_pilot.state, pilot.state)
+    log = fly(Odd(), resumed_pilot, setup.flight_starts(1)[0], ticks=10)
     fresh = fly(Odd(), setup.pilot(pilot.state.policy.policy), setup.flight_starts(1)[0], ticks=10)
     np.testing.assert_array_equal(log.u, fresh.u)
 
 
-class Recorded(ResidualWorker):
+class RecordingWorker(ResidualWorker):
     """A residual worker that keeps its updates."""
 
     def __init__(self, *args):
@@ -359,20 +359,20 @@ class Recorded(ResidualWorker):
         return self.updates[-1]
 
 
-def test_missed_ticks_keep_the_schedule_and_do_not_poison_the_fit(trained):
+def test_missed_ticks_keep_the_schedule_and_do_not_poison_the_fit(trained_policy):
     """The clock jumps by three ticks at every ninth step; the plant is pushed by 2 m/s^2 per axis all the same."""
-    setup, policy = trained
+    setup, policy = trained_policy
 
     def fits(stalls):
         state = setup.learner.init(policy, random.key(2))
-        worker = Recorded(setup.learner, state)
+        worker = RecordingWorker(setup.learner, state)
         learner = LockstepLearner(worker, 0.1, 0.02)
-        pilot = AdaptivePilot(setup.controller, state, [Scheduled(learner, 0.6)], dt=0.02, window=100)
+        pilot = AdaptivePilot(setup.controller, state, [ScheduledLearner(learner, 0.6)], dt=0.02, window=100)
         log = fly(Odd(stalls=stalls), pilot, setup.flight_starts(1)[0], ticks=160)
         assert log.missed_ticks == 2 * sum(s < len(log.t) - 1 for s in stalls)
         return log, [update.rms_error for update in worker.updates]
 
-    smooth, undisturbed = fits(())
+    smooth, calm = fits(())
     rough, errors = fits(tuple(range(4, 160, 9)))
     assert smooth.missed_ticks == 0
     assert rough.missed_ticks > 20
@@ -381,4 +381,4 @@ def test_missed_ticks_keep_the_schedule_and_do_not_poison_the_fit(trained):
     assert len(times(rough, "residual")) == len(times(smooth, "residual")) == 5
     late = np.array(times(rough, "residual")) - due
     assert np.all((late > 0.099) & (late < 0.1 + 0.1))  # the first tick that was there, after the latency
-    assert max(errors[1:]) < 2.0 * max(undisturbed[1:])
+    assert max(errors[1:]) < 2.0 * max(calm[1:])

@@ -26,11 +26,11 @@ def parts():
     return model, push, PolicyController(task.observation, policy), State.at(jnp.array([0.2, 0.1, 1.3]))
 
 
-def assert_same(flown, log):
-    for states, recorded in ((flown.true, log.true), (flown.measured, log.measured)):
+def assert_same(flight, log):
+    for states, recorded in ((flight.true, log.true), (flight.measured, log.measured)):
         for name in ("p", "R", "v"):
             np.testing.assert_allclose(getattr(states, name), getattr(recorded, name)[1:], atol=1e-12)
-    np.testing.assert_allclose(jax.vmap(lambda u: u.vector())(flown.accepted), log.u[1:], atol=1e-10)
+    np.testing.assert_allclose(jax.vmap(lambda u: u.vector())(flight.accepted), log.u[1:], atol=1e-10)
 
 
 SENSORS = SensorModel.of(position=0.01, velocity=0.01, attitude=0.01, latency=20, dropout=0.2)
@@ -50,15 +50,15 @@ def test_a_late_measurement_is_taken_for_what_it_says_of_now(parts):
     observer = DisturbanceObserver(
         PointMass(0.02), jnp.array(0.05), jnp.array(6.0), jnp.array(4.0), CommandPath.of(0.02)
     )
-    framed = GravityFrame(controller, observer)
+    in_frame = GravityFrame(controller, observer)
     moving = State(x0.p, x0.R, jnp.array([2.0, 0.0, 0.0]))
     late, now = (SimPlant(model, push, sensors=SensorModel.of(latency=ms)) for ms in (10, 0))
-    log = fly(late, ControllerPilot(framed), moving, ticks=15)
-    assert_same(jax.jit(lambda x0: batch_flight(late.simulation, framed, x0, ticks=15))(moving), log)
-    wanted = fly(now, ControllerPilot(framed), moving, ticks=15)
-    unaware = fly(late, ControllerPilot(Unaware(framed)), moving, ticks=15)
+    log = fly(late, ControllerPilot(in_frame), moving, ticks=15)
+    assert_same(jax.jit(lambda x0: batch_flight(late.simulation, in_frame, x0, ticks=15))(moving), log)
+    expected = fly(now, ControllerPilot(in_frame), moving, ticks=15)
+    unaware = fly(late, ControllerPilot(Unaware(in_frame)), moving, ticks=15)
     # Rates are the policy's; thrust is the observer's, which is late. The first sample is not.
-    off, blind = (np.abs(each.u - wanted.u)[3:, 1:].max() for each in (log, unaware))
+    off, blind = (np.abs(each.u - expected.u)[3:, 1:].max() for each in (log, unaware))
     assert off < 0.5 * blind
 
 
@@ -92,16 +92,16 @@ def test_limits_are_those_of_the_plant_and_are_remembered(parts):
     model, push, _, x0 = parts
     plant = SimPlant(model, push)
     log = fly(plant, ControllerPilot(Greedy()), x0, ticks=8)
-    flown = jax.jit(lambda x0: batch_flight(plant.simulation, Greedy(), x0, ticks=8))(x0)
-    assert_same(flown, log)
-    assert float(flown.issued.c[-1]) == pytest.approx(1.5 * float(flown.accepted.c[-1]))  # no windup
+    flight = jax.jit(lambda x0: batch_flight(plant.simulation, Greedy(), x0, ticks=8))(x0)
+    assert_same(flight, log)
+    assert float(flight.issued.c[-1]) == pytest.approx(1.5 * float(flight.accepted.c[-1]))  # no windup
 
 
 def test_maps_over_vehicles_that_see_other_noise(parts):
     model, push, controller, x0 = parts
     plants = [SimPlant(model, push, sensors=SENSORS, seed=seed) for seed in (0, 1)]
     together = stack([plant.simulation for plant in plants])
-    flown = jax.jit(jax.vmap(lambda s: batch_flight(s, controller, x0, ticks=5)))(together)
-    assert flown.accepted.c.shape == (2, 5)
-    assert not np.array_equal(flown.accepted.c[0], flown.accepted.c[1])
-    assert_same(unstack(flown, 1), fly(plants[1], ControllerPilot(controller), x0, ticks=5))
+    flight = jax.jit(jax.vmap(lambda s: batch_flight(s, controller, x0, ticks=5)))(together)
+    assert flight.accepted.c.shape == (2, 5)
+    assert not np.array_equal(flight.accepted.c[0], flight.accepted.c[1])
+    assert_same(unstack(flight, 1), fly(plants[1], ControllerPilot(controller), x0, ticks=5))

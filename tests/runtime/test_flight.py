@@ -28,14 +28,14 @@ class Odd(Plant):
         self._inner = Scenario(disturbance, "simple", sensors=sensors).make()
         self._clock, self._limit, self._stalls = clock, limit, stalls
         self.dt = self._inner.dt
-        self.issued, self.stops, self._steps = [], 0, 0
+        self.commands, self.stops, self._steps = [], 0, 0
 
     def reset(self, x0):
         self._steps = 0
         return self._shown(self._inner.reset(x0))
 
     def step(self, u):
-        self.issued.append(u)
+        self.commands.append(u)
         if self._limit is not None:
             u = self._limit(u)
         for _ in range(3 if self._steps in self._stalls else 1):
@@ -55,13 +55,13 @@ class Witness:
     """An observer that keeps what it is told, in order."""
 
     def __init__(self):
-        self.told = []
+        self.calls = []
 
     def measurement(self, measurement, u):
-        self.told.append((measurement, u))
+        self.calls.append((measurement, u))
 
     def event(self, event):
-        self.told.append(event)
+        self.calls.append(event)
 
 
 class Climb(AbstractController[None]):
@@ -102,23 +102,23 @@ def policy_controller(key, history=2):
 
 def test_a_clock_may_start_anywhere():
     """Pilots are told the time since the start of the flight, whatever the plant's clock says."""
-    asked = []
+    calls = []
 
     def late(t, x):
-        asked.append(t)
+        calls.append(t)
         return t > 0.29
 
-    flown = [
+    flight = [
         fly(Odd(clock=clock), ControllerPilot(Climb()), START, ticks=50, terminated=late) for clock in (0.0, 1.7e9)
     ]
-    for log in flown:
+    for log in flight:
         assert len(log.t) == 16
         assert log.t[0] == 0.0
         assert log.terminated
         np.testing.assert_allclose(log.t, 0.02 * np.arange(16), atol=1e-6)
         np.testing.assert_allclose(log.u[1:, 0], 9.81 + 0.02 * np.arange(15), atol=1e-6)
-    np.testing.assert_allclose(asked, 2 * list(0.02 * np.arange(1, 16)), atol=1e-6)
-    np.testing.assert_allclose(flown[1].p, flown[0].p, atol=1e-6)
+    np.testing.assert_allclose(calls, 2 * list(0.02 * np.arange(1, 16)), atol=1e-6)
+    np.testing.assert_allclose(flight[1].p, flight[0].p, atol=1e-6)
 
 
 def test_missed_ticks_count_and_shorten_the_flight():
@@ -137,32 +137,32 @@ def test_missed_ticks_count_and_shorten_the_flight():
 # ---- commands that a plant limits
 
 
-def limited(u):
+def limit(u):
     return Command(jnp.clip(u.c, 9.5, 10.0), jnp.clip(u.omega, -0.05, 0.05))
 
 
 def test_log_and_observation_hold_the_accepted_command(key):
     """The policy's next observation has the accepted command: replayed with it, each issued command is the same."""
-    controller, plant = policy_controller(key), Odd(limit=limited)
+    controller, plant = policy_controller(key), Odd(limit=limit)
     log = fly(plant, ControllerPilot(controller), START, ticks=12)
-    issued = np.stack([u.vector() for u in plant.issued])
-    accepted = np.stack([limited(u).vector() for u in plant.issued])
-    assert not np.allclose(issued, accepted)
-    np.testing.assert_array_equal(log.u[1:], accepted)
+    commands = np.stack([u.vector() for u in plant.commands])
+    accepted_command = np.stack([limit(u).vector() for u in plant.commands])
+    assert not np.allclose(commands, accepted_command)
+    np.testing.assert_array_equal(log.u[1:], accepted_command)
     np.testing.assert_array_equal(log.u[0], Command.hover().vector())
 
-    def replayed(told):
-        memory, found = controller.init(START), []
+    def replay(message):
+        memory, result = controller.init(START), []
         for k in range(12):
             x = State(*(jnp.asarray(leaf[k]) for leaf in log.measured))
             u, memory = controller(memory, jnp.array(0.02 * k), x)
-            found.append(u.vector())
-            if told:
-                memory = controller.accepted(memory, limited(u))
-        return np.stack(found)
+            result.append(u.vector())
+            if message:
+                memory = controller.accepted(memory, limit(u))
+        return np.stack(result)
 
-    np.testing.assert_allclose(replayed(told=True), issued, atol=1e-12)
-    assert not np.allclose(replayed(told=False), issued, atol=1e-6)
+    np.testing.assert_allclose(replay(message=True), commands, atol=1e-12)
+    assert not np.allclose(replay(message=False), commands, atol=1e-6)
 
 
 # ---- the record
@@ -185,11 +185,11 @@ def test_a_log_gives_the_window_that_was_seen_in_flight(key):
             inner.accepted(u)
             buffer.accepted(u)
 
-    log = fly(Odd(sensors="rough", limit=limited), Keeping(), START, ticks=15)
-    seen, kept = buffer.window(), log.window(10)
-    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(kept), strict=True):
+    log = fly(Odd(sensors="rough", limit=limit), Keeping(), START, ticks=15)
+    observation, rest = buffer.window(), log.window(10)
+    for a, b in zip(jax.tree.leaves(observation), jax.tree.leaves(rest), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
-    assert not np.allclose(kept.x.p, log.p[5:15], atol=1e-6)  # measured, not true
+    assert not np.allclose(rest.x.p, log.p[5:15], atol=1e-6)  # measured, not true
     earlier = log.window(4, end=9)
     np.testing.assert_array_equal(earlier.x.p, log.measured.p[5:9])
     np.testing.assert_array_equal(earlier.u.c, log.u[6:10, 0])
@@ -211,18 +211,18 @@ def test_flights_of_noisy_plants_keep_truth_and_measurement():
 def test_observers_see_the_first_measurement_every_tick_and_every_event():
     witness, second, plant = Witness(), Witness(), Odd(clock=100.0)
     log = fly(plant, Eventful(), START, ticks=5, observers=[witness, second])
-    measurements = [told for told in witness.told if not isinstance(told, Event)]
+    measurements = [message for message in witness.calls if not isinstance(message, Event)]
     assert len(measurements) == 6
     first, u = measurements[0]
     np.testing.assert_array_equal(first.x.vector(), START.vector())
     np.testing.assert_array_equal(u.vector(), Command.hover().vector())
     np.testing.assert_array_equal(log.p, np.stack([m.x.p for m, _ in measurements]))
-    (event,) = [told for told in witness.told if isinstance(told, Event)]
+    (event,) = [message for message in witness.calls if isinstance(message, Event)]
     assert event == Event(event.t, "skipped", "policy learner still busy")
     assert event.t == pytest.approx(0.04)
     assert log.events == (event,)
-    assert [type(told) for told in witness.told] == [type(told) for told in second.told]
-    assert witness.told.index(event) == 3  # with the tick that it happened in, before its measurement
+    assert [type(message) for message in witness.calls] == [type(message) for message in second.calls]
+    assert witness.calls.index(event) == 3  # with the tick that it happened in, before its measurement
 
 
 def test_events_as_lines_of_json(tmp_path):
@@ -249,8 +249,8 @@ def test_a_stop_token_gives_the_flight_up_and_stops_the_plant():
     with pytest.raises(FlightStopped, match="given up"):
         fly(plant, FunctionPilot(until_the_third), START, ticks=50, observers=[witness], stop=stop)
     assert plant.stops == 1
-    assert len(plant.issued) == 3
-    assert len(witness.told) == 4
+    assert len(plant.commands) == 3
+    assert len(witness.calls) == 4
     with pytest.raises(PlantError, match="call reset first"):
         plant.step(Command.hover())
 
@@ -274,9 +274,9 @@ def test_termination_ends_the_flight_and_is_logged():
 
 
 def test_termination_is_judged_by_the_true_state():
-    seen = []
-    fly(Odd(sensors="rough"), HOVER, START, ticks=5, terminated=lambda t, x: seen.append(x.p) or False)
-    np.testing.assert_array_equal(np.stack(seen), fly(Odd(), HOVER, START, ticks=5).p[1:])
+    observation = []
+    fly(Odd(sensors="rough"), HOVER, START, ticks=5, terminated=lambda t, x: observation.append(x.p) or False)
+    np.testing.assert_array_equal(np.stack(observation), fly(Odd(), HOVER, START, ticks=5).p[1:])
 
 
 def test_pilot_starts_its_memory_anew_at_time_zero(key):

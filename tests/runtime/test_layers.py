@@ -9,7 +9,7 @@ from jax import random
 from helpers import CheapModel
 from retrim.config import Setup, changed, load
 from retrim.config.faults import measurement_fault
-from retrim.io.trained import load_learner_state, save_learner_state
+from retrim.io.policies import load_learner_state, save_learner_state
 from retrim.physics import Push
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import fly
@@ -18,17 +18,17 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 
 
 @pytest.fixture(scope="module")
-def trained(as_a_user):
+def trained_policy(as_a_user):
     brief = {"hidden_sizes": (32, 32), "num_envs": 8, "num_updates": 200, "horizon": 100, "learning_rate": 0.01}
     setup = Setup.from_preset(changed(load("hover/retrim"), pretrain=brief, adapt={"num_envs": 4}))
     return setup, setup.pretrained(0)
 
 
 @pytest.fixture(scope="module")
-def flights(trained):
+def flights(trained_policy):
     """6 s from one start, a step of 2 m/s^2 per axis at 3 s, by each layer."""
     step = Push(lambda t, x: jnp.where(t < 3.0, 0.0, 2.0) * jnp.ones(3))
-    setup, policy = trained
+    setup, policy = trained_policy
 
     def flight(method, sensors=None, fault=None):
         pilot = setup.pilot(policy, method, random.key(1))
@@ -64,14 +64,14 @@ def test_wrong_velocities_are_excluded_and_reported(flights):
 
 
 def test_learning_does_not_harm_the_layer_below(flights):
-    log, framed, _ = flights["base-do"]
+    log, in_frame, _ = flights["base-do"]
     _, learning, pilot = flights["full"]
     kinds = [event.kind for event in pilot.events]
     assert kinds.count("residual") > 20
     assert kinds.count("policy") + kinds.count("rejected") > 8
     for since in (2.0, 5.0):
         late = (log.t > since) & (log.t < since + 1.0)
-        assert learning[late].mean() < framed[late].mean() + 0.005
+        assert learning[late].mean() < in_frame[late].mean() + 0.005
 
 
 def test_the_residual_has_found_the_push(flights):
@@ -80,8 +80,8 @@ def test_the_residual_has_found_the_push(flights):
     np.testing.assert_allclose(pilot.state.residual.mean[:3], 2.0, atol=0.3)
 
 
-def test_what_was_learnt_is_kept(flights, trained, tmp_path):
-    setup, _ = trained
+def test_what_was_learnt_is_kept(flights, trained_policy, tmp_path):
+    setup, _ = trained_policy
     _, _, pilot = flights["full"]
     save_learner_state(tmp_path / "learner_state.safetensors", pilot.state, setup.preset)
     state, preset = load_learner_state(tmp_path / "learner_state.safetensors")

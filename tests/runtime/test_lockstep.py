@@ -16,14 +16,14 @@ class Refusing(Worker):
     layer = "policy"
 
     def __init__(self):
-        self.received, self.learnt = [], 0
+        self.updates, self.count = [], 0
 
     def learn(self, window):
-        self.learnt += 1
-        return Rejection(float(window.t[-1]), self.layer, f"window {self.learnt}")
+        self.count += 1
+        return Rejection(float(window.t[-1]), self.layer, f"window {self.count}")
 
     def receive(self, update):
-        self.received.append(update)
+        self.updates.append(update)
 
 
 def window(t):
@@ -64,7 +64,7 @@ def test_a_window_is_skipped_while_another_is_under_way():
     learner = LockstepLearner(worker, 0.1, 0.02)
     learner.submit(window(1.0), 50)
     learner.submit(window(1.04), 52)
-    assert worker.learnt == 1
+    assert worker.count == 1
     assert learner.poll(52) == [Skip(1.04, "policy")]
     assert learner.poll(54) == []
     assert learner.poll(55) == [Rejection(1.0, "policy", "window 1")]
@@ -79,11 +79,11 @@ def test_reset_drops_what_is_under_way():
     learner.reset()
     assert learner.poll(1000) == []
     learner.submit(window(0.0), 0)
-    assert worker.learnt == 2
+    assert worker.count == 2
 
 
 def test_published_updates_reach_the_worker():
     worker = Refusing()
     update = Skip(1.0, "residual")
     LockstepLearner(worker, 0.1, 0.02).receive(update)
-    assert worker.received == [update]
+    assert worker.updates == [update]

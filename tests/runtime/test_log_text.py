@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from made_up import flight, log
+from fake_flights import flight, log
 from retrim import PRESETS, Command, Event, Scenario, Setup, State
 from retrim.evaluation.executor import MOST_ROWS, Flights
 from retrim.physics import so3
@@ -114,11 +114,11 @@ def test_the_figure_of_a_log_shows_errors_updates_path_and_commands(target, labe
 
 
 def test_a_target_may_change_with_time():
-    flown = log(1.0)
-    targets = np.linspace(0.0, 1.0, len(flown.t))[:, None] * np.array([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(flown.plot(targets).axes[0].lines[-1].get_ydata(), targets[:, 0])
+    flight = log(1.0)
+    targets = np.linspace(0.0, 1.0, len(flight.t))[:, None] * np.array([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(flight.plot(targets).axes[0].lines[-1].get_ydata(), targets[:, 0])
     with pytest.raises(ValueError, match="broadcast"):
-        flown.plot(targets[:-1])
+        flight.plot(targets[:-1])
 
 
 def test_the_figure_of_flights_has_a_colour_for_each_method():

@@ -40,16 +40,16 @@ STILL = Window.of(np.zeros(1), np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 3
 
 @given(period=st.integers(1, 12), latency=st.integers(1, 30))
 def test_offers_are_those_of_a_learner_on_the_virtual_clock(period, latency):
-    learner, told = LockstepLearner(Counting(), 0.02 * latency, 0.02), []
+    learner, message = LockstepLearner(Counting(), 0.02 * latency, 0.02), []
     for tick in range(60):
-        told += [(tick, type(update)) for update in learner.poll(tick)]
+        message += [(tick, type(update)) for update in learner.poll(tick)]
         if tick and tick % period == 0:
             learner.submit(STILL, tick)
-            told += [(tick, type(update)) for update in learner.poll(tick)]
+            message += [(tick, type(update)) for update in learner.poll(tick)]
     expected = []
     for offer in offers(period, latency, 60):
         expected.append((offer.tick, Skip) if offer.visible is None else (offer.visible, Rejection))
-    assert sorted(told, key=str) == sorted((each for each in expected if each[0] < 60), key=str)
+    assert sorted(message, key=str) == sorted((each for each in expected if each[0] < 60), key=str)
 
 
 @given(n=st.integers(1, 400), size=st.integers(1, 2 * IN_CACHE))
@@ -62,7 +62,7 @@ def test_few_updates_are_made_at_once_and_hardly_any_in_vain(n, size):
 
 
 @pytest.fixture(scope="module")
-def flown(as_a_user):
+def sample_flight(as_a_user):
     """Five flights that train a delta, with noisy sensors; every other offer finds the learner busy.
 
     Three learn at once, so that the last round has a place to spare.
@@ -81,15 +81,15 @@ def flown(as_a_user):
 
     plants, pilots = parts()
     assert can_fly_together(plants, pilots)
-    told = []
-    logs = fly_together(plants, pilots, starts, ticks=TICKS, progress=told.append, cold=True)
+    message = []
+    logs = fly_together(plants, pilots, starts, ticks=TICKS, progress=message.append, cold=True)
     others, alone = parts()
     each = [fly(plant, pilot, x0, ticks=TICKS) for plant, pilot, x0 in zip(others, alone, starts, strict=True)]
-    return logs, pilots, each, alone, told, setup
+    return logs, pilots, each, alone, message, setup
 
 
-def test_states_commands_and_times_are_the_same(flown):
-    logs, _, each, _, told, _ = flown
+def test_states_commands_and_times_are_the_same(sample_flight):
+    logs, _, each, _, message, _ = sample_flight
     for log, other in zip(logs, each, strict=True):
         np.testing.assert_array_equal(log.t, other.t)
         for states, others in ((log.true, other.true), (log.measured, other.measured)):
@@ -97,12 +97,12 @@ def test_states_commands_and_times_are_the_same(flown):
                 np.testing.assert_allclose(a, b, atol=2e-4)
         np.testing.assert_allclose(log.u, other.u, atol=2e-3)
         assert not log.terminated
-    assert told[-1] == 1.0
-    assert told == sorted(told)
+    assert message[-1] == 1.0
+    assert message == sorted(message)
 
 
-def test_events_are_the_same(flown):
-    logs, _, each, _, _, _ = flown
+def test_events_are_the_same(sample_flight):
+    logs, _, each, _, _, _ = sample_flight
     for log, other in zip(logs, each, strict=True):
         assert [(e.t, e.kind) for e in log.events] == [(e.t, e.kind) for e in other.events]
     kinds = {event.kind for log in logs for event in log.events}
@@ -110,9 +110,9 @@ def test_events_are_the_same(flown):
     assert kinds & {"policy", "rejected"}
 
 
-def test_pilots_have_learnt_the_same(flown):
+def test_pilots_have_learnt_the_same(sample_flight):
     """By what it does: Adam moves a weight of hardly any gradient either way, by rounding."""
-    _, pilots, _, alone, _, setup = flown
+    _, pilots, _, alone, _, setup = sample_flight
     inputs = np.random.default_rng(0).normal(size=(50, 23)).astype(np.float32)
     start, model = setup.flight_starts(1)[0], setup.learner.residual_model
 
@@ -121,25 +121,25 @@ def test_pilots_have_learnt_the_same(flown):
         return jax.vmap(state.policy.policy.merged())(inputs), model.predict(state.residual, start, Command.hover())
 
     for pilot, other in zip(pilots, alone, strict=True):
-        (a, felt), (b, expected) = does(pilot.state), does(other.state)
+        (a, specific_force), (b, expected) = does(pilot.state), does(other.state)
         np.testing.assert_allclose(a.c, b.c, atol=0.03)
         np.testing.assert_allclose(a.omega, b.omega, atol=0.03)
-        np.testing.assert_allclose(felt, expected, atol=0.05)
+        np.testing.assert_allclose(specific_force, expected, atol=0.05)
 
 
-def test_a_pilot_flies_on_with_what_it_learnt(flown):
+def test_a_pilot_flies_on_with_what_it_learnt(sample_flight):
     """And its learners go on from there, with the next random numbers: nothing of it is left as it was before."""
-    _, pilots, _, alone, _, setup = flown
+    _, pilots, _, alone, _, setup = sample_flight
     for pilot, other in zip(pilots, alone, strict=True):
         mine, theirs = (jax.random.key_data(each.learners[1].learner.worker.key) for each in (pilot, other))
         np.testing.assert_array_equal(mine, theirs)
     pilot, start = pilots[0], setup.flight_starts(1)[0]
     plain = [SimPlant(CheapModel(0.02), disturbance("none")) for _ in range(2)]
     log = fly(plain[0], pilot, start, ticks=3)
-    learnt = fly(plain[1], ControllerPilot(pilot.controller_of(pilot.state)), start, ticks=3)
-    np.testing.assert_array_equal(log.u, learnt.u)
-    for scheduled in pilot.learners:
-        worker = scheduled.learner.worker
+    learner_state = fly(plain[1], ControllerPilot(pilot.controller_of(pilot.state)), start, ticks=3)
+    np.testing.assert_array_equal(log.u, learner_state.u)
+    for schedule in pilot.learners:
+        worker = schedule.learner.worker
         jax.tree.map(np.testing.assert_array_equal, worker._residual, pilot.state.residual)
         if hasattr(worker, "_policy"):
             jax.tree.map(np.testing.assert_array_equal, worker._policy, pilot.state.policy)

@@ -23,8 +23,8 @@ SECONDS = 1.2
 @pytest.fixture(scope="module")
 def preset(as_a_user):
     """The file of the preset states twice the lag of the vehicle that flies, and no delay."""
-    declared = {**VEHICLE, "rate_lag": [0.2, 0.2, 0.2], "command_delay": 0.02}
-    return changed(load("hover/any"), pretrain=SHORT, vehicle=declared)
+    declaration = {**VEHICLE, "rate_lag": [0.2, 0.2, 0.2], "command_delay": 0.02}
+    return changed(load("hover/any"), pretrain=SHORT, vehicle=declaration)
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +39,8 @@ def notes(log):
 def test_a_batch_and_a_pilot_report_the_same_vehicle(preset, scenario):
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(random.key(0))
-    (flown,) = Fleet(preset, {0: policy}, [scenario], methods=["base-id"], starts=1, seconds=SECONDS).run().flown
-    ((t, note),) = notes(flown.log)
+    (flight,) = Fleet(preset, {0: policy}, [scenario], methods=["base-id"], starts=1, seconds=SECONDS).run().flights
+    ((t, note),) = notes(flight.log)
     assert t == pytest.approx(1.0)
     assert re.fullmatch(r"thrust gain .*; rate delay .*(vehicle file: 20 ms, 200 ms\)|not excited)", note), note
     pilot = setup.pilot(policy, "base-id")

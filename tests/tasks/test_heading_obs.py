@@ -50,11 +50,11 @@ def test_a_vehicle_that_heads_along_x_observes_the_world(observation, key):
 def test_lengths_heights_and_tilt_are_kept(observation, key):
     a, b = random.split(key)
     x, u = random_state(a), random_command(b)
-    seen, world = observe(observation, x, u), observe(observation.inner, x, u)
+    view, world = observe(observation, x, u), observe(observation.inner, x, u)
     for part in (slice(0, 3), slice(12, 15)):
-        assert jnp.linalg.norm(seen[part]) == pytest.approx(float(jnp.linalg.norm(world[part])), rel=1e-12)
+        assert jnp.linalg.norm(view[part]) == pytest.approx(float(jnp.linalg.norm(world[part])), rel=1e-12)
     for row in (2, 14, *range(9, 12)):  # height, vertical velocity, and the vertical in body axes
-        assert seen[row] == pytest.approx(float(world[row]), rel=1e-12)
+        assert view[row] == pytest.approx(float(world[row]), rel=1e-12)
 
 
 def test_the_law_holds_in_another_frame(observation, key):

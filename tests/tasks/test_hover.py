@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import GOAL, draw_starts, hover_env, hover_task, random_command, random_state, replaced
+from helpers import GOAL, draw_starts, hover_env, hover_task, random_command, random_state, replace_fields
 from retrim.config import PRESETS, Setup
 from retrim.control import Policy, PolicyController
 from retrim.learn import rollout
@@ -48,7 +48,7 @@ reward = eqx.filter_jit(lambda task, t, x, u: task.reward(t, x, u))
 def test_the_l2_reward_has_a_tip_at_the_goal(away, key):
     """It is the paper's - 3 (sqrt(d^2 + (1 cm)^2) - 1 cm), whatever attitude, velocity and command."""
     x, u = random_state(key), random_command(key)
-    x = replaced(x, p=jnp.asarray(np.array(GOAL) + away))
+    x = replace_fields(x, p=jnp.asarray(np.array(GOAL) + away))
     paper, ours = (reward(task, jnp.array(0.0), x, u) for task in (hover_task(), hover_task(make=L2Hover)))
     d = math.hypot(*away)
     assert float(ours - paper) == pytest.approx(-3.0 * (math.hypot(d, 0.01) - 0.01), abs=1e-12)
@@ -57,7 +57,7 @@ def test_the_l2_reward_has_a_tip_at_the_goal(away, key):
 @eqx.filter_jit
 def slope(task, x):
     """Of the reward by position, in hover."""
-    return jax.grad(lambda p: task.reward(jnp.array(0.0), replaced(x, p=p), Command.hover()))(x.p)
+    return jax.grad(lambda p: task.reward(jnp.array(0.0), replace_fields(x, p=p), Command.hover()))(x.p)
 
 
 def test_only_the_l2_reward_is_steep_close_to_the_goal():
@@ -88,8 +88,8 @@ def test_starts_keep_to_their_bounds(heading):
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
     tilt = np.arccos(np.asarray(x.R)[:, 2, 2])
     assert tilt.max() <= math.hypot(0.1 * math.pi, 0.1 * math.pi)
-    turned = np.abs(np.arctan2(np.asarray(x.R)[:, 1, 0], np.asarray(x.R)[:, 0, 0]))
-    assert 0.9 * heading < turned.max() <= heading + 0.15
+    rotation = np.abs(np.arctan2(np.asarray(x.R)[:, 1, 0], np.asarray(x.R)[:, 0, 0]))
+    assert 0.9 * heading < rotation.max() <= heading + 0.15
     assert np.asarray(x.v).std() == pytest.approx(0.1, rel=0.05)
 
 
@@ -99,7 +99,7 @@ def test_termination():
     assert task.terminated(t, State.at(jnp.array([2.1, 0.0, 1.0])))
     assert task.terminated(t, State.at(jnp.array([jnp.nan, 0.0, 1.0])))
     x = State.at(jnp.array(GOAL))
-    assert task.terminated(t, replaced(x, v=jnp.array([jnp.inf, 0.0, 0.0])))
+    assert task.terminated(t, replace_fields(x, v=jnp.array([jnp.inf, 0.0, 0.0])))
 
 
 def test_error_is_the_distance():
@@ -129,16 +129,16 @@ def test_simulation_and_flight_see_the_same(key):
     policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
     policy = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), policy)  # so that what is seen matters
     x0 = eqx.filter_jit(task.reset)(key)
-    simulated = jax.tree.map(np.asarray, eqx.filter_jit(rollout)(env, policy, x0))
+    simulation = jax.tree.map(np.asarray, eqx.filter_jit(rollout)(env, policy, x0))
     pilot = ControllerPilot(PolicyController(task.observation, policy))
     pilot.reset(Measurement(0.0, x0.x))
     for k in range(task.horizon):
-        x = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), simulated.x)
+        x = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), simulation.x)
         u = pilot.act(Measurement(k * 0.02, x))
-        np.testing.assert_allclose(u.vector(), [simulated.u.c[k], *simulated.u.omega[k]], rtol=1e-12)
+        np.testing.assert_allclose(u.vector(), [simulation.u.c[k], *simulation.u.omega[k]], rtol=1e-12)
 
 
-turned = jax.jit(so3.log)
+rotation = jax.jit(so3.log)
 
 
 def test_flight_starts_are_the_same_for_every_preset():
@@ -146,4 +146,4 @@ def test_flight_starts_are_the_same_for_every_preset():
     for others in starts[1:]:
         jax.tree.map(np.testing.assert_array_equal, starts[0], others)
     for x in starts[0]:
-        assert np.linalg.norm(turned(x.R)) < math.sqrt(3) * 0.1 * math.pi
+        assert np.linalg.norm(rotation(x.R)) < math.sqrt(3) * 0.1 * math.pi

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import GOAL, replaced
+from helpers import GOAL, replace_fields
 from retrim.control import Policy, PolicyController
 from retrim.learn import Env, rollout
 from retrim.learn.encoder import pretrain_encoder
@@ -60,17 +60,17 @@ step = eqx.filter_jit(lambda x, u: PointMass(0.02).step(x, u, jnp.zeros(3)))
 see = eqx.filter_jit(lambda o, memory, x, last: o(memory, jnp.array(0.0), x, last))
 history = eqx.filter_jit(lambda o, x, omega: o.history(x, omega))
 stack = eqx.filter_jit(lambda o, frames: o.stacked(frames))
-turned = jax.jit(so3.exp)
+rotation = jax.jit(so3.exp)
 
 
-def watched(observation, x, us):
+def watch(observation, x, us):
     """Observations of a point mass under the commands ``us``, as a policy would get them; and the last state."""
-    memory, last, shown = begin(observation, x), Command.hover(), []
+    memory, last, display = begin(observation, x), Command.hover(), []
     for u in us:
         o, memory = see(observation, memory, x, last)
         x, last = step(x, u), u
-        shown.append(np.asarray(o))
-    return np.array(shown), memory, x
+        display.append(np.asarray(o))
+    return np.array(display), memory, x
 
 
 def gentle(key, n):
@@ -86,24 +86,24 @@ def test_no_silent_broadcast(plain):
 
 def test_layout(plain, key):
     us = gentle(key, 6)
-    shown, _, _ = watched(plain, near(), us)
-    assert shown.shape == (6, plain.size) == (6, 89)
+    display, _, _ = watch(plain, near(), us)
+    assert display.shape == (6, plain.size) == (6, 89)
     assert plain.size == 89
     pixels, _ = look(plain, near())
-    np.testing.assert_allclose(np.clip(shown[0, :14], -5, 5), np.reshape(pixels, 14), atol=1e-9)  # newest first
-    np.testing.assert_allclose(shown[3, 14:28], shown[0, :14], atol=1e-12)  # 60 ms later it is one frame back
-    np.testing.assert_array_equal(shown[:, 70:77], 1.0)
-    issued = [[float(u.c) / 9.81 - 1.0, *(np.asarray(u.omega) / [6.0, 6.0, 4.0])] for u in us[2:5]]
-    np.testing.assert_allclose(shown[5, 77:], np.reshape(issued, 12), atol=1e-12)
+    np.testing.assert_allclose(np.clip(display[0, :14], -5, 5), np.reshape(pixels, 14), atol=1e-9)  # newest first
+    np.testing.assert_allclose(display[3, 14:28], display[0, :14], atol=1e-12)  # 60 ms later it is one frame back
+    np.testing.assert_array_equal(display[:, 70:77], 1.0)
+    commands = [[float(u.c) / 9.81 - 1.0, *(np.asarray(u.omega) / [6.0, 6.0, 4.0])] for u in us[2:5]]
+    np.testing.assert_allclose(display[5, 77:], np.reshape(commands, 12), atol=1e-12)
 
 
 def test_the_same_start_sees_the_same(key):
     noisy, us = keypoints(noise=2.0), gentle(key, 4)
-    first, again = watched(noisy, near(), us)[0], watched(noisy, near(), us)[0]
+    first, again = watch(noisy, near(), us)[0], watch(noisy, near(), us)[0]
     np.testing.assert_array_equal(first, again)
-    elsewhere = replaced(near(), v=near().v + 0.01)
-    quiet = watched(keypoints(noise=0.0), elsewhere, us)[0] - watched(keypoints(noise=0.0), near(), us)[0]
-    assert not np.allclose(watched(noisy, elsewhere, us)[0] - first, quiet, atol=1e-4)  # other noise
+    elsewhere = replace_fields(near(), v=near().v + 0.01)
+    quiet = watch(keypoints(noise=0.0), elsewhere, us)[0] - watch(keypoints(noise=0.0), near(), us)[0]
+    assert not np.allclose(watch(noisy, elsewhere, us)[0] - first, quiet, atol=1e-4)  # other noise
 
 
 def test_without_noise_it_shows_the_projection_and_with_noise_its_deviation(plain):
@@ -132,7 +132,7 @@ def slope(o, x):
 
 @pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (0.9, 0.0, 1.0), (4.0, 0.0, 0.3)])
 def test_gradient_of_the_observation_is_finite(place, white):
-    x = State(jnp.array(place), turned(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
+    x = State(jnp.array(place), rotation(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
     leaves = jax.tree.leaves(slope(white, x))
     assert all(np.isfinite(leaf).all() for leaf in leaves)
     if place[0] < 1.0:
@@ -140,7 +140,7 @@ def test_gradient_of_the_observation_is_finite(place, white):
 
 
 @jax.jit
-def moved(x, omega):
+def move(x, omega):
     """A tick later."""
     return State(x.p + 0.02 * x.v, x.R @ so3.exp(0.02 * omega), x.v)
 
@@ -152,7 +152,7 @@ def test_history_is_a_steady_motion(plain):
     for _ in range(13):
         frames.append(np.asarray(look(plain, x)[0]).reshape(14))
         last = x
-        x = moved(x, omega)
+        x = move(x, omega)
     np.testing.assert_allclose(history(plain, last, omega), frames, atol=1e-10)
     frames = np.array(frames)
     np.testing.assert_array_equal(stack(plain, jnp.asarray(frames)).reshape(5, 14), frames[[12, 9, 6, 3, 0]])
@@ -210,9 +210,9 @@ def test_frames_are_60_ms_apart_at_every_rate(dt, depth, stride, plain):
     assert stride * dt == pytest.approx(0.06)
     frames = history(observation, near(), jnp.zeros(3))
     assert frames.shape == (depth, 14)
-    for i, shown in enumerate(np.asarray(stack(observation, frames)).reshape(5, 14)):
-        then = replaced(near(), p=jnp.asarray(np.asarray(near().p) - 0.06 * i * np.asarray(near().v)))
-        np.testing.assert_allclose(shown, np.reshape(look(plain, then)[0], 14), atol=1e-12)
+    for i, display in enumerate(np.asarray(stack(observation, frames)).reshape(5, 14)):
+        then = replace_fields(near(), p=jnp.asarray(np.asarray(near().p) - 0.06 * i * np.asarray(near().v)))
+        np.testing.assert_allclose(display, np.reshape(look(plain, then)[0], 14), atol=1e-12)
     # So they do at the first look of a flight.
     _, memory = see(observation, begin(observation, near()), near(), Command.hover())
     np.testing.assert_allclose(memory.frames, frames, atol=1e-12)
@@ -230,34 +230,34 @@ def test_impossible_rates():
 def test_learns_to_see(white, key):
     """A hundred small steps: the error falls; the output layer and the limits are as they were."""
     policy = Policy.of(white.size, small(), key=key, hidden=(16,))
-    learnt, errors = pretrain_encoder(policy, white, key, steps=100, batch=32)
+    learner_state, errors = pretrain_encoder(policy, white, key, steps=100, batch=32)
     assert errors.shape == (100,)
     assert float(errors[-10:].mean()) < 0.75 * float(errors[:5].mean())
-    jax.tree.map(np.testing.assert_array_equal, learnt.layers[-1], policy.layers[-1])
+    jax.tree.map(np.testing.assert_array_equal, learner_state.layers[-1], policy.layers[-1])
     jax.tree.map(
         np.testing.assert_array_equal,
-        (learnt.u_hover, learnt.u_min, learnt.u_max),
+        (learner_state.u_hover, learner_state.u_min, learner_state.u_max),
         (policy.u_hover, policy.u_min, policy.u_max),
     )
-    assert [l.weight.shape for l in learnt.layers] == [l.weight.shape for l in policy.layers]
-    for before, after in zip(policy.layers[:-1], learnt.layers[:-1], strict=True):
+    assert [l.weight.shape for l in learner_state.layers] == [l.weight.shape for l in policy.layers]
+    for before, after in zip(policy.layers[:-1], learner_state.layers[:-1], strict=True):
         assert float(jnp.abs(after.weight - before.weight).max()) > 0.01
 
 
 @pytest.mark.parametrize("occluded", [True, False])
 def test_simulation_and_flight_see_the_same(occluded, white, key):
     """Noise and lost points included: the pilot, given the states of a roll-out, issues its very commands."""
-    seen = replaced(white, noise=jnp.array(1.0))
-    seen = OccludedKeypoints(seen, jnp.array(0.1)) if occluded else seen
-    task = Hover(jnp.array(GOAL), seen, jnp.array(5.0), jnp.array(0.3), 0.02, 12)
-    policy = Policy.of(seen.size, small(), key=key, hidden=(8,))
+    observation = replace_fields(white, noise=jnp.array(1.0))
+    observation = OccludedKeypoints(observation, jnp.array(0.1)) if occluded else observation
+    task = Hover(jnp.array(GOAL), observation, jnp.array(5.0), jnp.array(0.3), 0.02, 12)
+    policy = Policy.of(observation.size, small(), key=key, hidden=(8,))
     policy = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.02), policy)
     x0 = Start(jnp.array(0.0), State(jnp.array([0.6, 0.2, 1.2]), jnp.eye(3), jnp.array([0.5, 0.0, 0.0])))
-    simulated = jax.tree.map(np.asarray, eqx.filter_jit(rollout)(Env(PointMass(0.02), task), policy, x0))
-    pilot = ControllerPilot(PolicyController(seen, policy))
+    simulation = jax.tree.map(np.asarray, eqx.filter_jit(rollout)(Env(PointMass(0.02), task), policy, x0))
+    pilot = ControllerPilot(PolicyController(observation, policy))
     pilot.reset(Measurement(0.0, x0.x))
     for k in range(task.horizon):
-        x = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), simulated.x)
+        x = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), simulation.x)
         u = pilot.act(Measurement(k * 0.02, x))
-        np.testing.assert_allclose(u.vector(), [simulated.u.c[k], *simulated.u.omega[k]], rtol=1e-7)
-    assert np.ptp(simulated.u.c) > 1e-3
+        np.testing.assert_allclose(u.vector(), [simulation.u.c[k], *simulation.u.omega[k]], rtol=1e-7)
+    assert np.ptp(simulation.u.c) > 1e-3

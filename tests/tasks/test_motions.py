@@ -19,19 +19,19 @@ from retrim.tasks.motions import MOTIONS, NEAR, WILD
 def test_motions_are_as_wide_as_they_say(motions, key):
     @jax.jit
     @jax.vmap
-    def drawn(key):
+    def draw(key):
         x, omega = motions.draw(key, jnp.array(GOAL))
         return x, omega, so3.log(x.R)
 
-    x, omega, turned = drawn(random.split(key, 4000))
+    x, omega, turn_rates = draw(random.split(key, 4000))
     off = np.asarray(x.p) - np.array(GOAL)
     assert np.abs(off).max() <= motions.box
     np.testing.assert_allclose(off.std(axis=0), motions.box / 3**0.5, rtol=0.05)
     np.testing.assert_allclose(np.asarray(x.v).std(axis=0), motions.speed, rtol=0.05)
     np.testing.assert_allclose(np.asarray(omega).std(axis=0), motions.rates, rtol=0.05)
     # About an axis in the ground the vehicle leans; about the vertical it turns, too.
-    np.testing.assert_allclose(np.asarray(turned)[:, :2].std(axis=0), motions.tilt, rtol=0.1)
-    np.testing.assert_allclose(np.asarray(turned)[:, 2].std(), np.hypot(motions.tilt, motions.turn), rtol=0.1)
+    np.testing.assert_allclose(np.asarray(turn_rates)[:, :2].std(axis=0), motions.tilt, rtol=0.1)
+    np.testing.assert_allclose(np.asarray(turn_rates)[:, 2].std(), np.hypot(motions.tilt, motions.turn), rtol=0.1)
 
 
 @pytest.mark.usefixtures("optax_promotion")

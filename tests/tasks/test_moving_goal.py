@@ -57,7 +57,7 @@ def moving(path=circle):
     return MovingGoal(hover(jnp.zeros(3)), path)
 
 
-def observed(task, t, x, u):
+def observe(task, t, x, u):
     return task.observation(task.observation.init(x), t, x, u)[0]
 
 
@@ -73,7 +73,7 @@ def test_a_goal_at_rest_is_hover(key):
     for name in ("reward", "error", "terminated"):
         values = (getattr(task, name)(t, x, *([u] if name == "reward" else [])) for task in (one, other))
         np.testing.assert_allclose(*values, rtol=1e-12)
-    np.testing.assert_allclose(observed(one, t, x, u), observed(other, t, x, u), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(observe(one, t, x, u), observe(other, t, x, u), rtol=1e-12, atol=1e-12)
 
 
 def test_uniform_motion_is_invisible(key):
@@ -81,7 +81,7 @@ def test_uniform_motion_is_invisible(key):
     x, u, t = random_state(key), Command.hover(), jnp.array(7.0)
     along = State(x.p + straight(t), x.R, x.v + VELOCITY)
     one, other = moving(straight), hover(jnp.zeros(3))
-    np.testing.assert_allclose(observed(one, t, along, u), observed(other, t, x, u), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(observe(one, t, along, u), observe(other, t, x, u), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(one.reward(t, along, u), other.reward(t, x, u), rtol=1e-9)
 
 
@@ -109,16 +109,16 @@ def test_frames(key):
     frame, t = EffectiveGravityFrame.of(PUSH), jnp.array(4.0)
     x, u = random_state(key), Command.of(jnp.array([10.0, 0.1, 0.2, -0.1]))
     task = moving()
-    turned = task.in_frame(frame)
-    np.testing.assert_allclose(turned.target(t), frame.vector(task.target(t)), rtol=1e-12)
-    np.testing.assert_allclose(turned.error(t, frame.state(x)), frame.scale * task.error(t, x), rtol=1e-9)
+    rotation = task.in_frame(frame)
+    np.testing.assert_allclose(rotation.target(t), frame.vector(task.target(t)), rtol=1e-12)
+    np.testing.assert_allclose(rotation.error(t, frame.state(x)), frame.scale * task.error(t, x), rtol=1e-9)
     own = Height(StateObs(jnp.zeros(3), jnp.full(3, 6.0), 0))
-    framed = own.in_frame(frame)
-    np.testing.assert_allclose(framed.target(t), frame.vector(own.target(t)), rtol=1e-12)
-    np.testing.assert_allclose(framed.reward(t, frame.state(x), u), own.reward(t, x, u), rtol=1e-9)
-    np.testing.assert_allclose(framed.error(t, frame.state(x)), own.error(t, x), rtol=1e-9)
+    in_frame = own.in_frame(frame)
+    np.testing.assert_allclose(in_frame.target(t), frame.vector(own.target(t)), rtol=1e-12)
+    np.testing.assert_allclose(in_frame.reward(t, frame.state(x), u), own.reward(t, x, u), rtol=1e-9)
+    np.testing.assert_allclose(in_frame.error(t, frame.state(x)), own.error(t, x), rtol=1e-9)
     with pytest.raises(FrameError, match="twice"):
-        turned.in_frame(frame)
+        rotation.in_frame(frame)
 
 
 def test_only_a_task_without_a_moving_target_rests():
@@ -138,4 +138,4 @@ def test_only_a_policy_whose_task_rests_is_shifted_at_rest():
             kinds.append(type(policy_controller(setup.preset, setup.flight_task, policy).inner))
         assert kinds == [RestingController, PolicyController]
     finally:
-        del TASKS._known["orbit-family"]
+        del TASKS._objects["orbit-family"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import GOAL, replaced, stacked
+from helpers import GOAL, replace_fields, stack_trees
 from retrim.physics import Command, PointMass, State, small, so3
 from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import Keypoints, L2Hover, OccludedKeypoints
@@ -16,7 +16,7 @@ from retrim.tasks.view import ViewHover
 SURE = 1e-12 * np.eye(12)
 begin = eqx.filter_jit(lambda o, x: o.init(x))
 step = eqx.filter_jit(lambda x, u: PointMass(0.02).step(x, u, jnp.zeros(3)))
-turned = jax.jit(so3.exp)
+rotation = jax.jit(so3.exp)
 see = eqx.filter_jit(lambda o, memory, x, last: o(memory, jnp.array(0.0), x, last))
 pixels_of = eqx.filter_jit(lambda o, x: o.pixels(x))
 
@@ -25,7 +25,7 @@ def full(noise=0.0):
     return Keypoints.of(jnp.array(GOAL), small().omega_max, whitened=False, noise=noise)
 
 
-def seen(noise=0.0, dropout=0.0, **options):
+def observe(noise=0.0, dropout=0.0, **options):
     return OccludedKeypoints(full(noise), jnp.array(dropout), **options)
 
 
@@ -43,8 +43,8 @@ def sure(observation, x):
     """The memory of a filter that starts from the truth, so that nothing but its prediction makes an error."""
     memory = begin(observation, x)
     ago = 0.02 * np.arange(12.0, -1.0, -1.0)
-    poses = stacked([replaced(x, p=jnp.asarray(np.asarray(x.p) - s * np.asarray(x.v))) for s in ago])
-    return memory._replace(pose=replaced(memory.pose, x=x, P=jnp.asarray(SURE)), poses=poses)
+    poses = stack_trees([replace_fields(x, p=jnp.asarray(np.asarray(x.p) - s * np.asarray(x.v))) for s in ago])
+    return memory._replace(pose=replace_fields(memory.pose, x=x, P=jnp.asarray(SURE)), poses=poses)
 
 
 def gentle(key, n):
@@ -56,22 +56,22 @@ def gentle(key, n):
 
 def test_while_everything_is_seen_it_shows_what_training_shows(key):
     """All five frames, the flags and the commands, of a vehicle that flies as Eq. (1) has it."""
-    x, last, hidden, plain = near(), Command.hover(), seen(), full()
-    memory, known = begin(plain, x), sure(hidden, x)
+    x, last, hidden, plain = near(), Command.hover(), observe(), full()
+    memory, model = begin(plain, x), sure(hidden, x)
     a_tick_ago = jnp.asarray(np.asarray(x.p) - 0.02 * np.asarray(x.v))
-    known = known._replace(pose=replaced(known.pose, x=replaced(x, p=a_tick_ago)))
-    known = known._replace(poses=jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[[0, *range(12)]]), known.poses))
+    model = model._replace(pose=replace_fields(model.pose, x=replace_fields(x, p=a_tick_ago)))
+    model = model._replace(poses=jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[[0, *range(12)]]), model.poses))
     for u in gentle(key, 14):
         expected, memory = see(plain, memory, x, last)
-        found, known = see(hidden, known, x, last)
+        result, model = see(hidden, model, x, last)
         x, last = step(x, u), u
-    np.testing.assert_array_equal(found[70:77], 1.0)
-    np.testing.assert_allclose(found, expected, atol=2e-4)
+    np.testing.assert_array_equal(result[70:77], 1.0)
+    np.testing.assert_allclose(result, expected, atol=2e-4)
 
 
 def test_only_what_is_in_the_image_is_observed():
     """The estimate is the filter's, of the points inside; those outside can be anywhere."""
-    hidden, x = seen(), aside()
+    hidden, x = observe(), aside()
     pixels, inside = map(np.asarray, pixels_of(hidden.full, x))
     np.testing.assert_array_equal(inside, ~(np.abs(pixels) > 1.0).any(axis=1))
     assert 0 < int(inside.sum()) < 7
@@ -79,37 +79,37 @@ def test_only_what_is_in_the_image_is_observed():
     _, after = see(hidden, memory, x, Command.hover())
 
     @eqx.filter_jit
-    def corrected(full, pose, shown, inside):
-        prior = pose.predicted(Command.hover(), 0.02)
-        return prior.corrected(full.camera, full.ground(), shown, inside, 1.0 / full.camera.size)
+    def correct(full, pose, display, inside):
+        prior = pose.predict(Command.hover(), 0.02)
+        return prior.correct(full.camera, full.ground(), display, inside, 1.0 / full.camera.size)
 
     for stray in (0.0, 0.7):
-        shown = np.where(inside[:, None], pixels, pixels + stray)
-        by_hand = corrected(hidden.full, memory.pose, jnp.asarray(shown), jnp.asarray(inside))
+        display = np.where(inside[:, None], pixels, pixels + stray)
+        by_hand = correct(hidden.full, memory.pose, jnp.asarray(display), jnp.asarray(inside))
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), after.pose, by_hand)
 
 
 def test_what_is_missed_is_not_observed(key):
     """Where every point is missed, it does not matter where the vehicle is; where half are, more is in doubt."""
-    never, memory = seen(dropout=1.0), begin(seen(dropout=1.0), near())
+    never, memory = observe(dropout=1.0), begin(observe(dropout=1.0), near())
     here, _ = see(never, memory, near(), Command.hover())
     there, _ = see(never, memory, aside(), Command.hover())
     np.testing.assert_array_equal(here, there)
     doubt = {}
     for dropout in (0.0, 0.5):
-        memory = begin(seen(), near())
+        memory = begin(observe(), near())
         for _ in range(4):
-            _, memory = see(seen(dropout=dropout), memory, near(), Command.hover())
+            _, memory = see(observe(dropout=dropout), memory, near(), Command.hover())
         doubt[dropout] = float(jnp.trace(memory.pose.P[:3, :3]))
     assert doubt[0.5] > 1.1 * doubt[0.0]
 
 
 def test_a_correction_is_no_motion():
     """A hand-over that is 20 cm and 6 degrees off is mended at the first look: in all five frames."""
-    x, hidden = State.at(jnp.array([0.1, 0.1, 1.2])), seen()
-    off = State(jnp.array([0.25, 0.0, 1.3]), turned(jnp.array([0.05, -0.05, 0.08])), x.v)
+    x, hidden = State.at(jnp.array([0.1, 0.1, 1.2])), observe()
+    off = State(jnp.array([0.25, 0.0, 1.3]), rotation(jnp.array([0.05, -0.05, 0.08])), x.v)
     memory = begin(hidden, off)
-    memory = memory._replace(pose=replaced(memory.pose, x=off, d=jnp.zeros(3)), poses=stacked([off] * 13))
+    memory = memory._replace(pose=replace_fields(memory.pose, x=off, d=jnp.zeros(3)), poses=stack_trees([off] * 13))
     o, _ = see(hidden, memory, x, Command.hover())
     frames = np.asarray(o[:70]).reshape(5, 14)
     np.testing.assert_allclose(frames, np.repeat(np.reshape(pixels_of(full(), x)[0], (1, 14)), 5, axis=0), atol=0.02)
@@ -138,10 +138,10 @@ def test_the_filter_predicts_under_the_command_that_acted(delay):
     After a step of thrust and roll the wrong command is in force for as many ticks as the delay is off by.
     """
     us = [Command.hover()] * 6 + [Command(jnp.array(13.0), jnp.array([1.5, 0.0, 0.0]))] * 6
-    declared = {max(delay - 1, 0), delay, min(delay + 1, 3)}
-    found = {d: blind(seen(dropout=1.0, delay_ticks=d), us, delay) for d in declared}
-    assert found[delay].max() < 1e-9
-    for d, errors in found.items():
+    declaration = {max(delay - 1, 0), delay, min(delay + 1, 3)}
+    result = {d: blind(observe(dropout=1.0, delay_ticks=d), us, delay) for d in declaration}
+    assert result[delay].max() < 1e-9
+    for d, errors in result.items():
         assert errors[:6].max() < 1e-9  # in hover every delay is the same
         if d != delay:
             assert errors[-1] > 0.05
@@ -150,7 +150,7 @@ def test_the_filter_predicts_under_the_command_that_acted(delay):
 def test_a_wrong_delay_shows_even_while_points_are_seen():
     """With points in sight the filter is corrected, and still follows a step of commands less well."""
     us = [Command.hover()] * 6 + [Command(jnp.array(14.0), jnp.zeros(3)), Command(jnp.array(6.0), jnp.zeros(3))] * 5
-    right, wrong = (blind(seen(delay_ticks=d), us, delay=1).max() for d in (1, 0))
+    right, wrong = (blind(observe(delay_ticks=d), us, delay=1).max() for d in (1, 0))
     assert right < 1e-3
     assert wrong > 20.0 * right
 
@@ -158,22 +158,22 @@ def test_a_wrong_delay_shows_even_while_points_are_seen():
 def test_impossible_delays():
     for delay in (-1, 4):
         with pytest.raises(ValueError, match=rf"delay_ticks = {delay} must be 0 to 3"):
-            seen(delay_ticks=delay)
+            observe(delay_ticks=delay)
 
 
 @eqx.filter_jit
 def observed_and_slope(observation, memory, x):
-    def shown(p):
-        return observation(memory, jnp.array(0.0), replaced(x, p=p), Command.hover())[0]
+    def show(p):
+        return observation(memory, jnp.array(0.0), replace_fields(x, p=p), Command.hover())[0]
 
-    return shown(x.p), jax.jacobian(shown)(x.p)
+    return show(x.p), jax.jacobian(show)(x.p)
 
 
 @pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (4.0, 0.0, 0.3)])
 def test_it_is_for_flight(place):
     """Finite wherever the vehicle is, and no gradient passes."""
-    x = State(jnp.array(place), turned(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
-    hidden = seen(noise=1.0, dropout=0.1)
+    x = State(jnp.array(place), rotation(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
+    hidden = observe(noise=1.0, dropout=0.1)
     o, slope = observed_and_slope(hidden, begin(hidden, x), x)
     assert np.isfinite(o).all()
     np.testing.assert_array_equal(slope, 0.0)
@@ -186,12 +186,12 @@ def test_in_a_frame_the_camera_sees_level_ground(d):
     x = step(before, Command.hover())
     inside = full().in_frame(frame)
     hovering = frame.command(Command.hover())
-    soon = replaced(before, p=before.p + 0.02 * before.v)  # a memory is that of a tick ago
+    soon = replace_fields(before, p=before.p + 0.02 * before.v)  # a memory is that of a tick ago
     expected, _ = see(inside, begin(inside, frame.state(soon)), frame.state(x), hovering)
-    hidden = seen()
-    found, after = see(hidden.in_frame(frame), sure(hidden, before), frame.state(x), hovering)
-    np.testing.assert_allclose(found[:77], expected[:77], atol=1e-5)
-    np.testing.assert_allclose(found[85:], expected[85:], atol=1e-9)  # the last command, as the policy gave it
+    hidden = observe()
+    result, after = see(hidden.in_frame(frame), sure(hidden, before), frame.state(x), hovering)
+    np.testing.assert_allclose(result[:77], expected[:77], atol=1e-5)
+    np.testing.assert_allclose(result[85:], expected[85:], atol=1e-9)  # the last command, as the policy gave it
     np.testing.assert_allclose(after.pose.x.p, x.p, atol=1e-5)  # the filter is in the world
 
 
@@ -202,14 +202,15 @@ def test_keeping_points_in_sight_is_rewarded():
     )
 
     @jax.jit
-    def lost(x):
+    def lose(x):
         return plain.reward(jnp.array(0.0), x, Command.hover()) - task.reward(jnp.array(0.0), x, Command.hover())
 
-    tilted = [
-        replaced(State.at(jnp.array([0.0, 0.0, 1.3])), R=turned(jnp.array([a, 0.0, 0.0]))) for a in (0.0, 0.8, 1.1)
+    tilts = [
+        replace_fields(State.at(jnp.array([0.0, 0.0, 1.3])), R=rotation(jnp.array([a, 0.0, 0.0])))
+        for a in (0.0, 0.8, 1.1)
     ]
-    level, some, more = (float(lost(x)) for x in tilted)
+    level, some, more = (float(lose(x)) for x in tilts)
     assert level == 0.0
     assert 0.0 < some < more
-    slope = jax.jit(jax.grad(lambda a: lost(replaced(tilted[0], R=so3.exp(a * jnp.array([1.0, 0.0, 0.0]))))))(0.8)
+    slope = jax.jit(jax.grad(lambda a: lose(replace_fields(tilts[0], R=so3.exp(a * jnp.array([1.0, 0.0, 0.0]))))))(0.8)
     assert 0.0 < float(slope) < np.inf

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import at, replaced
+from helpers import at, replace_fields
 from retrim.physics import Command, PointMass, State, kingfisher, small, with_payload
-from retrim.tasks import REFERENCES, Reference, joined, smooth_start
+from retrim.tasks import REFERENCES, Reference, join_references, smooth_start
 from retrim.tasks.reference import POINTS
 from retrim.tasks.shapes import AT_SPEED, circle, figure8, star
 
@@ -25,7 +25,7 @@ BOUNDS = {  # of the lap: lowest and highest x, then y
 }
 CORNERS = [1.0 + np.exp(1j * (math.pi + k * math.radians(72.0))) for k in range(5)]  # of the star, x + i y
 
-named = pytest.mark.parametrize("name", REFERENCES)
+names = pytest.mark.parametrize("name", REFERENCES)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def line(t):
 # ---- the three shapes of the paper
 
 
-@named
+@names
 def test_starts_at_rest_at_the_origin(name, tables):
     here = at_one(tables[name], 0.0)
     np.testing.assert_allclose(here.p, [0.0, 0.0, 1.0], atol=1e-9)
@@ -57,7 +57,7 @@ def test_starts_at_rest_at_the_origin(name, tables):
     assert here.heading == 0.0
 
 
-@named
+@names
 def test_repeats_with_its_period_and_no_other(name, tables):
     reference, period = tables[name], PERIODS[name]
     assert float(reference.lap[1] - reference.lap[0]) == period
@@ -71,7 +71,7 @@ def test_repeats_with_its_period_and_no_other(name, tables):
         assert np.abs(at(reference, times + part * period).p - first.p).max() > 0.3
 
 
-@named
+@names
 def test_extent(name, tables):
     lap = at(tables[name], RAMP + PERIODS[name] * np.linspace(0.0, 1.0, 3000)).p
     for axis in (0, 1):
@@ -125,7 +125,7 @@ def test_the_start_is_smooth():
 # ---- continuity and derivatives
 
 
-@named
+@names
 def test_continuous_also_across_the_lap(name, tables):
     """No step is longer than the fastest speed allows; nor at the seam."""
     reference, end = tables[name], RAMP + PERIODS[name]
@@ -139,7 +139,7 @@ def test_continuous_also_across_the_lap(name, tables):
             np.testing.assert_allclose(b, a, atol=near)
 
 
-@named
+@names
 def test_velocity_is_the_derivative_of_position(name, tables):
     rows, every = np.asarray(tables[name].rows), float(tables[name].every)
     slopes = (rows[2:, :3] - rows[:-2, :3]) / (2.0 * every)
@@ -155,9 +155,9 @@ def test_velocity_is_the_derivative_of_position(name, tables):
 def test_interpolates_linearly_between_rows(tables):
     reference = tables["circle"]
     t = (100.0 + 0.25) * float(reference.every)
-    mixed = 0.75 * reference.rows[100] + 0.25 * reference.rows[101]
+    mixture = 0.75 * reference.rows[100] + 0.25 * reference.rows[101]
     here = at_one(reference, t)
-    np.testing.assert_allclose(jnp.concatenate([jnp.atleast_1d(leaf) for leaf in here]), mixed, atol=1e-12)
+    np.testing.assert_allclose(jnp.concatenate([jnp.atleast_1d(leaf) for leaf in here]), mixture, atol=1e-12)
 
 
 # ---- headings that wind
@@ -178,7 +178,7 @@ def along(phase):
 winding = pytest.mark.parametrize(("fold", "phase"), [(False, 0.0), (True, 0.0), (True, 1.0), (True, 4.0)])
 
 
-def made(fold, phase):
+def make(fold, phase):
     path = along(phase)
     return Reference.of(lambda t: path(t, fold), seconds=6.0, lap=3.0)
 
@@ -192,13 +192,13 @@ def check_heading(reference, first, last):
     step = 1e-3
     times = np.arange(first, last, step)
     points = at(reference, times)
-    turned = turned_by(np.diff(points.heading))
-    np.testing.assert_allclose(turned / step, 0.5 * (points.heading_rate[1:] + points.heading_rate[:-1]), atol=0.1)
+    rotation = turned_by(np.diff(points.heading))
+    np.testing.assert_allclose(rotation / step, 0.5 * (points.heading_rate[1:] + points.heading_rate[:-1]), atol=0.1)
 
 
 @winding
 def test_the_rate_of_a_heading_is_its_derivative(fold, phase):
-    reference = made(fold, phase)
+    reference = make(fold, phase)
     assert np.abs(reference.rows[:, 17]).max() == pytest.approx(2.0 * math.pi / 3.0, rel=1e-3)
     assert np.abs(np.diff(reference.rows[:, 10])).max() < 0.02  # it may be interpolated
     assert float(reference.rows[-1, 10] - at_one(reference, 3.0).heading) == pytest.approx(2.0 * math.pi, abs=1e-4)
@@ -207,7 +207,7 @@ def test_the_rate_of_a_heading_is_its_derivative(fold, phase):
 
 @winding
 def test_a_family_turns_as_its_members_do(fold, phase):
-    check_heading(joined([made(fold, phase), circle()]), 0.0, 19.9)
+    check_heading(join_references([make(fold, phase), circle()]), 0.0, 19.9)
 
 
 # ---- flatness
@@ -306,7 +306,7 @@ def test_names_the_axis_of_the_rate():
     text = spin.infeasibility(small())
     assert "it needs 6.0 rad/s about z" in text
     assert "the limit is 4.0" in text
-    lazy = replaced(small(), omega_max=jnp.array([0.5, 6.0, 4.0]))
+    lazy = replace_fields(small(), omega_max=jnp.array([0.5, 6.0, 4.0]))
     assert "rad/s about x" in circle().infeasibility(lazy)
 
 
@@ -422,17 +422,17 @@ def test_the_end_is_held():
 @pytest.mark.parametrize("what", ["joined", "distance"])
 def test_no_silent_promotion(what, tables):
     if what == "joined":
-        joined([tables["circle"]], seconds=6.0)
+        join_references([tables["circle"]], seconds=6.0)
     else:
         tables["circle"].distance(jnp.zeros(3))
 
 
 def test_each_stretch_of_a_family_is_its_reference(tables):
-    family = joined(list(tables.values()))
+    family = join_references(list(tables.values()))
     times = 0.02 * np.arange(950)
     for k, reference in enumerate(tables.values()):
-        found, wanted = at(family, 20.0 * k + times), at(reference, times)
-        for a, b in zip(found, wanted, strict=True):
+        result, expected = at(family, 20.0 * k + times), at(reference, times)
+        for a, b in zip(result, expected, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-9)
     between = at(family, times + 0.01).p - at(tables["circle"], times + 0.01).p
     assert np.abs(between).max() < 1e-3
@@ -440,7 +440,7 @@ def test_each_stretch_of_a_family_is_its_reference(tables):
 
 def test_starts_of_a_family_never_straddle(tables):
     """4 s of roll-out, and half a second of preview, from wherever one may start, stay in the stretch."""
-    family = joined(list(tables.values()), seconds=8.0, every=0.02)
+    family = join_references(list(tables.values()), seconds=8.0, every=0.02)
     for k, (first, last) in enumerate(np.asarray(family.joins)):
         assert 8.0 * k <= first < last
         assert last + 4.0 + 0.5 < 8.0 * (k + 1) - 0.02
@@ -450,7 +450,7 @@ def test_starts_of_a_family_never_straddle(tables):
 def test_a_family_needs_members_and_time(tables):
     for members, seconds in (([], 20.0), (list(tables.values()), 5.9)):
         with pytest.raises(ValueError, match="at least 1, of at least 6 s"):
-            joined(members, seconds=seconds)
+            join_references(members, seconds=seconds)
 
 
 # ---- cross-track
@@ -459,7 +459,7 @@ def test_a_family_needs_members_and_time(tables):
 distances = eqx.filter_jit(lambda reference, p: jax.vmap(reference.distance)(p))
 
 
-@named
+@names
 def test_no_distance_on_the_lap(name, tables):
     reference = tables[name]
     rows, times = np.asarray(reference.rows), row_times(reference)

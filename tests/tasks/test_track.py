@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import GOAL, draw_starts, random_command, random_state, replaced
+from helpers import GOAL, draw_starts, random_command, random_state, replace_fields
 from retrim.control import Policy, PolicyController
 from retrim.learn import Env, rollout
 from retrim.physics import Command, PointMass, State, small, so3
@@ -43,11 +43,11 @@ def observe(kind, reference, history):
 
 
 def tracking(reference, make=Track, *, history=2, spread=1.0, box=5.0, horizon=12, kind="preview"):
-    seen = observe(kind, reference, history)
-    return make(reference, seen, jnp.array(spread), jnp.array(box), 0.02, horizon)
+    observation = observe(kind, reference, history)
+    return make(reference, observation, jnp.array(spread), jnp.array(box), 0.02, horizon)
 
 
-turned = jax.jit(so3.rotz)
+rotation = jax.jit(so3.rotz)
 
 
 @eqx.filter_jit
@@ -74,24 +74,24 @@ def test_paper_reward_by_hand(nose):
 def test_sharp_reward_by_hand(nose):
     """|5 (p - p_ref)| = 2.5 -> 2; |v - v_ref| = .5 -> .125; |u - u_ref| = 1 -> .5, weighed 0.1; 60 degrees off."""
     x = on(nose, 3.0)
-    R = turned(jnp.array(math.pi / 6.0 + math.pi / 3.0))
+    R = rotation(jnp.array(math.pi / 6.0 + math.pi / 3.0))
     x = State(x.p + jnp.array([0.3, 0.0, -0.4]), R, x.v + jnp.array([0.3, 0.4, 0.0]))
     u = Command.of(place(nose, jnp.array(3.0)).u + jnp.array([0.6, 0.0, 0.8, 0.0]))
-    wanted = -(2.0 + 0.125 + 0.1 * 0.5 + 0.5 * (1.0 - 0.5))
-    assert float(reward(tracking(nose, L2Track), jnp.array(3.0), x, u)) == pytest.approx(wanted, rel=1e-6)
+    expected = -(2.0 + 0.125 + 0.1 * 0.5 + 0.5 * (1.0 - 0.5))
+    assert float(reward(tracking(nose, L2Track), jnp.array(3.0), x, u)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_l2_reward_against_the_papers(loop, key):
     """Five times as sharp in position, another command asked for, and half of 1 - cos of the heading error."""
     t, x, u = jnp.array(4.0), random_state(key), random_command(key)
     here, hover = place(loop, t), np.array([9.81, 0.0, 0.0, 0.0])
-    off, issued = x.p - here.p, u.vector()
+    off, commands = x.p - here.p, u.vector()
     nose = np.array([math.cos(float(here.heading)), math.sin(float(here.heading))])
-    difference = -(huber(5.0 * off) - huber(off)) - 0.1 * (huber(issued - here.u) - huber(issued - hover))
+    difference = -(huber(5.0 * off) - huber(off)) - 0.1 * (huber(commands - here.u) - huber(commands - hover))
     difference -= 0.5 * (1.0 - float(nose @ np.asarray(x.R)[:2, 0]))
-    found = reward(tracking(loop, L2Track), t, x, u) - reward(tracking(loop), t, x, u)
-    assert float(found) == pytest.approx(float(difference), rel=1e-12)
-    near = replaced(on(loop, 4.0), p=here.p + jnp.array([0.0, 0.0, 0.1]))
+    result = reward(tracking(loop, L2Track), t, x, u) - reward(tracking(loop), t, x, u)
+    assert float(result) == pytest.approx(float(difference), rel=1e-12)
+    near = replace_fields(on(loop, 4.0), p=here.p + jnp.array([0.0, 0.0, 0.1]))
     own = Command.of(here.u)
     assert float(reward(tracking(loop, L2Track), t, near, own)) == pytest.approx(-0.5 * (5.0 * 0.1) ** 2, rel=1e-6)
 
@@ -130,7 +130,7 @@ def test_error_knows_the_time_and_cross_track_does_not(loop):
         assert float(error(jnp.array(7.0), x)) == pytest.approx(0.0, abs=1e-8)  # a whole lap later
         assert float(error(jnp.array(5.5), x)) == pytest.approx(2.0, abs=1e-3)
         assert float(across(x)) < 0.007
-        outside = replaced(x, p=x.p + 0.25 * (x.p - jnp.array([1.0, 0.0, 1.0])))
+        outside = replace_fields(x, p=x.p + 0.25 * (x.p - jnp.array([1.0, 0.0, 1.0])))
         assert float(across(outside)) == pytest.approx(0.25, abs=1e-3)
         assert float(error(jnp.array(4.0), outside)) == pytest.approx(0.25, abs=1e-3)
 
@@ -142,9 +142,9 @@ def test_the_box_moves_with_the_reference(loop):
     assert terminated(jnp.array(5.5), x)  # the box has gone on
     for axis in range(3):
         for off, inside in ((0.49, True), (0.51, False), (-0.51, False)):
-            assert bool(terminated(jnp.array(4.0), replaced(x, p=x.p.at[axis].add(off)))) is not inside
-    assert terminated(jnp.array(4.0), replaced(x, p=x.p.at[0].set(jnp.nan)))
-    assert terminated(jnp.array(4.0), replaced(x, v=x.v.at[0].set(jnp.inf)))
+            assert bool(terminated(jnp.array(4.0), replace_fields(x, p=x.p.at[axis].add(off)))) is not inside
+    assert terminated(jnp.array(4.0), replace_fields(x, p=x.p.at[0].set(jnp.nan)))
+    assert terminated(jnp.array(4.0), replace_fields(x, v=x.v.at[0].set(jnp.inf)))
 
 
 @eqx.filter_jit
@@ -184,12 +184,12 @@ def test_starts_repeat_and_head_along(nose):
 # ---- the preview
 
 
-def seen_by(observation, t, x, last=None, memory=None):
+def observe_by(observation, t, x, last=None, memory=None):
     memory = observation.init(x) if memory is None else memory
-    return seen(observation, memory, jnp.array(t), x, Command.hover() if last is None else last)
+    return view(observation, memory, jnp.array(t), x, Command.hover() if last is None else last)
 
 
-seen = eqx.filter_jit(lambda observation, *more: observation(*more))
+view = eqx.filter_jit(lambda observation, *more: observation(*more))
 
 
 @pytest.mark.parametrize("history", [0, 2, 3])
@@ -198,7 +198,7 @@ def test_preview_layout(history, loop, key):
     x, memory = random_state(key), None
     for k in range(4):
         u = Command(jnp.array(9.81 * (1.0 + k)), jnp.array([6.0, 0.0, -4.0]) * k)
-        o, memory = seen_by(observation, t, x, u, memory)
+        o, memory = observe_by(observation, t, x, u, memory)
     assert o.shape == (observation.size,) == (35 + 4 * history,)
     soon = [loop(jnp.array(t + ahead)).p - x.p for ahead in (0.0, 0.08, 0.16, 0.28, 0.4)]
     np.testing.assert_allclose(o[:15], np.concatenate(soon), atol=1e-12)
@@ -217,29 +217,29 @@ def test_observed_tracking_errors_by_hand(kind, history, loop, key):
     observation, t, x, memory = observe(kind, loop, history), 3.7, random_state(key), None
     for k in range(3):
         u = Command(jnp.array(9.81 * (1.0 + k)), jnp.array([6.0, 0.0, -4.0]) * k)
-        o, memory = seen_by(observation, t, x, u, memory)
+        o, memory = observe_by(observation, t, x, u, memory)
     here, commands = loop(jnp.array(t)), [[k, k, 0.0, -k] for k in range(3)][3 - history :]
     error = np.asarray(x.p - here.p) / 1.5, np.asarray(x.v - here.v) / 5.0
     own = (np.asarray(x.p) - np.asarray(GOAL)) / 1.5, np.asarray(x.v) / 5.0
     first, last = (error, ()) if kind == "relative" else (own, error)
-    wanted = [first[0], np.asarray(x.R).reshape(9), first[1], np.reshape(commands, -1), *last]
+    expected = [first[0], np.asarray(x.R).reshape(9), first[1], np.reshape(commands, -1), *last]
     assert o.shape == (observation.size,) == ((15 if kind == "relative" else 21) + 4 * history,)
-    np.testing.assert_allclose(o, np.concatenate(wanted), atol=1e-12)
+    np.testing.assert_allclose(o, np.concatenate(expected), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["relative", "both"])
 def test_a_place_is_observed_by_a_policy_that_observes_both_alone(kind, loop, key):
     """Shape and vehicle are moved together: the error stays, and absolute positions do not."""
     by, x = jnp.array([3.0, -7.0, 2.0]), random_state(key)
-    moved = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
-    see = jax.jit(lambda reference, x: seen_by(observe(kind, reference, 1), 4.4, x)[0])
-    here, there = see(loop, x), see(moved, replaced(x, p=x.p + by))
+    shift = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
+    see = jax.jit(lambda reference, x: observe_by(observe(kind, reference, 1), 4.4, x)[0])
+    here, there = see(loop, x), see(shift, replace_fields(x, p=x.p + by))
     np.testing.assert_allclose(there[:3] - here[:3], (0.0 if kind == "relative" else by / 1.5), atol=1e-9)
     np.testing.assert_allclose(there[3:], here[3:], atol=1e-9)
 
 
 def test_preview_shows_the_heading(nose):
-    o, _ = seen_by(Preview(nose, small().omega_max, 0), 1.0, on(nose, 1.0))
+    o, _ = observe_by(Preview(nose, small().omega_max, 0), 1.0, on(nose, 1.0))
     np.testing.assert_allclose(o[33:35], [math.cos(math.pi / 6.0), 0.5], atol=1e-12)
     np.testing.assert_allclose(o[:3], 0.0, atol=1e-12)
 
@@ -247,12 +247,12 @@ def test_preview_shows_the_heading(nose):
 def test_preview_knows_no_place(loop, key):
     """Shape and vehicle moved together: it sees the same. Only one of them moved: it does not."""
     by = jnp.array([3.0, -7.0, 2.0])
-    moved = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
+    shift = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
     x = random_state(key)
-    see = jax.jit(lambda reference, x: seen_by(Preview(reference, small().omega_max, 1), 4.4, x)[0])
-    there = replaced(x, p=x.p + by)
-    np.testing.assert_allclose(see(moved, there), see(loop, x), atol=1e-12)
-    assert float(jnp.abs(see(moved, x) - see(loop, x)).max()) > 1.0
+    see = jax.jit(lambda reference, x: observe_by(Preview(reference, small().omega_max, 1), 4.4, x)[0])
+    there = replace_fields(x, p=x.p + by)
+    np.testing.assert_allclose(see(shift, there), see(loop, x), atol=1e-12)
+    assert float(jnp.abs(see(shift, x) - see(loop, x)).max()) > 1.0
 
 
 @pytest.mark.parametrize("t0", [0.0, 1.7, 5.95])
@@ -262,16 +262,16 @@ def test_simulation_and_flight_see_the_same(t0, kind, loop, key):
     task = tracking(loop, kind=kind)
     policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
     policy = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), policy)  # so that what is seen matters
-    x0 = replaced(on(loop, t0), p=place(loop, jnp.array(t0)).p + 0.2)
-    simulated = eqx.filter_jit(rollout)(Env(PointMass(0.02), task), policy, Start(jnp.array(t0), x0))
-    simulated = jax.tree.map(np.asarray, simulated)
+    x0 = replace_fields(on(loop, t0), p=place(loop, jnp.array(t0)).p + 0.2)
+    simulation = eqx.filter_jit(rollout)(Env(PointMass(0.02), task), policy, Start(jnp.array(t0), x0))
+    simulation = jax.tree.map(np.asarray, simulation)
     pilot = ControllerPilot(PolicyController(task.observation, policy))
     pilot.reset(Measurement(7.0, x0))  # the clock of a plant starts anywhere
     for k in range(task.horizon):
-        x = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), simulated.x)
+        x = jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), simulation.x)
         u = pilot.act(Measurement(7.0 + t0 + k * 0.02, x))
-        np.testing.assert_allclose(u.vector(), [simulated.u.c[k], *simulated.u.omega[k]], rtol=1e-10)
-    assert np.ptp(simulated.u.c) > 1e-4
+        np.testing.assert_allclose(u.vector(), [simulation.u.c[k], *simulation.u.omega[k]], rtol=1e-10)
+    assert np.ptp(simulation.u.c) > 1e-4
 
 
 def test_another_reference_is_data(loop):

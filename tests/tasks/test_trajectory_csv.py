@@ -19,7 +19,7 @@ from retrim.tasks.trajectory_table import read_table
 TURN = 2.0 * math.pi
 
 
-def written(tmp_path, text):
+def write(tmp_path, text):
     file = tmp_path / "path.csv"
     file.write_bytes(text.encode() if isinstance(text, str) else text)
     return file
@@ -29,7 +29,7 @@ def sampled(tmp_path, path, times, *, decimals=6, header="t,x,y,z,yaw"):
     rows = [[t, *path(float(t))] for t in times]
     names = ",".join(header.split(",")[: len(rows[0])])
     lines = [",".join(f"{value:.{decimals}f}" for value in row) for row in rows]
-    return written(tmp_path, "\n".join([names, *lines]) + "\n")
+    return write(tmp_path, "\n".join([names, *lines]) + "\n")
 
 
 def round_lap(t):
@@ -52,10 +52,10 @@ def test_a_sampled_lap_is_the_built_in_shape(lap, shape, period, tmp_path):
     reference = from_csv(sampled(tmp_path, lap, np.linspace(0.0, period, round(50 * period) + 1)))
     np.testing.assert_array_equal(reference.lap, shape().lap)
     times = np.concatenate([np.linspace(0.0, 3.0 + 2.0 * period, 501), 3.0 + 9.0 * period + np.linspace(0, 3, 50)])
-    found, wanted = at(reference, times), at(shape(), times)
-    np.testing.assert_allclose(found.p, wanted.p, atol=1e-3)
-    np.testing.assert_allclose(found.v, wanted.v, atol=5e-3)
-    np.testing.assert_allclose(found.u, wanted.u, atol=0.2)
+    result, expected = at(reference, times), at(shape(), times)
+    np.testing.assert_allclose(result.p, expected.p, atol=1e-3)
+    np.testing.assert_allclose(result.v, expected.v, atol=5e-3)
+    np.testing.assert_allclose(result.u, expected.u, atol=0.2)
     assert reference.infeasibility(small()) is None
     rates = np.abs(np.asarray(reference.rows)[:, 7:10]).max(axis=0)
     assert (rates < 0.8 * np.asarray(small().omega_max)).all()
@@ -123,8 +123,8 @@ def test_the_nose_turns_on_from_lap_to_lap(tmp_path):
     np.testing.assert_array_equal(reference.lap, [3.0, 6.0])
     times = np.linspace(3.1, 11.9, 200)
     points = at(reference, times)
-    wanted = -0.5 * math.pi + TURN * (times - 1.5) / 3.0
-    np.testing.assert_allclose(np.cos(points.heading - wanted), 1.0, atol=1e-6)
+    expected = -0.5 * math.pi + TURN * (times - 1.5) / 3.0
+    np.testing.assert_allclose(np.cos(points.heading - expected), 1.0, atol=1e-6)
     steady = np.asarray(points.u)[:, 1:]  # 2 pi / 3 s about the vertical, seen from the tilted body
     np.testing.assert_allclose(np.linalg.norm(steady, axis=1), TURN / 3.0, atol=0.1)
     assert reference.infeasibility(small()) is None
@@ -138,7 +138,7 @@ def test_another_yaw_at_the_end_is_no_lap(tmp_path):
 
 
 def test_two_or_three_points_are_no_lap(tmp_path):
-    file = written(tmp_path, "0,0,0,1\n2,1,0,1\n4,0,0,1\n")
+    file = write(tmp_path, "0,0,0,1\n2,1,0,1\n4,0,0,1\n")
     np.testing.assert_array_equal(from_csv(file).lap, [4.0, 4.0])
     with pytest.raises(ConfigError, match="3 points; a lap needs at least four"):
         from_csv(file, laps=True)
@@ -196,7 +196,7 @@ def test_a_start_at_rest_and_an_end_at_speed_in_one_place_are_no_lap(tmp_path):
 def test_corners_of_a_sampled_star_are_named(tmp_path):
     times = np.linspace(3.0, 9.0, 301)
     rows = np.column_stack([times, at(star(), times).p])
-    reference = from_csv(written(tmp_path, "\n".join(",".join(map(str, row)) for row in rows)))
+    reference = from_csv(write(tmp_path, "\n".join(",".join(map(str, row)) for row in rows)))
     assert float(reference.lap[1] - reference.lap[0]) == pytest.approx(6.0)
     assert "velocity jumps" in reference.infeasibility(small())
 
@@ -219,14 +219,14 @@ def test_once_through_its_points_from_rest_to_rest(tmp_path):
     """Way-points: passed at their times, at rest at both ends, held for ever."""
     points = np.array([[0.0, 0.0, 0.0, 1.0], [1.5, 1.0, 0.0, 1.2], [3.0, 1.0, 1.0, 1.5], [5.0, 0.0, 2.0, 1.0]])
     text = "\n".join(",".join(map(str, row)) for row in points)
-    reference = from_csv(written(tmp_path, text))
-    found = at(reference, points[:, 0])
-    np.testing.assert_allclose(found.p, points[:, 1:], atol=1e-4)
-    np.testing.assert_allclose(found.v[jnp.array([0, 3])], 0.0, atol=0.02)
-    held = at(reference, [5.01, 100.0])
-    np.testing.assert_allclose(held.p, [points[-1, 1:]] * 2, atol=1e-9)
-    np.testing.assert_array_equal(held.v, 0.0)
-    np.testing.assert_allclose(held.u, [[9.81, 0.0, 0.0, 0.0]] * 2)
+    reference = from_csv(write(tmp_path, text))
+    result = at(reference, points[:, 0])
+    np.testing.assert_allclose(result.p, points[:, 1:], atol=1e-4)
+    np.testing.assert_allclose(result.v[jnp.array([0, 3])], 0.0, atol=0.02)
+    hold = at(reference, [5.01, 100.0])
+    np.testing.assert_allclose(hold.p, [points[-1, 1:]] * 2, atol=1e-9)
+    np.testing.assert_array_equal(hold.v, 0.0)
+    np.testing.assert_allclose(hold.u, [[9.81, 0.0, 0.0, 0.0]] * 2)
     np.testing.assert_array_equal(reference.rows[:, 10], 0.0)  # it heads along x
     assert reference.infeasibility(small()) is None
 
@@ -234,10 +234,10 @@ def test_once_through_its_points_from_rest_to_rest(tmp_path):
 def test_once_between_its_points_is_their_curve(tmp_path):
     reference = from_csv(sampled(tmp_path, helix, np.linspace(2.0, 8.0, 121)))
     times = np.linspace(0.0, 5.99, 77)
-    found = at(reference, times)
-    np.testing.assert_allclose(found.p, [helix(t + 2.0)[:3] for t in times], atol=1e-4)
-    np.testing.assert_allclose(found.heading, 0.5 * (times + 2.0), atol=1e-4)
-    np.testing.assert_allclose(found.v, [[-math.sin(t + 2), math.cos(t + 2), 0.2] for t in times], atol=5e-3)
+    result = at(reference, times)
+    np.testing.assert_allclose(result.p, [helix(t + 2.0)[:3] for t in times], atol=1e-4)
+    np.testing.assert_allclose(result.heading, 0.5 * (times + 2.0), atol=1e-4)
+    np.testing.assert_allclose(result.v, [[-math.sin(t + 2), math.cos(t + 2), 0.2] for t in times], atol=5e-3)
     text = reference.infeasibility(small())
     assert text == (
         "it starts at speed, 1.02 m/s, and a flight starts at rest; "
@@ -258,14 +258,14 @@ def text_of(columns, sign=",", header=True, end=""):
 
 @pytest.mark.parametrize("columns", list(itertools.permutations(("t", "x", "y", "z", "yaw")))[::7])
 def test_columns_by_name_in_any_order(columns, tmp_path):
-    np.testing.assert_array_equal(read_table(written(tmp_path, text_of(columns))), ROWS)
+    np.testing.assert_array_equal(read_table(write(tmp_path, text_of(columns))), ROWS)
 
 
 @pytest.mark.parametrize("sign", [",", ";", "\t", " ", ", ", " ; ", "   ", " \t"])
 @pytest.mark.parametrize("header", [True, False])
 def test_separators(sign, header, tmp_path):
     text = text_of(("t", "x", "y", "z", "yaw"), sign, header)
-    np.testing.assert_array_equal(read_table(written(tmp_path, text)), ROWS)
+    np.testing.assert_array_equal(read_table(write(tmp_path, text)), ROWS)
 
 
 @pytest.mark.parametrize(
@@ -285,7 +285,7 @@ def test_separators(sign, header, tmp_path):
 )
 def test_headers(header, tmp_path):
     text = header + "\n" + text_of(("t", "x", "y", "z", "yaw"), header=False)
-    np.testing.assert_array_equal(read_table(written(tmp_path, text)), ROWS)
+    np.testing.assert_array_equal(read_table(write(tmp_path, text)), ROWS)
 
 
 @pytest.mark.parametrize(
@@ -304,19 +304,19 @@ def test_names_of_others_and_columns_that_the_positions_determine(names, tmp_pat
     """The first is that of rpg_time_optimal and gym-pybullet-drones; what is not read may hold anything."""
     more = ",oops" * (names.count(",") - 3)
     text = names + "\n" + "".join(",".join(f"{x:g}" for x in row[:4]) + more + "\n" for row in ROWS)
-    np.testing.assert_array_equal(read_table(written(tmp_path, text))[:, :4], ROWS[:, :4])
+    np.testing.assert_array_equal(read_table(write(tmp_path, text))[:, :4], ROWS[:, :4])
 
 
 @pytest.mark.parametrize("later", [0.0, 5e-7, -5e-7])
 def test_a_point_that_two_segments_share_is_there_once(later, tmp_path):
     again = np.insert(ROWS, 2, ROWS[1] + [later, 0.0, 0.0, 0.0, 0.0], axis=0)
     text = "\n".join(",".join(f"{x:.9f}" for x in row) for row in again)
-    np.testing.assert_array_equal(read_table(written(tmp_path, text)), ROWS)
+    np.testing.assert_array_equal(read_table(write(tmp_path, text)), ROWS)
 
 
 def test_two_places_at_one_time_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="line 3: time 1 s does not come after 1 s"):
-        read_table(written(tmp_path, "0,0,0,1\n1,0,0,1\n1,0.1,0,1\n"))
+        read_table(write(tmp_path, "0,0,0,1\n1,0,0,1\n1,0.1,0,1\n"))
 
 
 def test_a_commented_header_sets_the_order(tmp_path):
@@ -330,21 +330,21 @@ def test_a_commented_header_sets_the_order(tmp_path):
 def test_comments_blanks_quotes_and_trailing_separators(tmp_path):
     text = '# by hand\nt,x,y,z,\n\n0,0,0,1,  # here\n  \n"1","1","0.5",2,,\r\n2.5,2,0,3\n,,,\n'
     with pytest.raises(ConfigError, match="line 8"):
-        read_table(written(tmp_path, text))
-    found = read_table(written(tmp_path, text.removesuffix(",,,\n")))
-    np.testing.assert_array_equal(found[:, :4], ROWS[:, :4])
-    np.testing.assert_array_equal(found[:, 4], 0.0)
+        read_table(write(tmp_path, text))
+    result = read_table(write(tmp_path, text.removesuffix(",,,\n")))
+    np.testing.assert_array_equal(result[:, :4], ROWS[:, :4])
+    np.testing.assert_array_equal(result[:, 4], 0.0)
 
 
 def test_times_count_from_the_first_point(tmp_path):
     text = "\n".join(f"{t + 170.0},{t},0,1" for t in range(5))
-    np.testing.assert_array_equal(read_table(written(tmp_path, text))[:, 0], range(5))
+    np.testing.assert_array_equal(read_table(write(tmp_path, text))[:, 0], range(5))
 
 
 def test_a_wrapped_yaw_is_unwrapped(tmp_path):
-    wanted = np.linspace(0.5, 11.0, 50)
-    text = "\n".join(f"{0.1 * k},0,0,1,{math.remainder(yaw, TURN)}" for k, yaw in enumerate(wanted))
-    np.testing.assert_allclose(read_table(written(tmp_path, text))[:, 4], wanted, atol=1e-9)
+    expected = np.linspace(0.5, 11.0, 50)
+    text = "\n".join(f"{0.1 * k},0,0,1,{math.remainder(yaw, TURN)}" for k, yaw in enumerate(expected))
+    np.testing.assert_allclose(read_table(write(tmp_path, text))[:, 4], expected, atol=1e-9)
 
 
 numbers = st.floats(-900.0, 900.0).map(lambda v: round(v, 6))
@@ -361,7 +361,7 @@ def test_what_is_written_is_read(rows, columns, sign, tmp_path_factory):
     assume(max(math.dist(a[:3], b[:3]) for a, b in itertools.pairwise(rows)) >= 25.0)  # else: are the times in ms?
     points = [dict(zip(("x", "y", "z", "yaw"), row, strict=True), t=25.0 * k) for k, row in enumerate(rows)]
     text = "\n".join([sign.join(columns), *(sign.join(repr(float(p[name])) for name in columns) for p in points)])
-    table = read_table(written(tmp_path_factory.mktemp("points"), text))
+    table = read_table(write(tmp_path_factory.mktemp("points"), text))
     np.testing.assert_array_equal(table[:, 0], [p["t"] for p in points])
     np.testing.assert_array_equal(table[:, 1:4], [row[:3] for row in rows])
     np.testing.assert_allclose(np.exp(1j * table[:, 4]), np.exp(1j * np.array([row[3] for row in rows])), atol=1e-9)
@@ -371,7 +371,7 @@ def test_what_is_written_is_read(rows, columns, sign, tmp_path_factory):
 @settings(max_examples=200, deadline=None)
 def test_no_text_is_read_but_points(content, tmp_path_factory):
     """Any file gives finite points at rising times, or one clear error."""
-    file = written(tmp_path_factory.getbasetemp(), content)
+    file = write(tmp_path_factory.getbasetemp(), content)
     try:
         table = read_table(file)
     except ConfigError:
@@ -430,7 +430,7 @@ EXPECTED = r"t \[s\], x, y, z \[m\] and, if wanted, yaw \[rad\]"
 )
 def test_faults_of_a_file_are_named_with_their_line(text, message, tmp_path):
     with pytest.raises(ConfigError, match=message) as error:
-        from_csv(written(tmp_path, text))
+        from_csv(write(tmp_path, text))
     assert "path.csv" in str(error.value)
 
 
@@ -439,13 +439,13 @@ def test_times_in_milliseconds_are_recognised(tmp_path):
     for n in (151, 20):
         rows = [[20.0 * k, *round_lap(0.02 * k)] for k in range(n)]
         with pytest.raises(ConfigError, match=r"are the times in ms\?"):
-            read_table(written(tmp_path, "\n".join(",".join(map(str, row)) for row in rows)))
+            read_table(write(tmp_path, "\n".join(",".join(map(str, row)) for row in rows)))
     with pytest.raises(ConfigError, match=r"lasts 700 s; at most 600 s can be flown$"):
-        read_table(written(tmp_path, "\n".join(f"{0.5 * k},{0.1 * k},0,1" for k in range(1401))))
-    read_table(written(tmp_path, "\n".join(f"{20 * k},{k},0,1" for k in range(20))))
-    read_table(written(tmp_path, "\n".join(f"{20 * k},0,0,1" for k in range(20))))  # a hover
+        read_table(write(tmp_path, "\n".join(f"{0.5 * k},{0.1 * k},0,1" for k in range(1401))))
+    read_table(write(tmp_path, "\n".join(f"{20 * k},{k},0,1" for k in range(20))))
+    read_table(write(tmp_path, "\n".join(f"{20 * k},0,0,1" for k in range(20))))  # a hover
 
 
 def test_below_the_ground_is_no_fault_of_the_file_but_named(tmp_path):
-    reference = from_csv(written(tmp_path, "0,0,0,1\n3,0,0,-0.5\n6,0,0,1\n9,0,0,2\n"))
+    reference = from_csv(write(tmp_path, "0,0,0,1\n3,0,0,-0.5\n6,0,0,1\n9,0,0,2\n"))
     assert "m below the ground" in reference.infeasibility(small())

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bus_ends import LOCAL, NETWORK, arrived, network, two_ends
+from bus_ends import LOCAL, NETWORK, await_message, network, two_ends
 from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
 from retrim.transport import ros
@@ -33,9 +33,9 @@ def test_the_last_message_counts(ends):
     version = 0
     for i in range(1, 6):
         writer.publish("a", b"message %d" % i)
-        found = arrived(reader, "a", version, b"message %d" % i)
-        assert found.version > version
-        version = found.version
+        result = await_message(reader, "a", version, b"message %d" % i)
+        assert result.version > version
+        version = result.version
         assert reader.latest("a", after=version) is None
     assert reader.latest("a", after=version - 1) == (version, b"message 5")
     assert reader.latest("nothing") is None
@@ -45,12 +45,12 @@ def test_messages_of_any_length(ends):
     writer, reader = ends
     for n in (0, 1, 99, 100):
         writer.publish("b.c", bytes(range(n)))
-        assert arrived(reader, "b.c", data=bytes(range(n)))
+        assert await_message(reader, "b.c", data=bytes(range(n)))
     with pytest.raises(MessageError, match=r"'b\.c': a message of 101 bytes, room for 100"):
         writer.publish("b.c", bytes(101))
     assert reader.latest("b.c").data == bytes(range(100))
     writer.publish("big", bytes(200_000))
-    assert len(arrived(reader, "big").data) == 200_000
+    assert len(await_message(reader, "big").data) == 200_000
 
 
 def test_a_topic_that_there_is_not(ends):
@@ -62,8 +62,8 @@ def test_a_topic_that_there_is_not(ends):
 def test_both_ends_may_write_each_its_own_topic(ends):
     ends.writer.publish("there", b"there")
     ends.reader.publish("back", b"back")
-    arrived(ends.reader, "there", data=b"there")
-    arrived(ends.writer, "back", data=b"back")
+    await_message(ends.reader, "there", data=b"there")
+    await_message(ends.writer, "back", data=b"back")
 
 
 @pytest.mark.parametrize("backend", NETWORK)
@@ -76,7 +76,7 @@ def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_c
     other = multiprocessing.get_context("spawn").Process(target=answer, args=words, daemon=True)
     other.start()
     try:
-        assert arrived(bus, "again", version, b"of another process", patience=30.0).version > version
+        assert await_message(bus, "again", version, b"of another process", patience=30.0).version > version
     finally:
         other.kill()
         other.join(10.0)
@@ -84,29 +84,29 @@ def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_c
 
 
 def test_of_a_network_only_what_is_newer_and_fits_is_taken():
-    class Looped(NetworkBus):
+    class LoopBus(NetworkBus):
         def _send(self, topic, frame):
-            self.sent = frame
+            self.frame = frame
 
         def close(self):
             pass
 
-    bus, other = Looped(TOPICS), Looped(TOPICS)
+    bus, other = LoopBus(TOPICS), LoopBus(TOPICS)
     other.publish("a", b"one")
-    first = other.sent
+    first = other.frame
     other.publish("a", b"two")
-    bus._received("a", other.sent)
-    bus._received("a", first)  # overtaken
-    bus._received("a", b"short")
-    bus._received("a", bytes(1000))
+    bus._receive("a", other.frame)
+    bus._receive("a", first)  # overtaken
+    bus._receive("a", b"short")
+    bus._receive("a", bytes(1000))
     assert bus.latest("a") == (2, b"two")
-    assert bus.refused == 2
-    again = Looped(TOPICS)
+    assert bus.refusals == 2
+    again = LoopBus(TOPICS)
     again.publish("a", b"started again")
-    bus._received("a", again.sent)
+    bus._receive("a", again.frame)
     assert bus.latest("a") == (3, b"started again")
     bus.publish("a", b"mine")
-    bus._received("a", bus.sent)  # an echo
+    bus._receive("a", bus.frame)  # an echo
     assert bus.latest("a") == (4, b"mine")
 
 
@@ -145,7 +145,7 @@ def test_vehicles_at_one_place_do_not_hear_each_other():
 
 
 def test_what_an_end_of_ros_writes_has_readers_before_the_first_message(monkeypatch):
-    declared, sent = [], []
+    declaration, sending = [], []
 
     class Rospy:
         def Subscriber(self, *_, **__):
@@ -153,18 +153,18 @@ def test_what_an_end_of_ros_writes_has_readers_before_the_first_message(monkeypa
 
         def Publisher(self, name, *_, latch, **__):
             assert latch
-            declared.append(name)
-            return SimpleNamespace(publish=lambda data: sent.append((name, data[-4:])))
+            declaration.append(name)
+            return SimpleNamespace(publish=lambda data: sending.append((name, data[-4:])))
 
     monkeypatch.setattr(ros, "join", lambda master: Rospy())
     monkeypatch.setattr(ros, "system_module", lambda name: SimpleNamespace(UInt8MultiArray=None))
     bus = Address("ros", "h", 1, "quad1").join(TOPICS, listen=True, writes=("a", "b.c"))
-    assert declared == ["/retrim/quad1/a", "/retrim/quad1/b/c", "/retrim/quad1/greeting/flight"]
+    assert declaration == ["/retrim/quad1/a", "/retrim/quad1/b/c", "/retrim/quad1/greeting/flight"]
     bus.publish("a", b"last")
-    assert len(declared) == 3
+    assert len(declaration) == 3
     bus.publish("there", b"also")
-    assert declared[3:] == ["/retrim/quad1/there"]
-    assert sent[1:] == [("/retrim/quad1/a", b"last"), ("/retrim/quad1/there", b"also")]
+    assert declaration[3:] == ["/retrim/quad1/there"]
+    assert sending[1:] == [("/retrim/quad1/a", b"last"), ("/retrim/quad1/there", b"also")]
 
 
 def test_a_master_that_there_is_not_is_named():
@@ -208,14 +208,14 @@ def test_readers_never_see_half_a_message_and_a_killed_writer_leaves_a_whole_one
             words = bus.folder, "big", TOPICS["big"]
             writer = multiprocessing.get_context("spawn").Process(target=write_for_ever, args=words, daemon=True)
             writer.start()
-            seen, version, until = 0, 0, time.monotonic() + 20.0
-            while seen < 200 and time.monotonic() < until:
-                if (found := bus.latest("big", after=version)) is not None:
-                    version, seen = found.version, seen + 1
-                    assert whole(found.data)
+            observation, version, until = 0, 0, time.monotonic() + 20.0
+            while observation < 200 and time.monotonic() < until:
+                if (result := bus.latest("big", after=version)) is not None:
+                    version, observation = result.version, observation + 1
+                    assert whole(result.data)
             os.kill(writer.pid, signal.SIGKILL)
             writer.join()
-            assert seen == 200
+            assert observation == 200
             assert whole(bus.latest("big").data)
     finally:
         bus.remove()

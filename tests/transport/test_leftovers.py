@@ -38,12 +38,12 @@ def test_what_killed_processes_left_is_removed_at_the_next_start():
     process, folder = start()
     kill(process)
     assert (folder / "sample").exists()
-    made = SharedMemoryBus.create({"sample": 4096})
+    setup = SharedMemoryBus.create({"sample": 4096})
     try:
         assert not folder.exists()
-        assert made.folder.exists()
+        assert setup.folder.exists()
     finally:
-        made.remove()
+        setup.remove()
 
 
 def test_a_bus_that_one_process_still_has_stays_until_that_one_is_gone():

@@ -26,7 +26,7 @@ class End(NetworkBus):
         wire.ends.append(self)
 
     def _send(self, topic, frame):
-        self.wire.carried.append((self, topic, frame))
+        self.wire.frames.append((self, topic, frame))
 
     def close(self):
         self.wire.ends.remove(self)
@@ -34,20 +34,20 @@ class End(NetworkBus):
 
 class Wire:
     def __init__(self):
-        self.ends, self.carried, self.record = [], [], []
+        self.ends, self.frames, self.record = [], [], []
 
     def settle(self):
         """Carry messages until none is left."""
         for _ in range(20):
             for end in self.ends:
                 end._attend()
-            carried, self.carried = self.carried, []
-            for sender, topic, frame in carried:
+            count, self.frames = self.frames, []
+            for sender, topic, frame in count:
                 self.record.append((topic, frame))
                 for end in self.ends:
                     if end is not sender:
-                        end._received(topic, frame)
-            if not carried:
+                        end._receive(topic, frame)
+            if not count:
                 return
         raise AssertionError("they never stop to talk")
 
@@ -57,7 +57,7 @@ def wire():
     return Wire()
 
 
-def said(end, topic):
+def read_messages(end, topic):
     message = end.latest(topic)
     return None if message is None else message.data
 
@@ -68,13 +68,13 @@ def test_messages_arrive_in_both_directions_whoever_was_first(wire):
     wire.settle()
     ground = End(wire, 1)
     wire.settle()
-    assert said(ground, "mission") == b"before anybody is there"
+    assert read_messages(ground, "mission") == b"before anybody is there"
     for i in range(3):
         flight.publish("out", b"out %d" % i)
         ground.publish("into", b"into %d" % i)
         wire.settle()
-        assert (said(ground, "out"), said(flight, "into")) == (b"out %d" % i, b"into %d" % i)
-    assert flight.refused == ground.refused == 0
+        assert (read_messages(ground, "out"), read_messages(flight, "into")) == (b"out %d" % i, b"into %d" % i)
+    assert flight.refusals == ground.refusals == 0
     assert flight.fault == ground.fault == ""
 
 
@@ -90,15 +90,15 @@ def test_an_end_that_is_started_again_goes_on_and_the_one_before_is_not_heard_an
     old.close()
     ends[again] = End(wire, again)
     wire.settle()
-    assert said(ends[again], topics[1 - again]) == b"first"
+    assert read_messages(ends[again], topics[1 - again]) == b"first"
     ends[again].publish(topics[again], b"second")
     wire.settle()
-    found = ends[1 - again].latest(topics[again])
-    assert found.data == b"second"
-    assert found.version > version
+    result = ends[1 - again].latest(topics[again])
+    assert result.data == b"second"
+    assert result.version > version
     old.publish(topics[again], b"of a process that hung")
     wire.settle()
-    assert said(ends[1 - again], topics[again]) == b"second"
+    assert read_messages(ends[1 - again], topics[again]) == b"second"
 
 
 def test_nothing_that_was_said_before_is_taken_again_by_anybody(wire):
@@ -112,60 +112,60 @@ def test_nothing_that_was_said_before_is_taken_again_by_anybody(wire):
     wire.settle()
     record = list(wire.record)
 
-    def replayed(*ends):
+    def replay(*ends):
         for topic, frame in record:
             for end in ends:
-                end._received(topic, frame)
+                end._receive(topic, frame)
         wire.settle()
 
-    replayed(flight, ground)
-    assert (said(ground, "out"), said(flight, "into")) == (b"new", b"new")
-    assert flight.refused > 0
-    assert ground.refused > 0
+    replay(flight, ground)
+    assert (read_messages(ground, "out"), read_messages(flight, "into")) == (b"new", b"new")
+    assert flight.refusals > 0
+    assert ground.refusals > 0
     ground.close()
     later = End(wire, 1)
-    replayed(flight, later)
-    assert said(later, "out") == b"new"  # from the flight that lives
+    replay(flight, later)
+    assert read_messages(later, "out") == b"new"  # from the flight that lives
     later.publish("into", b"newer")
     wire.settle()
-    replayed(flight, later)
-    assert said(flight, "into") == b"newer"
+    replay(flight, later)
+    assert read_messages(flight, "into") == b"newer"
     alone = End(Wire(), 1)
     for topic, frame in record:
-        alone._received(topic, frame)
-    assert said(alone, "out") is None
-    assert said(alone, "into") is None
+        alone._receive(topic, frame)
+    assert read_messages(alone, "out") is None
+    assert read_messages(alone, "into") is None
 
 
 def test_no_change_of_a_message_is_taken(wire):
     flight, ground = End(wire, 0), End(wire, 1)
     wire.settle()
     flight.publish("out", b"payload")
-    ((_, topic, frame),) = wire.carried
+    ((_, topic, frame),) = wire.frames
     assert topic == "out"
-    wire.carried.clear()
+    wire.frames.clear()
     for i in range(len(frame)):
         for bit in (1, 128):
-            ground._received("out", frame[:i] + bytes([frame[i] ^ bit]) + frame[i + 1 :])
+            ground._receive("out", frame[:i] + bytes([frame[i] ^ bit]) + frame[i + 1 :])
     for cut in (b"", frame[:-1], frame[: HEAD.size], frame[: HEAD.size - 1], frame + b"x", frame[1:]):
-        ground._received("out", cut)
+        ground._receive("out", cut)
     for other in ("mission", "into", GREETINGS[0]):  # said of something else
-        ground._received(other, frame)
-    flight._received("out", frame)  # sent back
-    ground._received("out", bytes(2000))
-    assert said(ground, "out") is said(ground, "mission") is said(ground, "into") is None
+        ground._receive(other, frame)
+    flight._receive("out", frame)  # sent back
+    ground._receive("out", bytes(2000))
+    assert read_messages(ground, "out") is read_messages(ground, "mission") is read_messages(ground, "into") is None
     assert flight.latest("out").version == 1
-    assert ground.refused == 2 * len(frame) + 6 + 3 + 1
-    ground._received("out", frame)
-    assert said(ground, "out") == b"payload"
+    assert ground.refusals == 2 * len(frame) + 6 + 3 + 1
+    ground._receive("out", frame)
+    assert read_messages(ground, "out") == b"payload"
 
 
 def test_vehicles_with_one_key_do_not_take_what_is_said_to_another(wire):
     flight, ground = End(wire, 0, vehicle="quad1"), End(wire, 1, vehicle="quad2")
     flight.publish("out", b"for quad1")
     wire.settle()
-    assert said(ground, "out") is None
-    assert ground.refused > 0
+    assert read_messages(ground, "out") is None
+    assert ground.refusals > 0
 
 
 @pytest.mark.parametrize(
@@ -177,8 +177,8 @@ def test_another_key_or_none_is_one_clear_line_at_both_ends(wire, here, there, f
     ground.publish("into", b"into")
     wire.settle()
     assert flight.fault == fault
-    assert said(flight, "into") is said(ground, "out") is None
-    assert flight.refused > 0
+    assert read_messages(flight, "into") is read_messages(ground, "out") is None
+    assert flight.refusals > 0
     assert fault.isprintable()
     assert len(fault) < 120
 
@@ -189,13 +189,13 @@ def test_a_stranger_does_not_come_between_two_ends_that_have_met(wire):
     wire.settle()
     for end in (flight, ground):
         for topic in TOPICS:
-            end._received(topic, b"noise")
-            end._received(topic, secrets.token_bytes(200)[: HEAD.size])
+            end._receive(topic, b"noise")
+            end._receive(topic, secrets.token_bytes(200)[: HEAD.size])
     assert flight.fault == ground.fault == ""
-    assert said(ground, "mission") == b"mine"
+    assert read_messages(ground, "mission") == b"mine"
     flight.publish("mission", b"mine still")
     wire.settle()
-    assert said(ground, "mission") == b"mine still"
+    assert read_messages(ground, "mission") == b"mine still"
 
 
 def test_the_code_is_hmac_sha256_over_parts_that_cannot_be_shifted():
@@ -211,8 +211,8 @@ def test_a_key_is_read_and_shown_nowhere(tmp_path, monkeypatch):
     key = read_key(file)
     assert key == SharedKey(b"0123456789abcdef-secret")
     address = Address.of("zenoh:10.0.0.5:7447", key)
-    for shown in (repr(key), str(key), repr(address), str(address), repr([address]), f"{address!r}"):
-        assert "secret" not in shown.replace("secret=", "")
+    for display in (repr(key), str(key), repr(address), str(address), repr([address]), f"{address!r}"):
+        assert "secret" not in display.replace("secret=", "")
     assert pickle.loads(pickle.dumps(address)).shared == key
     monkeypatch.setenv("RETRIM_KEY", " 0123456789abcdef-secret ")
     assert read_key(None) == key

@@ -19,11 +19,11 @@ TREE = {"a": jnp.arange(6.0).reshape(2, 3), "b": (jnp.array(3), jnp.zeros(0))}
 SHAPES = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), TREE)
 
 
-def packed(tree=TREE, **about):
+def pack(tree=TREE, **about):
     return wire.pack(tree, kind="test", about=about)
 
 
-def unpacked(data, like=TREE):
+def unpack(data, like=TREE):
     return wire.unpack(data, like, kind="test", source="somewhere")
 
 
@@ -32,7 +32,7 @@ def with_header(header):
     return len(text).to_bytes(8, "little") + text
 
 
-def edited(data, change=None, **header):
+def edit(data, change=None, **header):
     """The message with other tensors or another header, without the checksum's consent."""
     tensors = load(data)
     return save(change(tensors) if change else tensors, metadata=message._header(data, "test") | header)
@@ -40,17 +40,17 @@ def edited(data, change=None, **header):
 
 @pytest.mark.parametrize("like", [TREE, SHAPES])
 def test_round_trip_is_exact(like):
-    found = unpacked(packed(who="me"), like)
-    assert jax.tree.structure(found) == jax.tree.structure(TREE)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(TREE), strict=True):
+    result = unpack(pack(who="me"), like)
+    assert jax.tree.structure(result) == jax.tree.structure(TREE)
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(TREE), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
-    assert wire.describe(packed(who="me"), kind="test", source="test")["who"] == "me"
+    assert wire.describe(pack(who="me"), kind="test", source="test")["who"] == "me"
     assert wire.names(TREE).keys() == {"a", "b.0", "b.1"}
 
 
 def test_an_empty_tree_is_a_message():
-    assert unpacked(packed(()), ()) == ()
+    assert unpack(pack(()), ()) == ()
 
 
 @pytest.mark.parametrize(
@@ -69,33 +69,33 @@ def test_an_empty_tree_is_a_message():
 )
 def test_tensors_that_do_not_fit(change, message):
     with pytest.raises(MessageError, match=f"somewhere: {message}"):
-        unpacked(edited(packed(), change))
+        unpack(edit(pack(), change))
 
 
 def test_a_changed_header_breaks_the_checksum():
     with pytest.raises(MessageError, match="the checksum does not match"):
-        unpacked(edited(packed(who="me"), who="you"))
+        unpack(edit(pack(who="me"), who="you"))
     with pytest.raises(MessageError, match="the checksum does not match"):
-        unpacked(edited(packed(), more="fields"))
+        unpack(edit(pack(), more="fields"))
 
 
 def test_another_kind_or_format():
     with pytest.raises(MessageError, match="somewhere: holds a 'test', expected a 'policy'"):
-        wire.unpack(packed(), TREE, kind="policy", source="somewhere")
+        wire.unpack(pack(), TREE, kind="policy", source="somewhere")
     with pytest.raises(MessageError, match=r"format 'retrim/0', expected 'retrim/1'"):
-        unpacked(edited(packed(), format="retrim/0"))
+        unpack(edit(pack(), format="retrim/0"))
 
 
 @pytest.mark.parametrize("header", [{}, {"__metadata__": None}, {"__metadata__": {}}])
 def test_a_header_without_fields(header):
     with pytest.raises(MessageError, match=r"somewhere: format 'none', expected 'retrim/1'"):
-        unpacked(with_header(header))
+        unpack(with_header(header))
 
 
 @pytest.mark.parametrize("header", [[], "text", 3, {"__metadata__": {"kind": 3}}, {"a": {"dtype": "F64"}}])
 def test_a_header_that_is_none(header):
     with pytest.raises(MessageError, match="somewhere: not a whole safetensors file"):
-        unpacked(with_header(header))
+        unpack(with_header(header))
 
 
 @pytest.mark.parametrize("dtype", ["BF16", "F8_E4M3"])
@@ -106,38 +106,38 @@ def test_types_that_numpy_has_not(dtype):
         | {"a": {"dtype": dtype, "shape": [6], "data_offsets": [0, 6 * width]}}
     ) + bytes(6 * width)
     with pytest.raises(MessageError, match="somewhere: "):
-        unpacked(data)
+        unpack(data)
 
 
 def test_more_bytes_than_are_accepted(monkeypatch):
     monkeypatch.setattr(message, "MAX_BYTES", 100)
     with pytest.raises(MessageError, match=r"somewhere: \d+ bytes, more than the 100 that are accepted"):
-        unpacked(packed())
+        unpack(pack())
 
 
 def test_single_precision_is_read_in_the_expected_type():
     single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32) if leaf.ndim else leaf, TREE)
-    found = unpacked(packed(single))
-    assert found["a"].dtype == jnp.float64
-    np.testing.assert_array_equal(found["a"], TREE["a"])
+    result = unpack(pack(single))
+    assert result["a"].dtype == jnp.float64
+    np.testing.assert_array_equal(result["a"], TREE["a"])
 
 
 def test_size_of_a_paper_policy():
     with jax.enable_x64(False):
         shapes = eqx.filter_eval_shape(lambda key: Policy.of(15, small(), key=key), random.key(0))
-        data = packed(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
+        data = pack(jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes))
     assert len(data) == pytest.approx(1.09e6, rel=0.01)
 
 
 def test_the_same_content_has_the_same_bytes():
     """The library that writes a header puts its fields in another order each time."""
     about = {f"field{i}": str(i) for i in range(20)}
-    made = {packed(**dict(sorted(about.items(), reverse=back))) for back in (True, False) for _ in range(20)}
-    assert len(made) == 1
-    (data,) = made
+    setup = {pack(**dict(sorted(about.items(), reverse=back))) for back in (True, False) for _ in range(20)}
+    assert len(setup) == 1
+    (data,) = setup
     size = int.from_bytes(data[:8], "little")
     assert size % 8 == 0
     assert list(json.loads(data[8 : 8 + size])["__metadata__"]) == sorted([*about, "checksum", "format", "kind"])
-    np.testing.assert_array_equal(unpacked(data)["a"], TREE["a"])
-    assert packed(field="ü €\n") == packed(field="ü €\n")
-    assert wire.describe(packed(field="ü €\n"), kind="test", source="x")["field"] == "ü €\n"
+    np.testing.assert_array_equal(unpack(data)["a"], TREE["a"])
+    assert pack(field="ü €\n") == pack(field="ü €\n")
+    assert wire.describe(pack(field="ü €\n"), kind="test", source="x")["field"] == "ü €\n"

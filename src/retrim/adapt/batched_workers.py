@@ -52,9 +52,9 @@ class PolicyBatch(WorkerBatch):
     def learn(self, states: LearnerState, windows: Window, incumbents: Any = None) -> BatchUpdate:
         """Re-train the policy of each vehicle; a vehicle keeps its old policy if the gate refuses the new one."""
         self.keys, now = _next_keys(self.keys)
-        trained, verdicts = _update_all(self.learner, states, windows, now, incumbents)
+        trained_policy, verdicts = _update_all(self.learner, states, windows, now, incumbents)
         verdicts, t = jax.device_get((verdicts, windows.t[:, -1]))
-        return BatchUpdate(trained, lambda i, state: policy_update(float(t[i]), state, _row(verdicts, i)))
+        return BatchUpdate(trained_policy, lambda i, state: policy_update(float(t[i]), state, _row(verdicts, i)))
 
     def unstack(self, workers: Sequence[Any]) -> None:
         """Let the workers continue with the next random keys."""
@@ -194,8 +194,8 @@ def _update_all(
     """Return the trained policies, or the old ones where the gate refused them, and the verdicts."""
 
     def update(state: LearnerState, window: Window, key: Key[Array, ""], incumbent: Any) -> tuple[PolicyState, Verdict]:
-        trained, verdict = learner.update_policy(state.policy, state.residual, window, key, incumbent)
-        return where(verdict.admitted, trained, state.policy), verdict
+        trained_policy, verdict = learner.update_policy(state.policy, state.residual, window, key, incumbent)
+        return where(verdict.admitted, trained_policy, state.policy), verdict
 
     if jax.default_backend() != "cpu" or jax.device_count() > 1:
         updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys, incumbents)
@@ -204,15 +204,15 @@ def _update_all(
     arrays, rest = eqx.partition((state, windows, keys, incumbents), eqx.is_array)
     n = keys.shape[0]
     few = at_once(n, sum(leaf.nbytes for leaf in jax.tree.leaves(eqx.filter(state.policy.policy, eqx.is_array))) // n)
-    filled = jnp.minimum(jnp.arange(n + -n % few), n - 1)
+    filling = jnp.minimum(jnp.arange(n + -n % few), n - 1)
 
     def of_arrays(one: Any) -> tuple[PolicyState, Verdict]:
-        trained, verdict = update(*eqx.combine(one, rest))
-        return eqx.filter(trained, eqx.is_array), verdict
+        trained_policy, verdict = update(*eqx.combine(one, rest))
+        return eqx.filter(trained_policy, eqx.is_array), verdict
 
-    made = lax.map(of_arrays, jax.tree.map(lambda leaf: leaf[filled], arrays), batch_size=few)
-    trained, verdicts = jax.tree.map(lambda leaf: leaf[:n], made)
-    return eqx.combine(trained, eqx.filter(state.policy, eqx.is_array, inverse=True)), verdicts
+    made = lax.map(of_arrays, jax.tree.map(lambda leaf: leaf[filling], arrays), batch_size=few)
+    trained_policy, verdicts = jax.tree.map(lambda leaf: leaf[:n], made)
+    return eqx.combine(trained_policy, eqx.filter(state.policy, eqx.is_array, inverse=True)), verdicts
 
 
 @eqx.filter_jit

@@ -22,8 +22,8 @@ from ..tasks.task import Start
 from .gate import Verdict, all_finite, judge
 from .learner_state import FitReport, LearnerState
 from .optimisers import AbstractPolicyOptimiser
-from .starts import AbstractStarts, TaskStarts, drawn
-from .trim import AbstractTrim, Untrimmed
+from .starts import AbstractStarts, TaskStarts, sample_starts
+from .trim import AbstractTrim, NoTrim
 from .updates import Layer
 from .vehicles import AbstractVehicles, OwnVehicle
 from .views import AbstractView, WorldView
@@ -66,7 +66,7 @@ class OnlineLearner(eqx.Module):
     """Source of the starts."""
     view: AbstractView = WorldView()
     """Coordinates in which the policy is trained and flies."""
-    trim: AbstractTrim = Untrimmed()
+    trim: AbstractTrim = NoTrim()
     """Correction of the policy's command at rest after an update."""
     vehicles: AbstractVehicles = OwnVehicle()
     """Vehicle of the flight: that of the model, or an identified one."""
@@ -102,9 +102,9 @@ class OnlineLearner(eqx.Module):
         screening, delay = screen(window, self.env.dynamics.dt), self.plant_delay_ticks
         window = self.vehicles.apply_path(window)
         rows = residual_targets(window, self.env.dynamics, delay_ticks=delay, consistent=screening.steps)
-        fitted, rms = self.residual_model.fit(state, rows)
-        accepted = all_finite(fitted) & jnp.any(rows.valid) & screening.trusted
-        return where(accepted, fitted, state), FitReport(rms, accepted, screening.counts)
+        residual, rms = self.residual_model.fit(state, rows)
+        valid = all_finite(residual) & jnp.any(rows.valid) & screening.trusted
+        return where(valid, residual, state), FitReport(rms, valid, screening.counts)
 
     @eqx.filter_jit
     def update_policy(
@@ -113,7 +113,7 @@ class OnlineLearner(eqx.Module):
         residual: Any,
         window: Window,
         key: Key[Array, ""],
-        flown: AbstractPolicy | LoraPolicy | None = None,
+        active: AbstractPolicy | LoraPolicy | None = None,
     ) -> tuple[PolicyState, Verdict]:
         """Re-train the policy by back-propagation in the corrected model, and judge the result.
 
@@ -127,7 +127,7 @@ class OnlineLearner(eqx.Module):
             residual: State of the residual model.
             window: Ticks of flight.
             key: Random key, consumed.
-            flown: Policy in flight, with which the gate compares the trained one; by default that of ``state``.
+            active: Policy in flight, with which the gate compares the trained one; by default that of ``state``.
 
         Returns:
             The trained policy, and the gate's verdict on it.
@@ -135,22 +135,22 @@ class OnlineLearner(eqx.Module):
         screening = screen(window, self.env.dynamics.dt)
         usable = jnp.where(jnp.any(screening.samples), screening.samples, window.valid)
         window = dataclasses.replace(window, valid=usable)
-        corrected = self.view(self.env, FittedResidual(self.residual_model, residual))
+        corrected_env = self.view(self.env, FittedResidual(self.residual_model, residual))
         k_train, k_gate, k_window = random.split(key, 3)
         x0 = self.starts(self.env.task, window, k_train, self.num_updates, self.num_envs)
         vehicle = self.vehicles.identify(window)
         x0 = self.vehicles.assign_vehicles(x0, vehicle, random.fold_in(k_train, VEHICLES))
-        stepped = self.retrain(state, corrected, x0, random.fold_in(k_train, RETRAIN))
-        trained = PolicyState(self.trim(stepped.policy, corrected, window), stepped.optimiser)
-        held_out = jax.tree.map(
+        candidate = self.retrain(state, corrected_env, x0, random.fold_in(k_train, RETRAIN))
+        trained_state = PolicyState(self.trim(candidate.policy, corrected_env, window), candidate.optimiser)
+        test_starts = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
             jax.vmap(self.env.task.reset)(random.split(k_gate, HELD_OUT // 2)),
-            drawn(window, k_window, (HELD_OUT // 2,)),
+            sample_starts(window, k_window, (HELD_OUT // 2,)),
         )
-        incumbent = state.policy if flown is None else flown
-        held_out = self.vehicles.assign_vehicles(held_out, vehicle, random.fold_in(k_gate, VEHICLES))
-        verdict = judge(trained.policy.merged(), incumbent.merged(), corrected, held_out)
-        return trained, verdict.provided(screening.trusted)
+        incumbent = state.policy if active is None else active
+        test_starts = self.vehicles.assign_vehicles(test_starts, vehicle, random.fold_in(k_gate, VEHICLES))
+        verdict = judge(trained_state.policy.merged(), incumbent.merged(), corrected_env, test_starts)
+        return trained_state, verdict.provided(screening.trusted)
 
     def retrain(self, state: PolicyState, env: Env, starts: Start, key: Key[Array, ""]) -> PolicyState:
         """Train the policy in the corrected model by back-propagation through time; JAX traces this method.
@@ -166,8 +166,8 @@ class OnlineLearner(eqx.Module):
         """
         del key
         optimiser = (isinstance(state.policy, LoraPolicy) and self.low_rank_optimiser) or self.optimiser
-        begun = optimiser.begin(state, self.num_updates)
-        return bptt(begun, env, starts, optimiser=optimiser.transformation(self.num_updates))[0]
+        start = optimiser.begin(state, self.num_updates)
+        return bptt(start, env, starts, optimiser=optimiser.transformation(self.num_updates))[0]
 
     def worker(self, layer: Layer, state: LearnerState, key: Key[Array, ""]) -> Worker | None:
         """Return a custom worker for a learning layer; None, the default, selects the built-in one.

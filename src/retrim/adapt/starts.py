@@ -31,7 +31,7 @@ class TaskStarts(AbstractStarts):
         return random_starts(task, key, updates, envs)
 
 
-class FlownStarts(AbstractStarts):
+class WindowStarts(AbstractStarts):
     """Most starts come from recent states of the flight, the others from the task, so that the policy does not forget.
 
     With few environments, distant starts give noisy gradients, and the resulting policy jitters by centimetres.
@@ -49,14 +49,14 @@ class FlownStarts(AbstractStarts):
         shape = (updates, envs - far)
         dtype = window.x.p.dtype
         dp, dv = (self.spread * random.normal(k, (*shape, 3), dtype) for k in (k_p, k_v))
-        near = jax.vmap(jax.vmap(_shifted))(drawn(window, k_rows, shape), dp, dv)
+        near = jax.vmap(jax.vmap(_shift))(sample_starts(window, k_rows, shape), dp, dv)
         both: Start = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b], axis=1), random_starts(task, k_task, updates, far), near
         )
         return both
 
 
-def drawn(window: Window, key: Key[Array, ""], shape: tuple[int, ...]) -> Start:
+def sample_starts(window: Window, key: Key[Array, ""], shape: tuple[int, ...]) -> Start:
     """Draw states, with the times at which they were true, from the valid part of the window; the key is consumed."""
     weight = window.valid.astype(window.x.p.dtype)
     row = random.choice(key, window.valid.shape[0], shape, p=weight / jnp.sum(weight))
@@ -67,5 +67,5 @@ def drawn(window: Window, key: Key[Array, ""], shape: tuple[int, ...]) -> Start:
     return make(t[row], jax.tree.map(lambda leaf: leaf[row], window.x))
 
 
-def _shifted(start: Start, dp: Float[Array, "3"], dv: Float[Array, "3"]) -> Start:
+def _shift(start: Start, dp: Float[Array, "3"], dv: Float[Array, "3"]) -> Start:
     return Start(start.t, State(start.x.p + dp, start.x.R, start.x.v + dv))

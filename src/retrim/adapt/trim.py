@@ -31,7 +31,7 @@ class AbstractTrim(eqx.Module):
         """
 
 
-class Untrimmed(AbstractTrim):
+class NoTrim(AbstractTrim):
     """Leaves the policy unchanged (as in the paper)."""
 
     def __call__(self, policy: AbstractPolicy | LoraPolicy, env: Env, window: Window) -> AbstractPolicy | LoraPolicy:

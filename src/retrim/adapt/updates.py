@@ -36,7 +36,9 @@ class ResidualUpdate:
     def note(self) -> str:
         """Return one line for the log."""
         fit = f"rms error {self.rms_error:.3f} m/s^2"
-        return f"{fit}; measurements excluded: {described}" if (described := describe_counts(self.excluded)) else fit
+        return (
+            f"{fit}; measurements excluded: {description}" if (description := describe_counts(self.excluded)) else fit
+        )
 
 
 @dataclass(frozen=True)
@@ -133,31 +135,31 @@ def unpack_update(data: bytes, like: LearnerState, *, source: str) -> Update:
     expected: Any = {"residual": like.residual, "policy": like.policy}.get(kind, ())
     state = wire.unpack(data, expected, kind=kind, source=source)
     try:
-        plain = _checked(json.loads(wire.describe(data, kind=kind, source=source)["update"]), types[kind])
+        plain = _check_fields(json.loads(wire.describe(data, kind=kind, source=source)["update"]), types[kind])
         update: Update = types[kind](**plain, **({"state": state} if kind in ("residual", "policy") else {}))
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MessageError(f"{source}: not the fields of a {kind!r} update ({error})") from error
     return update
 
 
-def _checked(plain: Any, cls: type) -> dict[str, Any]:
+def _check_fields(plain: Any, cls: type) -> dict[str, Any]:
     """Return the plain fields of a message; raise ``TypeError`` or ``ValueError`` with the name of an invalid field."""
-    wanted = {f.name: f.type for f in fields(cls) if f.name != "state"}
-    if not isinstance(plain, dict) or plain.keys() != wanted.keys():
-        raise TypeError(f"expected {', '.join(wanted)}")
-    return {name: _field(name, value, wanted[name]) for name, value in plain.items()}
+    types = {f.name: f.type for f in fields(cls) if f.name != "state"}
+    if not isinstance(plain, dict) or plain.keys() != types.keys():
+        raise TypeError(f"expected {', '.join(types)}")
+    return {name: _field(name, value, types[name]) for name, value in plain.items()}
 
 
-def _field(name: str, value: Any, wanted: Any) -> Any:
-    if wanted is float:
+def _field(name: str, value: Any, kind: Any) -> Any:
+    if kind is float:
         # A policy may replace one whose cost was not finite.
         if type(value) not in (int, float) or not (math.isfinite(value) or name == "incumbent_cost"):
             raise ValueError(f"{name} = {value!r} is no finite number")
         return float(value)
-    if wanted is Counts:
+    if kind is Counts:
         if type(value) is not list or len(value) != len(REASONS) or any(type(n) is not int or n < 0 for n in value):
             raise ValueError(f"{name} must be {len(REASONS)} whole numbers of at least 0")
         return tuple(value)
-    if not isinstance(value, str) or (wanted is Layer and value not in get_args(Layer)):
+    if not isinstance(value, str) or (kind is Layer and value not in get_args(Layer)):
         raise ValueError(f"{name} = {value!r}")
     return value

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Float, Key
 
-from ..control.identified import belief_from, bounded_gain
+from ..control.belief_flight import belief_from, bounded_gain
 from ..estimation.command_path import PathEstimate, PathEstimator, PathState
 from ..learn.window import Window
 from ..physics.command_path import CommandPath
@@ -44,12 +44,12 @@ class AbstractVehicles(eqx.Module):
         """
 
     @abc.abstractmethod
-    def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
+    def assign_vehicles(self, starts: Start, identification: "Identification | None", key: Key[Array, ""]) -> Start:
         """Return starts with a vehicle assigned to each; the key is consumed.
 
         Args:
             starts: Starts of roll-outs, with any leading axes.
-            found: Result of :meth:`identify`.
+            identification: Result of :meth:`identify`.
             key: Random key.
         """
 
@@ -64,7 +64,7 @@ class OwnVehicle(AbstractVehicles):
         """Return the window unchanged; the delay is a setting of the learner."""
         return window
 
-    def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
+    def assign_vehicles(self, starts: Start, identification: "Identification | None", key: Key[Array, ""]) -> Start:
         """Return the starts unchanged."""
         return starts
 
@@ -105,16 +105,16 @@ class IdentifiedVehicle(AbstractVehicles):
             return s, mean
 
         _, acting = lax.scan(tick, path.init(first, dt), window.u)
-        forgotten = jnp.ceil((path.delay + path.response.settling_time) / dt)
+        settling_ticks = jnp.ceil((path.delay + path.response.settling_time) / dt)
         count = jnp.cumsum(window.valid.astype(window.t.dtype))
         acting = jax.tree.map(lambda new, old: new.astype(old.dtype), acting, window.u)
-        return dataclasses.replace(window, u=acting, valid=window.valid & (count > forgotten))
+        return dataclasses.replace(window, u=acting, valid=window.valid & (count > settling_ticks))
 
-    def assign_vehicles(self, starts: Start, found: "Identification | None", key: Key[Array, ""]) -> Start:
+    def assign_vehicles(self, starts: Start, identification: "Identification | None", key: Key[Array, ""]) -> Start:
         """Return starts with vehicles drawn from the belief."""
-        if found is None:
+        if identification is None:
             raise ValueError("IdentifiedVehicle.assign_vehicles needs the result of identify, got None")
-        belief, shape = found.belief, starts.t.shape
+        belief, shape = identification.belief, starts.t.shape
         inside = random.uniform(key, (*shape, belief.centre.shape[0]), minval=-1.0, maxval=1.0)
 
         def assign(t: Float[Array, ""], x: State, inside: Float[Array, "4"]) -> Start:
@@ -137,11 +137,11 @@ def estimate_path(estimator: PathEstimator, window: Window) -> PathEstimate:
 
     def tick(s: PathState, row: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
         t, x, u, valid, age = row
-        seen = estimator.issued(estimator.measured(s, t, x, age=age), u)
-        return jax.tree.map(lambda new, old: jnp.where(valid, new, old), seen, s), None
+        memory = estimator.issued(estimator.measured(s, t, x, age=age), u)
+        return jax.tree.map(lambda new, old: jnp.where(valid, new, old), memory, s), None
 
     def piece(s: PathState, rows: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
-        return estimator.estimated(lax.scan(tick, s, rows)[0]), None
+        return estimator.estimate_path(lax.scan(tick, s, rows)[0]), None
 
     first = estimator.init(jax.tree.map(lambda leaf: leaf[0], window.x))
     rows = _in_pieces((window.t, window.x, window.u, window.valid, age), PIECE)

@@ -6,11 +6,11 @@ import dataclasses
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..control.gravity_frame import NormLimited, capped
+from ..control.gravity_frame import NormLimited, limit_norm
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
 from ..learn.residuals.rates import RateFit
-from ..physics.actuators import Lagged, RateBiased
+from ..physics.actuators import LaggedModel, RateBiasedModel
 from ..physics.dynamics import Residual
 from ..physics.state import Command, State
 
@@ -57,7 +57,7 @@ class RestView(AbstractView):
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model; the frame compensates for its value at rest, but not for a rate bias."""
         home = env.task.home()
-        d = capped(residual(State.at(home), Command.hover(home.dtype)), self.limit)
+        d = limit_norm(residual(State.at(home), Command.hover(home.dtype)), self.limit)
         env = as_it_turns(env, turning_of(residual))
         return dataclasses.replace(env.with_residual(residual), frame_disturbance=Same(d))
 
@@ -67,22 +67,22 @@ def turning_of(residual: Residual) -> RateFit | None:
     return residual.turning if isinstance(residual, FittedResidual) else None
 
 
-def with_lag(env: Env, found: RateFit | None) -> Env:
+def with_lag(env: Env, fit: RateFit | None) -> Env:
     """Return the environment with the identified lag, if its model has a lag and one was identified.
 
     The identified lag is that of the rates. In the model, thrust has the lag of roll and pitch, since the same motors
     generate it.
     """
-    if found is None or not isinstance(env.dynamics, Lagged):
+    if fit is None or not isinstance(env.dynamics, LaggedModel):
         return env
-    response = dataclasses.replace(env.dynamics.response, thrust_lag=found.tau[0], rate_lag=found.tau)
-    return dataclasses.replace(env, dynamics=Lagged(env.dynamics.base, response))
+    response = dataclasses.replace(env.dynamics.response, thrust_lag=fit.tau[0], rate_lag=fit.tau)
+    return dataclasses.replace(env, dynamics=LaggedModel(env.dynamics.base, response))
 
 
-def as_it_turns(env: Env, found: RateFit | None) -> Env:
+def as_it_turns(env: Env, fit: RateFit | None) -> Env:
     """Return the environment with the identified lag and bias of the rates, if they were identified."""
-    env = with_lag(env, found)
-    return env if found is None else dataclasses.replace(env, dynamics=RateBiased(env.dynamics, found.bias))
+    env = with_lag(env, fit)
+    return env if fit is None else dataclasses.replace(env, dynamics=RateBiasedModel(env.dynamics, fit.bias))
 
 
 class Same(eqx.Module):

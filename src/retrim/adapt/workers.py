@@ -44,8 +44,8 @@ class ResidualWorker(Worker):
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
         """Fit the residual to ``window``."""
         with suitable_device(self._residual, 1):
-            fitted, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
-        return residual_update(float(window.t[-1]), fitted, report)
+            residual, report = jax.block_until_ready(self.learner.fit_residual(self._residual, window))
+        return residual_update(float(window.t[-1]), residual, report)
 
     def receive(self, update: Update) -> None:
         """Continue from a published fit."""
@@ -82,9 +82,9 @@ class PolicyWorker(Worker):
         """Re-train the policy; the window provides starts for the gate."""
         self.key, key = random.split(self.key)
         with suitable_device(self._policy.policy, self.learner.num_envs):
-            updated = self.learner.update_policy(self._policy, self._residual, window, key)
-            trained, verdict = jax.block_until_ready(updated)
-        return policy_update(float(window.t[-1]), trained, verdict)
+            candidate = self.learner.update_policy(self._policy, self._residual, window, key)
+            trained_policy, verdict = jax.block_until_ready(candidate)
+        return policy_update(float(window.t[-1]), trained_policy, verdict)
 
     def receive(self, update: Update) -> None:
         """Continue from a published policy, or with a published residual in the model."""

@@ -17,7 +17,7 @@ from ..config.setup import Setup
 from ..onboard.launch import PYTHON
 from .flight import learner_in_flight
 from .machine import on_core
-from .timing import timed
+from .timing import time_runs
 
 POLICIES = 40
 PRESET = "hover/retrim"
@@ -44,14 +44,14 @@ def policies() -> dict[str, Any]:
         compile_s = time.perf_counter() - began
         if flight.stdin is None or flight.stdout is None or not flight.stdout.readline():
             raise OSError("the flight beside did not begin")
-        row = timed(compile_s, one, POLICIES)
+        row = time_runs(compile_s, one, POLICIES)
         flight.stdin.close()
-        told = flight.stdout.readline()
-    if not told:
+        line = flight.stdout.readline()
+    if not line:
         raise OSError("the flight beside did not go on")
-    flown = json.loads(told)
-    rate = f"{1.0 / row['run_s']:.0f} policies a second; {flown['late']} of {flown['ticks']} ticks beside ended late"
-    remarks = f"{rate}, a tick took {1000 * flown['tick_s']:.1f} ms"
+    report = json.loads(line)
+    rate = f"{1.0 / row['run_s']:.0f} policies a second; {report['late']} of {report['ticks']} ticks beside ended late"
+    remarks = f"{rate}, a tick took {1000 * report['tick_s']:.1f} ms"
     return {"compile_s": compile_s, "run_s": None, "one_core": row, "remarks": remarks}
 
 
@@ -72,9 +72,9 @@ def _fly() -> None:
     while not _over():
         began = time.perf_counter()
         u = pilot.act(measurement)
-        measurement, accepted = plant.step(u)
-        if accepted is not u:
-            pilot.accepted(accepted)
+        measurement, accepted_command = plant.step(u)
+        if accepted_command is not u:
+            pilot.accepted(accepted_command)
         took.append(time.perf_counter() - began)
         due += dt
         left = due - time.perf_counter()

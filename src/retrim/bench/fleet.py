@@ -22,7 +22,7 @@ from ..physics.vehicle import small
 from ..plants.sim import SimPlant
 from ..runtime.batch import batch_flight
 from .flight import learner_in_flight
-from .timing import compiled, timed
+from .timing import compile_function, time_runs
 
 FLEET = 8  # number of vehicles
 Update = Callable[[Key[Array, ""]], tuple[PolicyState, Verdict]]
@@ -38,13 +38,13 @@ def eight_flights() -> dict[str, Any]:
 
     @jax.jit
     def four(controller: PolicyController, x0s: State) -> State:
-        flown: State = jax.vmap(lambda x0: batch_flight(simulation, controller, x0, ticks=1500).true)(x0s)
-        return flown
+        states: State = jax.vmap(lambda x0: batch_flight(simulation, controller, x0, ticks=1500).true)(x0s)
+        return states
 
-    program, compile_s = compiled(four, controller, halves[0])
+    program, compile_s = compile_function(four, controller, halves[0])
     with ThreadPoolExecutor(2) as pool:
         fly_all = lambda: list(pool.map(lambda x0s: jax.block_until_ready(program(controller, x0s)), halves))  # noqa: E731
-        return timed(compile_s, fly_all, 3)
+        return time_runs(compile_s, fly_all, 3)
 
 
 def one_after_another() -> dict[str, Any]:
@@ -59,34 +59,36 @@ def side_by_side() -> dict[str, Any]:
 
 def on_threads() -> dict[str, Any]:
     """Time eight policy updates on two threads, with one program; return the table row."""
-    learner, policy, fitted, window = _learnt()
+    learner, policy, residual, window = _make_inputs()
     keys = random.split(random.key(0), FLEET)
 
     def update(key: Key[Array, ""]) -> tuple[PolicyState, Verdict]:
-        made: tuple[PolicyState, Verdict] = jax.block_until_ready(learner.update_policy(policy, fitted, window, key))
-        return made
+        result: tuple[PolicyState, Verdict] = jax.block_until_ready(
+            learner.update_policy(policy, residual, window, key)
+        )
+        return result
 
     update(keys[0])
     with ThreadPoolExecutor(2) as pool:
-        row = timed(0.0, lambda: list(pool.map(update, keys)), 3)
+        row = time_runs(0.0, lambda: list(pool.map(update, keys)), 3)
     return row | {"compile_s": None, "remarks": row["remarks"] + "; compiled as one update"}
 
 
 def _as_one(together: Callable[[Update, Key[Array, " n"]], Any]) -> dict[str, Any]:
-    learner, *learnt = _learnt()
+    learner, *inputs = _make_inputs()
 
     @jax.jit
-    def fleet(learnt: list[Any], keys: Key[Array, " n"]) -> Any:
-        policy, fitted, window = learnt
-        return together(lambda key: learner.update_policy(policy, fitted, window, key), keys)
+    def fleet(inputs: list[Any], keys: Key[Array, " n"]) -> Any:
+        policy, residual, window = inputs
+        return together(lambda key: learner.update_policy(policy, residual, window, key), keys)
 
-    arguments = learnt, random.split(random.key(0), FLEET)
-    program, compile_s = compiled(fleet, *arguments)
-    return timed(compile_s, lambda: program(*arguments), 3)
+    arguments = inputs, random.split(random.key(0), FLEET)
+    program, compile_s = compile_function(fleet, *arguments)
+    return time_runs(compile_s, lambda: program(*arguments), 3)
 
 
-def _learnt() -> tuple[OnlineLearner, PolicyState, Any, Window]:
+def _make_inputs() -> tuple[OnlineLearner, PolicyState, Any, Window]:
     """Return the inputs of a policy update: the learner, a policy, a fitted residual and the window of the fit."""
     learner, state, window = learner_in_flight()
-    fitted, _ = learner.fit_residual(state.residual, window)
-    return learner, state.policy, fitted, window
+    residual, _ = learner.fit_residual(state.residual, window)
+    return learner, state.policy, residual, window

@@ -46,11 +46,11 @@ def unit() -> Callable[[], float]:
     rows, weight = jnp.ones((ROWS, WIDTH)), jnp.full((WIDTH, WIDTH), 1.0 / WIDTH)
 
     @jax.jit
-    def scanned(x: Any, weight: Any) -> Any:  # a constant weight would get the layout of a different kind of product
+    def scan(x: Any, weight: Any) -> Any:  # a constant weight would get the layout of a different kind of product
         return lax.scan(lambda x, _: (x @ weight, None), x, None, length=STEPS)[0]
 
-    jax.block_until_ready(scanned(rows, weight))
-    return lambda: statistics.median(seconds(lambda: scanned(rows, weight)) for _ in range(3))
+    jax.block_until_ready(scan(rows, weight))
+    return lambda: statistics.median(seconds(lambda: scan(rows, weight)) for _ in range(3))
 
 
 def rates() -> dict[str, float]:

@@ -41,7 +41,7 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
     """
     if unknown := [name for name in works if name not in WORKS]:
         raise ConfigError(f"no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
-    rows, machine, failed = list[dict[str, Any]](), dict[str, dict[str, float]](), False
+    rows, machine, failures = list[dict[str, Any]](), dict[str, dict[str, float]](), False
     with tempfile.TemporaryDirectory() as cache, reporter.progress("bench") as advance:
         # The warm benchmark comes last, because it fills the cache folder in which the others run cold.
         for i, name in enumerate(sorted(works, key=lambda name: name == "programs-warm")):
@@ -52,12 +52,12 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
             try:
                 machine = machine or {cores: _process("machine", cores, {}) for cores in CORES}
                 if name == "programs-warm" and not any(Path(cache).iterdir()):
-                    _measured("programs-cold", Path(cache))
-                rows.append(_measured(name, Path(cache)))
+                    _measure("programs-cold", Path(cache))
+                rows.append(_measure(name, Path(cache)))
             except KeyboardInterrupt:
                 run.stop.set()
             except OSError as error:
-                failed = True
+                failures = True
                 reporter.say(f"{name}: {error}")
             if run.interrupted:
                 break
@@ -66,14 +66,14 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
         _machine(machine), [{"name": "machine", "cores": cores, **result} for cores, result in machine.items()]
     )
     document.add(TableSection(COLUMNS, tuple(_cells(row) for row in rows), "Works"), rows)
-    return not failed
+    return not failures
 
 
-def _machine(found: dict[str, dict[str, float]]) -> TableSection:
+def _machine(machine: dict[str, dict[str, float]]) -> TableSection:
     columns = ("", "product 2048, GFLOP/s", "10 x 512 by 512 x 512 in a scan, GFLOP/s", "memory, GB/s")
     lines = tuple(
         (f"{cores} core" if cores == "one" else f"{cores} cores", *(f"{rate:.1f}" for rate in rates.values()))
-        for cores, rates in found.items()
+        for cores, rates in machine.items()
     )
     return TableSection(columns, lines, "The machine")
 
@@ -83,11 +83,11 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     times = (one.get("run_s"), one.get("units"), row["run_s"], row.get("units"))
     best = one if one.get("flop") else row
     limit = f"{100 * best['flop'] / UNIT_FLOP / best['units']:.0f} %" if best.get("flop") else "-"
-    told = _seconds(row["compile_s"]), row["goal"], row["paper"], f"{row['peak_mb']:.0f}", row["remarks"]
-    return row["work"], *map(_seconds, times), limit, *told
+    cells = _seconds(row["compile_s"]), row["goal"], row["paper"], f"{row['peak_mb']:.0f}", row["remarks"]
+    return row["work"], *map(_seconds, times), limit, *cells
 
 
-def _measured(name: str, cache: Path) -> dict[str, Any]:
+def _measure(name: str, cache: Path) -> dict[str, Any]:
     """Run one benchmark in a fresh interpreter, and return its row.
 
     The folder ``cache`` is empty at first; a benchmark uses it only on request.
@@ -109,18 +109,18 @@ def _process(name: str, cores: str, environment: dict[str, str]) -> dict[str, An
 
     On one core, the process has no accelerator; otherwise, it does not preallocate memory.
     """
-    inherited = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
-    inherited |= {"JAX_PLATFORMS": "cpu"} if cores == "one" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    ran = subprocess.run(
+    inheritance = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+    inheritance |= {"JAX_PLATFORMS": "cpu"} if cores == "one" else {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    process = subprocess.run(
         [*PYTHON, "retrim.bench.workloads", name, cores],
-        env=inherited | environment,
+        env=inheritance | environment,
         capture_output=True,
         text=True,
         check=False,
     )
-    if ran.returncode:
-        raise OSError(f"failed: {ran.stderr.strip().splitlines()[-1:]}")
-    result: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    if process.returncode:
+        raise OSError(f"failed: {process.stderr.strip().splitlines()[-1:]}")
+    result: dict[str, Any] = json.loads(process.stdout.splitlines()[-1])
     return result
 
 

@@ -28,7 +28,7 @@ class Work:
     """Whether the benchmark needs two cores and the right to choose between them."""
 
 
-def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
+def time_runs(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]:
     """Return the median time of several runs in seconds and in machine units, and the compile time.
 
     The unit is timed before and after each run, because other processes may load the machine.
@@ -44,7 +44,7 @@ def timed(compile_s: float, run: Callable[[], Any], runs: int) -> dict[str, Any]
     return {"compile_s": compile_s, "run_s": statistics.median(took), **about, "remarks": spread}
 
 
-def compiled(jitted: Any, *arguments: Any) -> tuple[Any, float]:
+def compile_function(jitted: Any, *arguments: Any) -> tuple[Any, float]:
     """Return a jitted function, compiled for the given arguments, and the compile time [s]."""
     began = time.perf_counter()
     program = jitted.lower(*arguments).compile()

@@ -10,7 +10,7 @@ from ..learn.bptt import PolicyState
 from ..learn.pretrain import train_chunk
 from ..runkit.stopwatch import Stopwatch
 from ..runkit.training import nominal_error, train
-from .timing import compiled, timed
+from .timing import compile_function, time_runs
 
 
 def pretrain(name: str, runs: int) -> dict[str, Any]:
@@ -20,19 +20,19 @@ def pretrain(name: str, runs: int) -> dict[str, Any]:
     policy = setup.new_policy(random.key(0))
     state = PolicyState(policy, optimiser.init(policy.params))
     sizes = optimiser, 10, p.num_envs
-    program, compile_s = compiled(train_chunk, state, setup.env, random.key(0), *sizes)
+    program, compile_s = compile_function(train_chunk, state, setup.env, random.key(0), *sizes)
 
-    kept = list[PolicyState]()
+    states = list[PolicyState]()
 
     def run() -> PolicyState:
-        trained = state
-        for k in random.split(random.key(len(kept) + 1), p.num_updates // 10):
-            trained, _ = program(trained, setup.env, k, *sizes)
-        kept.append(trained)
-        return trained
+        state_now = state
+        for k in random.split(random.key(len(states) + 1), p.num_updates // 10):
+            state_now, _ = program(state_now, setup.env, k, *sizes)
+        states.append(state_now)
+        return state_now
 
-    row = timed(compile_s, run, runs)
-    errors = [nominal_error(setup, trained.policy.merged()) for trained in kept]
+    row = time_runs(compile_s, run, runs)
+    errors = [nominal_error(setup, state_now.policy.merged()) for state_now in states]
     row["remarks"] += "; error " + ", ".join(f"{1000 * e:.1f}" for e in errors) + " mm"
     return row
 

@@ -45,10 +45,10 @@ def live_fleet(n: int) -> dict[str, Any]:
     Raises:
         OSError: The vehicles did not complete the flight.
     """
-    ran = subprocess.run([*PYTHON, "retrim.bench.vehicles", str(n)], stdout=subprocess.PIPE, text=True, check=False)
-    if ran.returncode != 0 or not ran.stdout:
+    process = subprocess.run([*PYTHON, "retrim.bench.vehicles", str(n)], stdout=subprocess.PIPE, text=True, check=False)
+    if process.returncode != 0 or not process.stdout:
         raise OSError(f"the {n} vehicles did not fly to the end")
-    result: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    result: dict[str, Any] = json.loads(process.stdout.splitlines()[-1])
     remarks = (
         f"{result['updates_per_s']:.1f} updates a second, {result['policies_per_s']:.1f} of them better and flown, "
         f"{result['swap_s']:.2f} s from flight to swap (median; worst "
@@ -71,9 +71,9 @@ class Air:
         self.loops = [self._loop(self.spec, bus) for bus in self.buses]
         plants = [scenario.make("small", dt=self.dt, seed=i) for i in range(n)]
         self._simulations = stack([plant.simulation for plant in plants if isinstance(plant, SimPlant)])
-        self._flown, measured = _launch(self._simulations, stack(starts))
-        self._measured = np.asarray(measured, dtype=float)
-        self._accepted = np.tile(np.asarray(Command.hover().vector(), dtype=float), (n, 1))
+        self._states, measurements = _launch(self._simulations, stack(starts))
+        self._measurements = np.asarray(measurements, dtype=float)
+        self._commands = np.tile(np.asarray(Command.hover().vector(), dtype=float), (n, 1))
         self.tick = 0
 
     def plans(self) -> list[tuple[str, LearnerPlan]]:
@@ -87,14 +87,14 @@ class Air:
     def fly(self) -> None:
         """Advance every vehicle by a tick: measure, compute the command, simulate."""
         now, t, commands = time.monotonic(), self.tick * self.dt, []
-        for bus, loop, x, taken in zip(self.buses, self.loops, self._measured, self._accepted, strict=True):
-            bus.publish("sample", Sample(self.tick, t, now, 0.0, x, x, taken).pack())
+        for bus, loop, x, command in zip(self.buses, self.loops, self._measurements, self._commands, strict=True):
+            bus.publish("sample", Sample(self.tick, t, now, 0.0, x, x, command).pack())
             setpoint = loop.tick(time.monotonic())
             loop.idle()
             commands.append(loop.plan.limits.low if setpoint is None else setpoint.u)
         u = jnp.asarray(np.stack(commands), dtype=float)
-        self._flown, measured, taken = _step(self._simulations, self._flown, u, jnp.asarray(self.tick))
-        self._accepted, self._measured = np.asarray(taken, dtype=float), np.asarray(measured, dtype=float)
+        self._states, measurements, command = _step(self._simulations, self._states, u, jnp.asarray(self.tick))
+        self._commands, self._measurements = np.asarray(command, dtype=float), np.asarray(measurements, dtype=float)
         self.tick += 1
 
     def updates(self) -> int:
@@ -103,8 +103,8 @@ class Air:
 
     def compile(self) -> None:
         """Compile the program of a tick; the simulated result is discarded."""
-        u = jnp.asarray(self._accepted, dtype=float)
-        jax.block_until_ready(_step(self._simulations, self._flown, u, jnp.asarray(0)))
+        u = jnp.asarray(self._commands, dtype=float)
+        jax.block_until_ready(_step(self._simulations, self._states, u, jnp.asarray(0)))
 
     @staticmethod
     def _loop(spec: LiveSpec, bus: SharedMemoryBus) -> ControlLoop:
@@ -119,19 +119,19 @@ def _launch(simulations: Simulation, starts: State) -> tuple[SimState, Array]:
         s = simulation.launch(x0)
         return s, simulation.measured(s).vector()
 
-    launched: tuple[SimState, Array] = eqx.filter_vmap(launch)(simulations, starts)
-    return launched
+    start: tuple[SimState, Array] = eqx.filter_vmap(launch)(simulations, starts)
+    return start
 
 
 @eqx.filter_jit
-def _step(simulations: Simulation, flown: SimState, u: Array, tick: Array) -> tuple[SimState, Array, Array]:
+def _step(simulations: Simulation, state: SimState, u: Array, tick: Array) -> tuple[SimState, Array, Array]:
     def step(simulation: Simulation, s: SimState, u: Array) -> tuple[SimState, Array, Array]:
-        accepted = simulation.within_limits(Command.of(u))
-        s = simulation.advance(s, accepted, tick)
-        return s, simulation.measured(s).vector(), accepted.vector()
+        accepted_command = simulation.within_limits(Command.of(u))
+        s = simulation.advance(s, accepted_command, tick)
+        return s, simulation.measured(s).vector(), accepted_command.vector()
 
-    stepped: tuple[SimState, Array, Array] = eqx.filter_vmap(step)(simulations, flown, u)
-    return stepped
+    result: tuple[SimState, Array, Array] = eqx.filter_vmap(step)(simulations, state, u)
+    return result
 
 
 def main() -> None:
@@ -143,14 +143,14 @@ def main() -> None:
         place = Path(folder)
         air, fleet = Air(n, place), FleetProcess(place, {learning})
         try:
-            print(json.dumps(_flown(air, fleet, place)))
+            print(json.dumps(_fly_all(air, fleet, place)))
         finally:
             fleet.close()
             for bus in air.buses:
                 bus.remove()
 
 
-def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
+def _fly_all(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
     """Fly all vehicles for a fixed time, and return the results."""
     began = time.monotonic()
     for layer, plan in air.plans():
@@ -161,7 +161,7 @@ def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
             raise OSError("the process of the learners died")
         time.sleep(0.1)
     warm_s = time.monotonic() - began
-    epoch, late, ages, known = time.monotonic(), 0, list[float](), [0] * len(air.loops)
+    epoch, late, ages, versions = time.monotonic(), 0, list[float](), [0] * len(air.loops)
     before = 0
     while air.tick * air.dt < SECONDS:
         sleep_until(epoch + air.tick * air.dt)
@@ -170,14 +170,16 @@ def _flown(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
             before = air.updates()
         for i, loop in enumerate(air.loops):
             version = loop.intake.newest.get("policy", 0)
-            if version != known[i] and air.tick * air.dt > SETTLES_S:
+            if version != versions[i] and air.tick * air.dt > SETTLES_S:
                 ages += [age for _, half, _, age in list(loop.intake.swaps)[-2:] if half == "policy"][-1:]
-            known[i] = version
+            versions[i] = version
         behind = time.monotonic() - (epoch + air.tick * air.dt)
         late += behind > 0.0
         epoch += max(0.0, behind - air.dt)  # delay the simulation instead of skipping ticks
-    if fallen := sum(loop.mode != Mode.POLICY for loop in air.loops):
-        raise OSError(f"{fallen} of {len(air.loops)} vehicles were taken over by the guard: this machine is too busy")
+    if fallbacks := sum(loop.mode != Mode.POLICY for loop in air.loops):
+        raise OSError(
+            f"{fallbacks} of {len(air.loops)} vehicles were taken over by the guard: this machine is too busy"
+        )
     return {
         "warm_s": warm_s,
         "updates_per_s": (air.updates() - before) / (SECONDS - SETTLES_S),

@@ -25,7 +25,7 @@ from .background_load import policies
 from .fleet import eight_flights, on_threads, one_after_another, side_by_side
 from .flight import learner_in_flight
 from .machine import on_core, rates
-from .timing import Work, compiled, timed
+from .timing import Work, compile_function, time_runs
 from .training import encode_and_pretrain, pretrain
 from .vehicles import live_fleet
 
@@ -36,18 +36,18 @@ def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
     if lora:
         policy = Setup.from_preset(load(name)).low_rank(state.policy.policy, random.key(2))
         state = learner.init(policy, random.key(1))
-    fitted, _ = learner.fit_residual(state.residual, window)
-    arguments = learner, state.policy, fitted, window, random.key(0)
-    program, compile_s = compiled(OnlineLearner.update_policy, *arguments)
+    residual, _ = learner.fit_residual(state.residual, window)
+    arguments = learner, state.policy, residual, window, random.key(0)
+    program, compile_s = compile_function(OnlineLearner.update_policy, *arguments)
     weights = sum(layer.weight.size for layer in state.policy.policy.merged().linear_layers())
     ticks = learner.env.task.horizon * (3 * learner.num_updates * learner.num_envs + 2 * HELD_OUT)
-    return timed(compile_s, lambda: program(*arguments), 9) | {"flop": 2.0 * weights * ticks}
+    return time_runs(compile_s, lambda: program(*arguments), 9) | {"flop": 2.0 * weights * ticks}
 
 
 def _residual(name: str = "hover/paper") -> dict[str, Any]:
     learner, state, window = learner_in_flight(name)
-    program, compile_s = compiled(OnlineLearner.fit_residual, learner, state.residual, window)
-    return timed(compile_s, lambda: program(learner, state.residual, window), 9)
+    program, compile_s = compile_function(OnlineLearner.fit_residual, learner, state.residual, window)
+    return time_runs(compile_s, lambda: program(learner, state.residual, window), 9)
 
 
 def _programs() -> dict[str, Any]:
@@ -65,7 +65,7 @@ def _tick() -> dict[str, Any]:
     began = time.perf_counter()
     fly(plant, setup.pilot(policy), x0, ticks=2, progress=no_progress)
     compile_s = time.perf_counter() - began
-    row = timed(compile_s, lambda: fly(plant, setup.pilot(policy), x0, ticks=1500, progress=no_progress).p, 5)
+    row = time_runs(compile_s, lambda: fly(plant, setup.pilot(policy), x0, ticks=1500, progress=no_progress).p, 5)
     row["remarks"] = f"{1000 * row['run_s'] / 1500:.2f} ms a tick; " + row["remarks"]
     return row
 
@@ -83,7 +83,7 @@ def _bem_tick() -> dict[str, Any]:
             measurement, _ = plant.step(u)
         return measurement.x.p
 
-    row = timed(compile_s, ticks, 5)
+    row = time_runs(compile_s, ticks, 5)
     per_tick = {"run_s": row["run_s"] / 500, "units": row["units"] / 500}
     return row | per_tick | {"remarks": f"500 ticks: {row['remarks']}"}
 
@@ -175,8 +175,8 @@ def main() -> None:
     result = work.do()
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     unit = 1024.0 if sys.platform != "darwin" else 1024.0**2
-    known = {"goal": work.goal, "paper": work.paper}
-    print(json.dumps({"work": work.title, **known, "peak_mb": peak / unit, **result}))
+    limits = {"goal": work.goal, "paper": work.paper}
+    print(json.dumps({"work": work.title, **limits, "peak_mb": peak / unit, **result}))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from ..config.vehicles import VEHICLES
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
-from ..io.trained import load_learner_state, load_policy
+from ..io.policies import load_learner_state, load_policy
 from ..plants.entry import DELAY
 from .options import join_names, option
 
@@ -150,29 +150,29 @@ def reference_of_flight(preset: Preset, name: str | None) -> str | None:
         if name is not None:
             raise ConfigError(f"--reference {name}: a {preset.task} policy follows none")
         return None
-    trained_on = preset.track.reference
-    if name is None and "+" in trained_on:
-        raise ConfigError(f"the policy was trained on {trained_on}: say which to fly, as --reference circle")
-    if name is not None and name != trained_on and preset.track.observation == "blind":
+    training_reference = preset.track.reference
+    if name is None and "+" in training_reference:
+        raise ConfigError(f"the policy was trained on {training_reference}: say which to fly, as --reference circle")
+    if name is not None and name != training_reference and preset.track.observation == "blind":
         raise ConfigError(
-            f"--reference {name}: this policy does not see its reference, and was trained on {trained_on}"
+            f"--reference {name}: this policy does not see its reference, and was trained on {training_reference}"
         )
-    return name or trained_on
+    return name or training_reference
 
 
-def same_policy(trained: Preset, changed_one: Preset, config: Path) -> Preset:
+def same_policy(original: Preset, changed_one: Preset, config: Path) -> Preset:
     """Return ``changed_one``, unless it changes a value that the weights depend on.
 
     Raises:
         ConfigError: ``changed_one`` changes such a value.
     """
     for name in ("task", "vehicle", "dt", "axes", "command_history", "family", "pretrain"):
-        before, after = (_without_excitation(getattr(each, name)) for each in (trained, changed_one))
+        before, after = (_without_excitation(getattr(each, name)) for each in (original, changed_one))
         if before != after:
-            shown = (f"{name} = {after!r}, but the policy was trained with {before!r}"
+            differences = (f"{name} = {after!r}, but the policy was trained with {before!r}"
                      if name != "pretrain" else "[pretrain] cannot change for a policy that is trained")  # fmt: skip
-            raise ConfigError(f"{config}: {shown}")
-    before_sees, after_sees = (p.track and p.track.observation for p in (trained, changed_one))
+            raise ConfigError(f"{config}: {differences}")
+    before_sees, after_sees = (p.track and p.track.observation for p in (original, changed_one))
     if before_sees != after_sees:
         raise ConfigError(
             f"{config}: track.observation = {after_sees!r}, but the policy was trained with {before_sees!r}"
@@ -212,19 +212,19 @@ def training_preset(
         ConfigError: A name, key or value is invalid.
     """
     entry = find_task(task)
-    chosen = load_for(task, preset or entry.default_preset)
+    base = load_for(task, preset or entry.default_preset)
     if config is not None:
-        chosen = overlaid(chosen, config, trust=trust)
+        base = overlaid(base, config, trust=trust)
     if reference is not None:
         if not entry.has_reference:
             raise ConfigError(f"--reference {reference}: a {task} policy follows none")
-        chosen = changed(chosen, track={**_table(chosen.track), "reference": reference})
-    chosen = changed(chosen, pretrain={name: value for name, value in pretrain.items() if value is not None})
+        base = changed(base, track={**_table(base.track), "reference": reference})
+    base = changed(base, pretrain={name: value for name, value in pretrain.items() if value is not None})
     if residual is not None:
-        chosen = changed(chosen, adapt={"residual": residual})
+        base = changed(base, adapt={"residual": residual})
     if vehicle is not None:
-        chosen = with_vehicle(chosen, vehicle)
-    return chosen
+        base = with_vehicle(base, vehicle)
+    return base
 
 
 def _table(value: Any) -> dict[str, Any]:

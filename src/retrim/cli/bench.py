@@ -7,7 +7,7 @@ from pathlib import Path
 from ..bench.measure import bench as measure
 from ..bench.workloads import WORKS
 from ..runkit.run import Run
-from .console import RichReporter, show_paths, started
+from .console import RichReporter, report_start, show_paths
 
 
 def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Callable[[threading.Event], int]:
@@ -18,10 +18,10 @@ def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Cal
         out: Folder for bench.json and bench.md; by default, a new one under runs/.
     """
 
-    def ordered(stop: threading.Event) -> int:
-        run = started(Run("bench", out, stop=stop))
+    def execute(stop: threading.Event) -> int:
+        run = report_start(Run("bench", out, stop=stop))
         fine = measure(run, RichReporter(), works=works)
         show_paths([run.folder / "bench.md"])
         return run.exit_code or int(not fine)
 
-    return ordered
+    return execute

@@ -57,10 +57,10 @@ def _lines(title: str) -> Advance:
     return advance
 
 
-def started(run: Run) -> Run:
+def report_start(run: Run) -> Run:
     """Print a message if a run resumes or overwrites an earlier run, and return the run."""
-    if said := run.of_earlier():
-        console.print(said, markup=False, soft_wrap=True)
+    if message := run.of_earlier():
+        console.print(message, markup=False, soft_wrap=True)
     return run
 
 
@@ -78,7 +78,7 @@ def show_table(section: TableSection) -> None:
     for column in section.columns:
         table.add_column(escape(column))
     for row in section.rows:
-        table.add_row(*(_styled(text) for text in row))
+        table.add_row(*(_style(text) for text in row))
     console.print(table)
 
 
@@ -88,6 +88,6 @@ def show_paths(paths: Sequence[object]) -> None:
         console.print(f"[bold]{escape(str(path))}[/]", soft_wrap=True)
 
 
-def _styled(text: str) -> str:
+def _style(text: str) -> str:
     """Convert bold text from Markdown to terminal markup."""
     return f"[bold]{escape(text.replace('**', ''))}[/]" if text.startswith("**") else escape(text)

@@ -23,7 +23,7 @@ def _doctor() -> int:
         verdict = f"[bold red]wrong[/]: {wrong} rows of a batched product; another version of jax is needed"
     else:
         verdict = "[green]right[/]"
-    shown = Table(show_header=False)
+    table = Table(show_header=False)
     for name, value in (
         ("commit", commit()),
         *versions().items(),
@@ -32,6 +32,6 @@ def _doctor() -> int:
         ("compile cache", str(jax.config.values["jax_compilation_cache_dir"])),
         ("batched products (jax-ml/jax#39103)", verdict),
     ):
-        shown.add_row(name, value)
-    console.print(shown)
+        table.add_row(name, value)
+    console.print(table)
     return 1 if wrong else 0

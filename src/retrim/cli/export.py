@@ -25,8 +25,8 @@ def export(
         out: File to write; by default policy.npz, policy.onnx, policy.h or delta.npz in the current folder.
     """
 
-    def ordered(stop: threading.Event) -> int:
+    def execute(stop: threading.Event) -> int:
         show_paths(exported(policy, to, out, delta, RichReporter(), trust=trust))
         return 0
 
-    return ordered
+    return execute

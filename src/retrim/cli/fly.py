@@ -23,7 +23,7 @@ from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
 from ..runkit.run import INTERRUPTED, Run
 from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, same_policy, with_residual
-from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
+from .console import RichReporter, Trust, console, refuse, report_start, show_paths, show_table
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 from .options import option
 
@@ -65,7 +65,7 @@ def fly(
             default.
     """
 
-    def ordered(stop: threading.Event) -> int:
+    def execute(stop: threading.Event) -> int:
         check_vehicle_file(save_vehicle)
         if flight.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
@@ -88,11 +88,11 @@ def fly(
             preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,
             state=state,
         )  # fmt: skip
-        run = started(Run("fly", out, stop=stop))
+        run = report_start(Run("fly", out, stop=stop))
         _warn(setup, scenario)
         return _fly(fleet, scenario, run, save_vehicle, memory)
 
-    return ordered
+    return execute
 
 
 def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, memory: FlightMemory | None) -> int:
@@ -100,14 +100,14 @@ def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, 
     flights = list[Flight]()  # a Ctrl-C may come before the first flight ends
     with run.interruptible(), RichReporter().progress("flying") as advance:
         advance(0.0, "compiling the programs of a flight (kept in a cache for the next time)")
-        flights = fleet.run(stop=run.stop, progress=report_progress(advance)).flown
+        flights = fleet.run(stop=run.stop, progress=report_progress(advance)).flights
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
         return INTERRUPTED
     result, preset, outlet = rows(flights), setup.preset, Outlet(run.folder)
     with interrupts_only_set(run.stop):
         outlet.write_flights(flights, preset)
-        drawn = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []
+        pictures = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []
         results = outlet.write_results(run, result, seeds=list(fleet.policies), preset=preset.name)
         memories = memory.write(flights, setup) if memory else []
     n, steady = result[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
@@ -117,8 +117,8 @@ def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, 
     show_table(TableSection(("disturbance", "method", *figure_columns(fleet.seconds)), lines, title))
     for note in notes(flights, preset):
         console.print(note, markup=False, soft_wrap=True)
-    saved, code = save_flight_vehicle(flights[-1], setup, vehicle_file)
-    show_paths([*drawn, *([] if results is None else [results]), *saved, *memories])
+    vehicle_path, code = save_flight_vehicle(flights[-1], setup, vehicle_file)
+    show_paths([*pictures, *([] if results is None else [results]), *vehicle_path, *memories])
     return run.exit_code or max((code, *(refuse(fault) for fault in outlet.faults)))
 
 

@@ -29,7 +29,7 @@ def learn(
         trust: Python name that a flight may send, e.g. mine:task; its code is run here. Repeat it for each name.
     """
 
-    def ordered(stop: threading.Event) -> int:
+    def execute(stop: threading.Event) -> int:
         for number in ending_signals()[1:]:
             signal.signal(number, lambda *_: stop.set())
         result = flights_at(addresses, key)
@@ -38,4 +38,4 @@ def learn(
         console.print(printable(last), markup=False, soft_wrap=True)
         return 0
 
-    return ordered
+    return execute

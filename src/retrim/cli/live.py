@@ -31,7 +31,7 @@ from ..runkit.training import train
 from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
 from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, with_residual
-from .console import RichReporter, Trust, console, refuse, show_paths, show_table, started
+from .console import RichReporter, Trust, console, refuse, report_start, show_paths, show_table
 from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 from .options import option
 
@@ -90,36 +90,36 @@ def live(
         out: Folder for the results of the flight; by default, a new one under runs/.
     """
 
-    def ordered(stop: threading.Event) -> int:
+    def execute(stop: threading.Event) -> int:
         check_seeds([seed])
         check_recording(record)
         check_vehicle_file(save_vehicle)
         if page and no_page:
             raise ConfigError("--page and --no-page: choose one")
         check_limits(fence, seconds, policy_age)
-        state, weights, chosen = None, None, load_for(preset.partition("/")[0], preset)
+        state, weights, base = None, None, load_for(preset.partition("/")[0], preset)
         if policy is not None or resume is not None:
-            weights, chosen, state = load_inputs(policy, resume, trust=trust)
-        chosen = with_residual(chosen, residual, state)
-        scenario = flight.scenario(chosen)
-        wanted = page or (seconds is None and not no_page)
-        address = page_address(page_host, page_port, demanded=page, say=RichReporter().say) if wanted else None
+            weights, base, state = load_inputs(policy, resume, trust=trust)
+        base = with_residual(base, residual, state)
+        scenario = flight.scenario(base)
+        shows_page = page or (seconds is None and not no_page)
+        address = page_address(page_host, page_port, is_explicit=page, say=RichReporter().say) if shows_page else None
         ground = learners_at(learners, RichReporter().say, key)
-        setup, run = Setup.from_preset(chosen, scenario.reference), started(Run("live", out, stop=stop))
+        setup, run = Setup.from_preset(base, scenario.reference), report_start(Run("live", out, stop=stop))
         if weights is None:
-            weights, losses = train(Setup.from_preset(chosen), seed, reporter=RichReporter(), stop=stop)
+            weights, losses = train(Setup.from_preset(base), seed, reporter=RichReporter(), stop=stop)
             if run.interrupted:
                 console.print(f"interrupted while pretraining, after {len(losses)} steps; nothing has flown")
                 return INTERRUPTED
         memory, state = recall_flight(flight.memory, setup, scenario, weights, state, adapt, seed, RichReporter().say)
         request = LiveRequest(
             setup, weights, scenario, "base" if adapt == "none" else adapt, seconds or LONGEST, seed, fence, run.folder,
-            state, address, ground, policy_age=policy_age or float("inf"), record=record, until_stopped=seconds is None,
+            state, address, ground, policy_age=policy_age or float("inf"), record=record, until_stop=seconds is None,
         )  # fmt: skip
         with interrupts_only_set(run.stop):  # a Ctrl-C must land the vehicle, not end the processes
             return _fly(request, run, save_vehicle, memory)
 
-    return ordered
+    return execute
 
 
 def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None, memory: FlightMemory | None) -> int:
@@ -128,12 +128,12 @@ def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None, memory: Flig
     if done is None:
         return INTERRUPTED
     flights, setup = [done.flight], done.request.setup
-    drawn = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
+    pictures = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
-    saved, code = save_flight_vehicle(done.flight, setup, vehicle_file)
-    show_paths([*(drawn or [])[:1], *done.paths, *saved, *(memory.write(flights, setup) if memory else [])])
+    vehicle_path, code = save_flight_vehicle(done.flight, setup, vehicle_file)
+    show_paths([*(pictures or [])[:1], *done.paths, *vehicle_path, *(memory.write(flights, setup) if memory else [])])
     codes = [refuse(fault) for fault in done.outlet.faults]
-    return run.exit_code or max(codes, default=int(not done.landed)) or code
+    return run.exit_code or max(codes, default=int(not done.has_landed)) or code
 
 
 def _open_page(url: str, folder: Path) -> None:

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 
-from ..signals import stopped_by
+from ..signals import stop_on_signal
 
 PACKAGE = __name__.rpartition(".")[0]
 COMMANDS = {
@@ -44,20 +44,20 @@ def own_commands() -> dict[str, tuple[str, str]]:
     return {name: (about, f"{PACKAGE}.{name}") for name, about in COMMANDS.items()}
 
 
-def describe(known: Mapping[str, tuple[str, str]]) -> str:
+def describe(entries: Mapping[str, tuple[str, str]]) -> str:
     """Return the help text of the command line.
 
     Args:
-        known: Help text and module of every command, by name.
+        entries: Help text and module of every command, by name.
     """
-    width = max(map(len, known)) + 2
+    width = max(map(len, entries)) + 2
     return "\n".join(
         [
             "usage: retrim COMMAND [--help] [options]",
             "",
             "Re-train neural flight policies in seconds, in flight.",
             "",
-            *(f"  {name:<{width}}{about}" for name, (about, _) in known.items()),
+            *(f"  {name:<{width}}{about}" for name, (about, _) in entries.items()),
             "",
             "  --version, --help",
             "  --traceback with any command: show the full traceback of an error",
@@ -90,18 +90,18 @@ def _run(words: list[str]) -> int:
 
         print(f"retrim {version('retrim')}")
         return 0
-    known = own_commands() if words[0] in COMMANDS else commands()
-    if words[0] not in known:
+    entries = own_commands() if words[0] in COMMANDS else commands()
+    if words[0] not in entries:
         import difflib
 
-        near = difflib.get_close_matches(words[0], known, n=1)
+        near = difflib.get_close_matches(words[0], entries, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        print(f"retrim: no command {words[0]!r}; {hint}there are {', '.join(known)}", file=sys.stderr)
+        print(f"retrim: no command {words[0]!r}; {hint}there are {', '.join(entries)}", file=sys.stderr)
         return 2
     stop = threading.Event()
     try:
-        with stopped_by(stop):
-            return _command(words[0], *known[words[0]], words[1:], stop)
+        with stop_on_signal(stop):
+            return _command(words[0], *entries[words[0]], words[1:], stop)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

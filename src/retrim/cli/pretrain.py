@@ -10,11 +10,11 @@ from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import CheckpointError
 from ..evaluation.limits import check_seeds
-from ..runkit.outputs import write_trained
+from ..runkit.outputs import write_trained_policy
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import ground_warning, nominal_error, train
 from .arguments import training_preset
-from .console import RichReporter, Trust, console, show_paths, started
+from .console import RichReporter, Trust, console, report_start, show_paths
 
 
 def pretrain(
@@ -46,20 +46,20 @@ def pretrain(
         out: Folder for policy.safetensors and results.json; by default, a new one under runs/.
     """
 
-    def ordered(stop: threading.Event) -> int:
+    def execute(stop: threading.Event) -> int:
         check_seeds([seed])
-        chosen = training_preset(
+        base = training_preset(
             task, preset, config=config, vehicle=vehicle, reference=reference, residual=residual,
             num_updates=updates, num_envs=envs, trust=trust,
         )  # fmt: skip
-        return _pretrain(chosen, seed, out, stop)
+        return _pretrain(base, seed, out, stop)
 
-    return ordered
+    return execute
 
 
 def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event) -> int:
     setup = Setup.from_preset(preset)
-    run, reporter = started(Run("pretrain", out, stop=stop)), RichReporter()
+    run, reporter = report_start(Run("pretrain", out, stop=stop)), RichReporter()
     if warning := ground_warning(setup):
         console.print(f"[yellow]warning:[/] {warning}", soft_wrap=True)
     policy, losses = train(setup, seed, reporter=reporter, stop=stop)
@@ -67,16 +67,16 @@ def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event
         console.print("interrupted before the first steps were done; nothing was saved")
         return INTERRUPTED
     try:
-        path = write_trained(run, setup, policy, losses, seed=seed)
+        path = write_trained_policy(run, setup, policy, losses, seed=seed)
     except OSError as error:
-        path = write_trained(Run("pretrain", stop=stop), setup, policy, losses, seed=seed)
+        path = write_trained_policy(Run("pretrain", stop=stop), setup, policy, losses, seed=seed)
         raise CheckpointError(f"{run.folder}: {error.strerror}; the policy was saved as {path} instead") from error
     with run.interruptible():
         if not run.interrupted:
             error_m = nominal_error(setup, policy)
-            write_trained(run, setup, policy, losses, seed=seed, error_m=error_m)
-            told = f"{preset.task} error in its own model: {1000 * error_m:.1f} mm after {len(losses)} steps"
-            console.print(told, markup=False)
+            write_trained_policy(run, setup, policy, losses, seed=seed, error_m=error_m)
+            summary = f"{preset.task} error in its own model: {1000 * error_m:.1f} mm after {len(losses)} steps"
+            console.print(summary, markup=False)
     if run.interrupted:
         console.print(f"interrupted after {len(losses)} steps, which are saved")
     console.print(run.watch.sentence())

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from ..evaluation.cluster import joined
+from ..evaluation.cluster import join_cluster
 from ..evaluation.sweep import read_sweep, run_sweep
 from ..runkit.run import Run
 from .console import RichReporter, Trust, show_paths
@@ -28,12 +28,12 @@ def sweep(
         out: Folder for sweep.md, sweep.json and sweep.png; by default runs/sweep-NAME, named after the file.
     """
 
-    def ordered(stop: threading.Event) -> int:
+    def execute(stop: threading.Event) -> int:
         content, reporter = read_sweep(file, trust), RichReporter()
-        with joined(on, reporter) as executor:
+        with join_cluster(on, reporter) as executor:
             run = Run("sweep", out or Path("runs") / f"sweep-{file.stem}", stop=stop, executor=executor)
             run_sweep(content, run, reporter)
         show_paths([path for path in (run.folder / "sweep.md", run.folder / "sweep.png") if path.is_file()])
         return run.exit_code
 
-    return ordered
+    return execute

@@ -26,12 +26,12 @@ def _is_key(variable: Any) -> bool:
 
 
 def _of_one_key(expression: Expression) -> Expression:
-    def checked(eqn: Any, *operands: str) -> str:
+    def check_key(eqn: Any, *operands: str) -> str:
         if eqn.invars[0].aval.ndim:
             raise no_form("a batch of random keys")
         return expression(eqn, *operands)
 
-    return checked
+    return check_key
 
 
 def _infix(symbol: str) -> Expression:
@@ -42,7 +42,7 @@ def _call(function: str) -> Expression:
     return lambda eqn, *operands: f"{function}({', '.join(operands)})"
 
 
-def _reduced(ufunc: str) -> Expression:
+def _reduction(ufunc: str) -> Expression:
     def expression(eqn: Any, x: str) -> str:
         axes, dtype = tuple(eqn.params["axes"]), np.dtype(eqn.outvars[0].aval.dtype)
         if ufunc.startswith("logical") and dtype.kind != "b":
@@ -83,8 +83,8 @@ def _broadcast(eqn: Any, x: str) -> str:
     spread = [1] * len(shape)
     for axis, n in zip(eqn.params["broadcast_dimensions"], before, strict=True):
         spread[axis] = n
-    placed = x if tuple(spread) == tuple(before) else f"{x}.reshape({tuple(spread)})"
-    return placed if tuple(spread) == shape else f"np.broadcast_to({placed}, {shape})"
+    source = x if tuple(spread) == tuple(before) else f"{x}.reshape({tuple(spread)})"
+    return source if tuple(spread) == shape else f"np.broadcast_to({source}, {shape})"
 
 
 def _convert(eqn: Any, x: str) -> str:
@@ -148,11 +148,11 @@ def _gather(eqn: Any, x: str, at: str) -> str:
         raise no_form("gather with batches")
     axes = (d.offset_dims, d.collapsed_slice_dims, d.start_index_map, eqn.params["slice_sizes"])
     mode = GatherScatterMode.from_any(eqn.params["mode"])
-    value, shown = eqn.params["fill_value"], ""
+    value, argument = eqn.params["fill_value"], ""
     if mode == fill and value is not None:  # the text of a float may be "nan", which is not a name
         value = np.asarray(value).item()
-        shown = f", value=float({str(value)!r})" if isinstance(value, float) else f", value={value}"
-    return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill}{shown})"
+        argument = f", value=float({str(value)!r})" if isinstance(value, float) else f", value={value}"
+    return f"lax.gather({x}, {at}, {', '.join(str(tuple(each)) for each in axes)}, fill={mode == fill}{argument})"
 
 
 def _scatter(eqn: Any, x: str, at: str, updates: str) -> str:
@@ -218,7 +218,7 @@ EXPRESSIONS: dict[str, Expression] = {
         "abs": "abs", "sign": "sign", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum",
         "is_finite": "isfinite", "not": "invert", "square": "square", "rem": "fmod", "nextafter": "nextafter",
     }.items()},
-    **{name: _reduced(f) for name, f in {
+    **{name: _reduction(f) for name, f in {
         "reduce_sum": "add", "reduce_max": "maximum", "reduce_min": "minimum", "reduce_and": "logical_and",
         "reduce_or": "logical_or", "reduce_prod": "multiply",
     }.items()},

@@ -41,12 +41,12 @@ def numpy_program(function: Callable[..., Any], parameters: Any, inputs: Any) ->
     Raises:
         ConfigError: The function contains an operation without a NumPy form in this module.
     """
-    closed = jax.make_jaxpr(function)(parameters, inputs)
+    closed_jaxpr = jax.make_jaxpr(function)(parameters, inputs)
     writer = _Writer()
     kinds = [PARAMETER] * len(jax.tree.leaves(parameters)) + [INPUT] * len(jax.tree.leaves(inputs))
-    given: list[Ref] = [(f"p{i}" if kind == PARAMETER else f"i{i}", kind) for i, kind in enumerate(kinds)]
-    outputs = writer.inline(closed, given)
-    return ProgramSource(writer.source(given, outputs), writer.constants)
+    refs: list[Ref] = [(f"p{i}" if kind == PARAMETER else f"i{i}", kind) for i, kind in enumerate(kinds)]
+    outputs = writer.inline(closed_jaxpr, refs)
+    return ProgramSource(writer.source(refs, outputs), writer.constants)
 
 
 def plain(value: Any) -> np.ndarray:
@@ -62,25 +62,25 @@ class _Writer:
     def __init__(self) -> None:
         self.constants: dict[str, Any] = {}
         self.lines: list[tuple[str, str, int, tuple[str, ...]]] = []
-        self._known: dict[str, Ref] = {}
+        self._refs: dict[str, Ref] = {}
         self._scope: dict[str, Any] = {"np": np, "lax": lax, "threefry": threefry}
 
     def constant(self, value: Any) -> Ref:
         """Return the name of a constant."""
         array = plain(value)
         key = f"{array.dtype} {array.shape} {array.tobytes().hex()}"
-        if key not in self._known:
+        if key not in self._refs:
             name = f"c{len(self.constants)}"
             # NumPy scalars are several times faster than arrays without axes.
             self.constants[name] = self._scope[name] = array if array.ndim else array[()]
-            self._known[key] = (name, CONSTANT)
-        return self._known[key]
+            self._refs[key] = (name, CONSTANT)
+        return self._refs[key]
 
-    def inline(self, closed: ClosedJaxpr, given: Sequence[Ref]) -> list[Ref]:
+    def inline(self, closed_jaxpr: ClosedJaxpr, refs: Sequence[Ref]) -> list[Ref]:
         """Write the lines of a trace; return its outputs."""
-        jaxpr: Jaxpr = closed.jaxpr
-        result: dict[Var, Ref] = dict(zip(jaxpr.invars, given, strict=True))
-        result |= {var: self.constant(value) for var, value in zip(jaxpr.constvars, closed.consts, strict=True)}
+        jaxpr: Jaxpr = closed_jaxpr.jaxpr
+        result: dict[Var, Ref] = dict(zip(jaxpr.invars, refs, strict=True))
+        result |= {var: self.constant(value) for var, value in zip(jaxpr.constvars, closed_jaxpr.consts, strict=True)}
 
         def read(atom: Any) -> Ref:
             return result[atom] if isinstance(atom, Var) else self.constant(np.asarray(atom.val, atom.aval.dtype))
@@ -94,7 +94,7 @@ class _Writer:
                     inner = ClosedJaxpr(inner, ())
                 results = self.inline(inner, operands)
             elif name == "scan":
-                results = self._unrolled(eqn, operands)
+                results = self._unroll(eqn, operands)
             elif name in EXPRESSIONS:
                 results = self._write(eqn, operands)
             else:
@@ -120,10 +120,10 @@ class _Writer:
         kind = max((kind for _, kind in operands), default=CONSTANT)
         if kind == CONSTANT:
             return self.constant(eval(text, self._scope))
-        if text not in self._known:
-            self._known[text] = (f"v{len(self.lines)}", kind)
+        if text not in self._refs:
+            self._refs[text] = (f"v{len(self.lines)}", kind)
             self.lines.append((f"v{len(self.lines)}", text, kind, tuple(name for name, _ in operands)))
-        return self._known[text]
+        return self._refs[text]
 
     def _number(self, text: str, operands: Sequence[Ref]) -> tuple[str, Sequence[Ref]]:
         """Index an array directly: NumPy scalars are several times faster than arrays without axes."""
@@ -134,43 +134,45 @@ class _Writer:
         array, starts = block[1], re.sub(r":\d+", "", block[2])
         return f"{array}[{starts}]", [(array, operands[0][1])]
 
-    def _unrolled(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
+    def _unroll(self, eqn: Any, operands: list[Ref]) -> list[Ref]:
         """Write the body of a loop of known length once for each step."""
         params = eqn.params
-        length, (held, carry, taken) = params["length"], _parts(params, operands)
+        length, (constants, carry, slices) = params["length"], _parts(params, operands)
         if not 0 < length <= LONGEST:
             raise no_form(f"a loop of {length} steps, not of 1 to {LONGEST},")
         rows = [list[Ref]() for _ in range(length)]
         for i in reversed(range(length)) if params["reverse"] else range(length):
-            given = [self._line(f"{each[0]}[{i}]", [each]) for each in taken]
-            after = self.inline(params["jaxpr"], [*held, *carry, *given])
+            refs = [self._line(f"{each[0]}[{i}]", [each]) for each in slices]
+            after = self.inline(params["jaxpr"], [*constants, *carry, *refs])
             carry, rows[i] = after[: len(carry)], after[len(carry) :]
         columns = zip(*rows, strict=True)
         return [*carry, *(self._line(f"np.stack([{', '.join(n for n, _ in c)}])", c) for c in columns)]
 
-    def source(self, given: Sequence[Ref], outputs: Sequence[Ref]) -> str:
+    def source(self, refs: Sequence[Ref], outputs: Sequence[Ref]) -> str:
         """Return the source of both functions, without unused lines."""
-        needed, kept = {name for name, _ in outputs}, []
+        names, needed_lines = {name for name, _ in outputs}, []
         for line in reversed(self.lines):
-            if line[0] in needed:
-                needed |= set(line[3])
-                kept.append(line)
-        kept.reverse()
-        kinds = dict(given) | {name: kind for name, _, kind, _ in kept}
-        wanted = {n for *_, kind, names in kept if kind == INPUT for n in names} | {name for name, _ in outputs}
-        passed = sorted(n for n in wanted if kinds.get(n) == PARAMETER)
+            if line[0] in names:
+                names |= set(line[3])
+                needed_lines.append(line)
+        needed_lines.reverse()
+        kinds = dict(refs) | {name: kind for name, _, kind, _ in needed_lines}
+        needed_inputs = {n for *_, kind, names in needed_lines if kind == INPUT for n in names} | {
+            name for name, _ in outputs
+        }
+        needed_parameters = sorted(n for n in needed_inputs if kinds.get(n) == PARAMETER)
 
         def body(kind: int) -> list[str]:
-            return [f"    {name} = {text}" for name, text, k, _ in kept if k == kind]
+            return [f"    {name} = {text}" for name, text, k, _ in needed_lines if k == kind]
 
-        def unpacked(names: Sequence[str], source: str) -> list[str]:
+        def unpack_line(names: Sequence[str], source: str) -> list[str]:
             return [f"    {', '.join(names)}, = {source}"] if names else []
 
-        parameters = [name for name, kind in given if kind == PARAMETER]
-        inputs = [name for name, kind in given if kind == INPUT]
-        lines = ["def prepare(parameters):", *unpacked(parameters, "parameters"), *body(PARAMETER)]
-        lines += [f"    return [{', '.join(passed)}]", "", "def step(prepared, inputs):"]
-        lines += [*unpacked(passed, "prepared"), *unpacked(inputs, "inputs"), *body(INPUT)]
+        parameters = [name for name, kind in refs if kind == PARAMETER]
+        inputs = [name for name, kind in refs if kind == INPUT]
+        lines = ["def prepare(parameters):", *unpack_line(parameters, "parameters"), *body(PARAMETER)]
+        lines += [f"    return [{', '.join(needed_parameters)}]", "", "def step(prepared, inputs):"]
+        lines += [*unpack_line(needed_parameters, "prepared"), *unpack_line(inputs, "inputs"), *body(INPUT)]
         return "\n".join([*lines, f"    return [{', '.join(name for name, _ in outputs)}]", ""])
 
 
@@ -178,5 +180,5 @@ def _parts(params: dict[str, Any], operands: list[Ref]) -> tuple[list[Ref], ...]
     """Split the operands of a loop into constants, carried values, and arrays with one row per step."""
     if "ft_in" in params:  # since jax 0.11
         return tuple(list(part) for part in params["ft_in"].update(operands).unpack())
-    held, carried = params["num_consts"], params["num_consts"] + params["num_carry"]
-    return operands[:held], operands[held:carried], operands[carried:]
+    constants, carry_end = params["num_consts"], params["num_consts"] + params["num_carry"]
+    return operands[:constants], operands[constants:carry_end], operands[carry_end:]

@@ -47,7 +47,7 @@ def response_of(preset: Preset, vehicle: Vehicle) -> ActuatorResponse | None:
     return ActuatorResponse.of(lag.c, lag.omega, inverse_damping=0.0 if damping is None else 1.0 / damping)
 
 
-def delayed(preset: Preset) -> Preset:
+def with_delay(preset: Preset) -> Preset:
     """Return the preset with the command delay from its vehicle file, if any, in the model and in the declared plant.
 
     Raises:
@@ -79,8 +79,8 @@ def declared_path(preset: Preset, vehicle: Vehicle) -> CommandPath:
 def _delay(preset: Preset, ticks: int) -> float:
     """Return the delay from the vehicle file, which need not be whole ticks, or the delay of the preset [s]."""
     vehicle = preset.vehicle
-    stated = vehicle.command_delay if isinstance(vehicle, VehicleSpec) else None
-    return ticks * preset.dt if stated is None else stated
+    delay = vehicle.command_delay if isinstance(vehicle, VehicleSpec) else None
+    return ticks * preset.dt if delay is None else delay
 
 
 def longest_delay(preset: Preset) -> float:

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..control.actuator_tracking import ActuatorTracking
+from ..control.belief_flight import IdentifiedFlight
 from ..control.controller import AbstractController, PolicyController
 from ..control.excitation import Excitation
-from ..control.identified import IdentifiedFlight
 from ..control.near_target import NearTarget
 from ..control.policy import AbstractPolicy
 from ..control.resting import RestingController

@@ -56,13 +56,13 @@ def measurement_fault(name: str) -> AbstractMeasurementFault | None:
 def _register(
     name: str, make: Callable[[float], AbstractMeasurementFault], default: float, low: float, high: float, unit: str
 ) -> None:
-    def checked(size: float | None) -> AbstractMeasurementFault:
+    def make_checked(size: float | None) -> AbstractMeasurementFault:
         value = default if size is None else size
         if not low <= value <= high:
             raise ConfigError(f"fault {name!r}: the size must be between {low:g} and {high:g} {unit}, got {value:g}")
         return make(value)
 
-    FAULTS.register(name, checked)
+    FAULTS.register(name, make_checked)
 
 
 def _none(size: float | None) -> None:
@@ -78,24 +78,24 @@ def _spikes(size: float, every: int) -> VelocitySpikes:
     return VelocitySpikes(_along_x(size), jnp.array(every))
 
 
-def _swapped(angle: float) -> SwappedMarkers:
+def _swap_markers(angle: float) -> SwappedMarkers:
     return SwappedMarkers(jnp.array([0.05, -0.03, 0.02]), jnp.array([0.0, 0.0, angle]), jnp.array(50))
 
 
-def _biased(v: float, tilt: float) -> Biased:
+def _make_bias(v: float, tilt: float) -> Biased:
     return Biased(_along_x(v), _along_x(tilt))
 
 
 FAULTS.register(NO_FAULT, _none)
 _register("velocity-spikes", partial(_spikes, every=25), 2.0, -20.0, 20.0, "m/s")
 _register("rare-spikes", partial(_spikes, every=150), 3.0, -20.0, 20.0, "m/s")
-_register("swapped-markers", _swapped, 1.5, -3.2, 3.2, "rad")
+_register("swapped-markers", _swap_markers, 1.5, -3.2, 3.2, "rad")
 _register("late", lambda size: Late(round(size)), 3.0, 1.0, 25.0, "ticks")
 _register("frozen", lambda size: Frozen(jnp.array(200), round(size)), 15.0, 1.0, 100.0, "ticks")
 _register("repeated", lambda size: Repeated(jnp.array(size)), 0.2, 0.0, 0.95, "of all measurements")
 _register("scaled-velocity", lambda size: ScaledVelocity(jnp.array(size)), 0.5, 0.0, 3.0, "times the velocity")
-_register("velocity-bias", lambda size: _biased(size, 0.0), 0.1, -5.0, 5.0, "m/s")
-_register("attitude-bias", lambda size: _biased(0.0, size), 0.03, -0.5, 0.5, "rad")
+_register("velocity-bias", lambda size: _make_bias(size, 0.0), 0.1, -5.0, 5.0, "m/s")
+_register("attitude-bias", lambda size: _make_bias(0.0, size), 0.03, -0.5, 0.5, "rad")
 _register("drift", lambda size: DriftingPosition(_along_x(size), jnp.array(250.0)), 0.1, 0.0, 5.0, "m")
 _register("gaps", lambda size: Gaps(150, round(size)), 5.0, 1.0, 50.0, "ticks")
 _register("clock-jumps", lambda size: JumpingClock(100, size), 0.1, -2.0, 2.0, "s")

@@ -93,15 +93,15 @@ def _draw(draw: np.random.Generator, number: int) -> HiddenVehicle:
 
     def grow(low: float, high: float) -> float:
         value = low * (high / low) ** size * np.exp(draw.normal(0.0, SPREAD))
-        return _rounded(np.clip(value, low, high))
+        return _round(np.clip(value, low, high))
 
     like = small()
-    mass = _rounded(LIGHTEST * (HEAVIEST / LIGHTEST) ** size)
+    mass = _round(LIGHTEST * (HEAVIEST / LIGHTEST) ** size)
     length = (mass / float(like.mass)) ** (1.0 / 3.0)
     rate_lag, thrust_lag = grow(*RATE_LAG), grow(*THRUST_LAG)
     delay = float(np.clip(DELAY[1] * size + draw.normal(0.0, DELAY_SPREAD), *DELAY))
-    damping = _rounded(draw.uniform(*DAMPING))
-    gain = _rounded(np.exp(draw.uniform(*np.log(THRUST_GAIN))))
+    damping = _round(draw.uniform(*DAMPING))
+    gain = _round(np.exp(draw.uniform(*np.log(THRUST_GAIN))))
     ratio = max(np.exp(draw.uniform(*np.log(THRUST_TO_WEIGHT))), LEAST_THRUST / gain)
     inertia = mass * length**2 / float(like.mass) * np.asarray(like.inertia, dtype=float)
     rates = np.asarray(like.omega_max, dtype=float)
@@ -120,6 +120,6 @@ def _draw(draw: np.random.Generator, number: int) -> HiddenVehicle:
     return HiddenVehicle(spec, float(size), gain)
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     """Round to three digits, as in a vehicle file."""
     return float(f"{value:.3g}")

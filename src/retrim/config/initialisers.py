@@ -21,7 +21,7 @@ LOW_RANK_TAG = 2**30 + 4  # folded into the key of a learner, for its initial de
 
 
 @partial(jax.jit, static_argnames=("size", "hidden"))
-def untrained(size: int, vehicle: Vehicle, key: Key[Array, ""], hidden: tuple[int, ...]) -> Policy:
+def make_untrained_policy(size: int, vehicle: Vehicle, key: Key[Array, ""], hidden: tuple[int, ...]) -> Policy:
     """Return an untrained policy; set-ups with the same sizes share a compiled program.
 
     Args:
@@ -71,5 +71,5 @@ def _low_rank(policy: Policy, key: Key[Array, ""]) -> LoraPolicy:
 @partial(jax.jit, static_argnames="n")
 def _starts(home: Float[Array, "3"], key: Key[Array, ""], n: int) -> State:
     nearby = Hover(home, StateObs(home, jnp.ones_like(home), 0), jnp.array(1.0), jnp.array(TILT))
-    drawn: State = jax.vmap(nearby.reset)(random.split(key, n)).x
-    return drawn
+    states: State = jax.vmap(nearby.reset)(random.split(key, n)).x
+    return states

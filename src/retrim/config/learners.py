@@ -11,8 +11,8 @@ import optax
 from jaxtyping import Array
 
 from ..adapt.optimisers import AbstractPolicyOptimiser
-from ..adapt.starts import FlownStarts, TaskStarts
-from ..adapt.trim import RestTrim, Untrimmed
+from ..adapt.starts import TaskStarts, WindowStarts
+from ..adapt.trim import NoTrim, RestTrim
 from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
@@ -22,7 +22,7 @@ from ..estimation.command_path import PathEstimator
 from ..estimation.disturbance_observer import DisturbanceObserver
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
-from ..physics.actuators import Lagged
+from ..physics.actuators import LaggedModel
 from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.vehicle import Vehicle
@@ -41,7 +41,7 @@ TILT_LIMIT = 6.0  # [m/s^2]: largest disturbance that rotates a frame, so that g
 def nominal_model(preset: Preset, vehicle: Vehicle) -> AbstractDynamics[Any]:
     """Return the point mass of the paper's Eq. (1), with actuator lag if the preset or the vehicle has one."""
     model, response = PointMass(preset.dt), response_of(preset, vehicle)
-    return model if response is None else Lagged(model, response)
+    return model if response is None else LaggedModel(model, response)
 
 
 @functools.lru_cache(maxsize=32)
@@ -81,9 +81,9 @@ def learner_settings(
         "plant_delay_ticks": preset.plant_delay_ticks if family is None else 0,  # the identified path has the delay
         "num_updates": a.num_updates,
         "num_envs": a.num_envs,
-        "starts": TaskStarts() if a.task_starts is None else FlownStarts(jnp.array(a.start_noise), a.task_starts),
+        "starts": TaskStarts() if a.task_starts is None else WindowStarts(jnp.array(a.start_noise), a.task_starts),
         "view": _view(preset, env.task),
-        "trim": RestTrim() if a.trim == "rest" and env.task.rests else Untrimmed(),
+        "trim": RestTrim() if a.trim == "rest" and env.task.rests else NoTrim(),
         "vehicles": OwnVehicle() if family is None else IdentifiedVehicle(PathEstimator.of(preset.dt), family),
     }
 
@@ -102,8 +102,8 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
         ConfigError: The task cannot be rotated, or the observation neither measures nor estimates the state. The
             message names the task and the part that cannot be rotated.
     """
-    seen = task.observation_in_flight
-    if not seen.measures_state and seen.state_estimator is None:
+    observation = task.observation_in_flight
+    if not observation.measures_state and observation.state_estimator is None:
         raise ConfigError(
             f"preset {preset.name!r}: the frame of effective gravity needs a measured state or a pose filter; set "
             "[vision] occlusion = true"
@@ -115,7 +115,7 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 
 
 def effective_gravity_frame(
-    controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known: FittedResidual | None = None
+    controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known_residual: FittedResidual | None = None
 ) -> GravityFrame | PoseFrame:
     """Return a controller in the frame of effective gravity, which an observer or the observation estimates.
 
@@ -123,7 +123,7 @@ def effective_gravity_frame(
         controller: Controller that can be rotated into this frame.
         preset: Preset with the control period and the declared delay of the observer.
         vehicle: Vehicle with the command limits and the lag of the observer.
-        known: Learned residual, including the learned body-rate bias. The observer estimates the remaining
+        known_residual: Learned residual, including the learned body-rate bias. The observer estimates the remaining
             disturbance. The estimator of an observation ignores the residual and
             estimates the whole disturbance.
     """
@@ -140,7 +140,9 @@ def effective_gravity_frame(
         (vehicle.command_min, vehicle.command_max),
         longest_delay=longest_delay(preset),
     )
-    result = None if known is None else known.turning
+    result = None if known_residual is None else known_residual.turning
     bias = jnp.zeros(3) if result is None else result.bias
-    place = None if known is None else known.place
-    return GravityFrame(controller, observer, known, rate_bias=bias, place=place, lead=lead_of(path, preset.dt))
+    place = None if known_residual is None else known_residual.place
+    return GravityFrame(
+        controller, observer, known_residual, rate_bias=bias, place=place, lead=lead_of(path, preset.dt)
+    )

@@ -126,12 +126,12 @@ def missing_defaults(preset: Preset, text: str | bytes) -> dict[str, Any]:
     return dict(_absent(values(preset), json.loads(text_with_new_keys(text, source="preset")), ""))
 
 
-def _absent(whole: dict[str, Any], given: Any, before: str) -> Iterator[tuple[str, Any]]:
+def _absent(whole: dict[str, Any], content: Any, before: str) -> Iterator[tuple[str, Any]]:
     for name, value in whole.items():
-        if name not in given:
+        if name not in content:
             yield before + name, value
-        elif isinstance(value, dict) and isinstance(given[name], dict):
-            yield from _absent(value, given[name], f"{before}{name}.")
+        elif isinstance(value, dict) and isinstance(content[name], dict):
+            yield from _absent(value, content[name], f"{before}{name}.")
 
 
 def changed(preset: Preset, **tables: Any) -> Preset:

@@ -66,10 +66,10 @@ class MethodRequest:
         Raises:
             ConfigError: The observation neither measures nor estimates the state.
         """
-        seen = self.setup.flight_task.observation_in_flight
-        if seen.state_estimator is not None:
-            return PoseFilteredController(seen, controller)
-        if not seen.measures_state:
+        observation = self.setup.flight_task.observation_in_flight
+        if observation.state_estimator is not None:
+            return PoseFilteredController(observation, controller)
+        if not observation.measures_state:
             name = called or type(controller).__name__
             raise ConfigError(
                 f"method {name!r} needs the state, and preset {self.setup.preset.name!r} shows keypoints, from which "
@@ -105,7 +105,7 @@ class MethodEntry:
     learns: Prepare | None = None
     """Function that prepares the policy for the learners; None for a method that does not learn in flight."""
 
-    def fitted(self, setup: "Setup", plant: Plant) -> Plant:
+    def modify_plant(self, setup: "Setup", plant: Plant) -> Plant:
         """Return the plant with the modifications that the method requires.
 
         Raises:
@@ -163,7 +163,7 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(request.in_effective_gravity_frame())
 
 
-def _identified(request: MethodRequest) -> Pilot:
+def _make_adaptive_path(request: MethodRequest) -> Pilot:
     return ControllerPilot(identify_vehicle(request.in_effective_gravity_frame(), request.setup.preset))
 
 
@@ -187,7 +187,7 @@ def _low_rank(setup: "Setup", policy: AbstractPolicy, key: Key[Array, ""]) -> Lo
 register_method("base", MethodEntry(_base, "base policy"))
 register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
-register_method("base-id", MethodEntry(_identified, "base policy + observer + identification"))
+register_method("base-id", MethodEntry(_make_adaptive_path, "base policy + observer + identification"))
 for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _name, _baseline), _baseline.label))
 register_method("full", MethodEntry(_full, "**adapted, all weights**", learns=_all_weights))

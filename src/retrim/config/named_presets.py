@@ -66,13 +66,13 @@ ANY = dataclasses.replace(
     adapt=dataclasses.replace(RETRIM.adapt, window=150, trim="free"),  # in flight, each tick shifts the output
 )
 
-FELT = Track(reference="circle+figure8+star", observation="flat", gravity_copies=7)
+GRAVITY_TRACK = Track(reference="circle+figure8+star", observation="flat", gravity_copies=7)
 TRACK_RETRIM = dataclasses.replace(
     TRACK,
     name="track/retrim",
     reward="sharp",
     jump_cost=0.1,
-    track=FELT,
+    track=GRAVITY_TRACK,
     pretrain=dataclasses.replace(
         TRACK.pretrain, num_updates=1200, learning_rate=5e-3, adam_b2=0.95, hidden_sizes=(128, 128)
     ),
@@ -94,7 +94,7 @@ TRACK_FAST = dataclasses.replace(
     TRACK_RETRIM,
     name="track/fast",
     vehicle="kingfisher",
-    track=dataclasses.replace(FELT, reference="circle=8+figure8=8+circle=4+figure8=4+star=1.5"),
+    track=dataclasses.replace(GRAVITY_TRACK, reference="circle=8+figure8=8+circle=4+figure8=4+star=1.5"),
 )
 
 OCCLUDED = dataclasses.replace(

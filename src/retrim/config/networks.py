@@ -13,7 +13,7 @@ from ..control.network_policy import NetworkPolicy
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
 from ..physics.vehicle import Vehicle
-from .initialisers import untrained
+from .initialisers import make_untrained_policy
 from .presets import Preset
 from .registry import Registry
 
@@ -70,7 +70,7 @@ def make_policy(request: NetworkRequest) -> AbstractPolicy:
 
 
 def _perceptron(request: NetworkRequest) -> AbstractPolicy:
-    policy: AbstractPolicy = untrained(request.size, request.vehicle, request.key, request.hidden_sizes)
+    policy: AbstractPolicy = make_untrained_policy(request.size, request.vehicle, request.key, request.hidden_sizes)
     return policy
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import ConfigError
 from ..physics.effective_gravity import EffectiveGravityFrame
-from ..tasks.reference import Reference, joined
+from ..tasks.reference import Reference, join_references
 from ..tasks.shapes import AT_SPEED, FASTEST
 from ..tasks.shapes import REFERENCES as BUILT_IN
 from ..tasks.trajectory_csv import from_csv
@@ -28,7 +28,7 @@ for _name, _make in BUILT_IN.items():
     REFERENCES.register(_name, _make)
 register_reference = REFERENCES.register
 
-FELT_SEED = 0
+PUSH_SEED = 0
 """Seed of the pushes whose effective gravity transforms training references; the same for every policy seed."""
 
 LAPS = {"": None, "laps": True, "once": False}
@@ -47,7 +47,7 @@ def make_reference(names: str) -> Reference:
     Raises:
         ConfigError: There is no such reference, or a CSV file cannot be used.
     """
-    return _made(names, 0, 0.0)
+    return _make_reference(names, 0, 0.0)
 
 
 def make_training_reference(table: Track) -> Reference:
@@ -56,18 +56,18 @@ def make_training_reference(table: Track) -> Reference:
     Raises:
         ConfigError: As for :func:`make_reference`.
     """
-    return _made(table.reference, table.gravity_copies, table.gravity_push)
+    return _make_reference(table.reference, table.gravity_copies, table.gravity_push)
 
 
-def _made(names: str, copies: int, push: float) -> Reference:
+def _make_reference(names: str, copies: int, push: float) -> Reference:
     """Return a reference or a family, with ``copies`` of each member under random pushes of up to ``push`` [m/s^2]."""
     if all(name.partition("=")[0] in BUILT_IN for name in names.split("+")):
-        return _built_in(names, copies, push, jax.config.values["jax_enable_x64"])
+        return _make_built_in(names, copies, push, jax.config.values["jax_enable_x64"])
     return _family([_one_reference(name) for name in names.split("+")], copies, push)
 
 
 @functools.cache
-def _built_in(names: str, copies: int, push: float, x64: bool) -> Reference:
+def _make_built_in(names: str, copies: int, push: float, x64: bool) -> Reference:
     """Return built-in references, sampled once per process and precision; CSV files are read on every call instead."""
     return _family([_one_reference(name) for name in names.split("+")], copies, push)
 
@@ -75,36 +75,36 @@ def _built_in(names: str, copies: int, push: float, x64: bool) -> Reference:
 def _family(plain: Sequence[Reference], copies: int, push: float) -> Reference:
     if len(plain) == 1 and not copies:
         return plain[0]
-    draw = np.random.default_rng(FELT_SEED)
+    draw = np.random.default_rng(PUSH_SEED)
     directions = draw.normal(size=(len(plain), copies, 3))
     sizes = push * draw.uniform(size=(len(plain), copies, 1)) ** (1.0 / 3.0)  # uniform in a ball
     pushes = sizes * directions / np.linalg.norm(directions, axis=2, keepdims=True)
-    felt = [
+    perturbed_copies = [
         r.in_frame(EffectiveGravityFrame.of(jnp.asarray(d)))
         for r, many in zip(plain, pushes, strict=True)
         for d in many
     ]
-    return joined([*plain, *felt])
+    return join_references([*plain, *perturbed_copies])
 
 
 def _one_reference(name: str) -> Reference:
     file, _, how = name.rpartition(":") if ".csv:" in name.lower() else (name, "", "")
-    shape, sized, speed = name.partition("=")
+    shape, size, speed = name.partition("=")
     try:
-        if sized and shape in AT_SPEED:
+        if size and shape in AT_SPEED:
             return AT_SPEED[shape](_speed(name, speed))
         if file.lower().endswith(".csv"):
             if how not in LAPS:
                 raise ConfigError(f"{name}: {how!r} is not 'laps' or 'once'")
             return from_csv(Path(file), LAPS[how])
-        made: Any = REFERENCES.find(name)()
+        reference: Any = REFERENCES.find(name)()
     except OSError as error:
         raise ConfigError(f"{file}: {error.strerror or error}") from error
     except (TypeError, ValueError) as error:
         raise error if isinstance(error, ConfigError) else ConfigError(f"reference {name}: {error}") from error
-    if not isinstance(made, Reference):
-        raise ConfigError(f"reference {name!r} is a {type(made).__name__}, not a function that gives a Reference")
-    return made
+    if not isinstance(reference, Reference):
+        raise ConfigError(f"reference {name!r} is a {type(reference).__name__}, not a function that gives a Reference")
+    return reference
 
 
 def _speed(name: str, text: str) -> float:

@@ -55,7 +55,7 @@ class Registry(Mapping[str, T], Generic[T]):
             accepts: Function that returns whether an object has this type.
         """
         self._kind, self._example, self._expected, self._accepts = kind, example, expected, accepts
-        self._known = dict[str, T | _Place]()
+        self._objects = dict[str, T | _Place]()
 
     def register(self, name: str, thing: T) -> T:
         """Add an object under a new name.
@@ -65,7 +65,7 @@ class Registry(Mapping[str, T], Generic[T]):
                 type.
         """
         self._check_name(name)
-        self._known[name] = self._checked(name, thing)
+        self._objects[name] = self._checked(name, thing)
         return thing
 
     def register_place(self, name: str, place: str) -> None:
@@ -79,7 +79,7 @@ class Registry(Mapping[str, T], Generic[T]):
             ConfigError: The name is already registered, or contains forbidden characters.
         """
         self._check_name(name)
-        self._known[name] = _Place(place)
+        self._objects[name] = _Place(place)
 
     def find(self, name: str) -> T:
         """Return the object with this name.
@@ -91,12 +91,12 @@ class Registry(Mapping[str, T], Generic[T]):
         if name in self:
             return self[name]
         if ":" in name:
-            return self._checked(name, self._imported(name))
+            return self._checked(name, self._import(name))
         for entry in self._entries():
             if entry.name == name:
                 return self._checked(name, entry.load())
-        known = (*self, *self.plugins())
-        raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, known)}, or {self._example}")
+        names = (*self, *self.plugins())
+        raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, names)}, or {self._example}")
 
     def plugins(self) -> tuple[str, ...]:
         """Return the names that installed packages add through entry points."""
@@ -117,7 +117,7 @@ class Registry(Mapping[str, T], Generic[T]):
         result: T = thing
         return result
 
-    def _imported(self, name: str) -> Any:
+    def _import(self, name: str) -> Any:
         module, _, attribute = name.partition(":")
         if not (all(part.isidentifier() for part in module.split(".")) and attribute.isidentifier()):
             raise ConfigError(f"no {self._kind} {excerpt(name)}; a Python name is as module:name")
@@ -131,22 +131,22 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         """Return the object that is registered under ``name``."""
-        thing = self._known[name]
+        thing = self._objects[name]
         if isinstance(thing, _Place):
-            thing = self._known[name] = self._checked(name, thing.load())
+            thing = self._objects[name] = self._checked(name, thing.load())
         return thing
 
     def __contains__(self, name: object) -> bool:
         """Return whether there is a registered object with this name; nothing is imported."""
-        return name in self._known
+        return name in self._objects
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over the registered names; nothing is imported."""
-        return iter(self._known)
+        return iter(self._objects)
 
     def __len__(self) -> int:
         """Return the number of registered names."""
-        return len(self._known)
+        return len(self._objects)
 
 
 def describe_user_error(error: Exception, words: Sequence[str]) -> str | None:
@@ -158,10 +158,10 @@ def describe_user_error(error: Exception, words: Sequence[str]) -> str | None:
         error: Exception that was raised.
         words: Words of the command line; a word with ``module:name`` names such a module.
     """
-    here, named = str(Path.cwd()), any(_names_a_module(word) for word in words)
+    here, has_module = str(Path.cwd()), any(_names_a_module(word) for word in words)
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(LIBRARIES)]
-    own = [frame for frame in frames if named or frame.filename.startswith(here)]
-    if not own and not named:
+    own = [frame for frame in frames if has_module or frame.filename.startswith(here)]
+    if not own and not has_module:
         return None
     place = f"{own[-1].filename}, line {own[-1].lineno}: " if own else ""
     hint = "--traceback shows where; retrim.testing.check_... names a broken law"

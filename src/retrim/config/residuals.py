@@ -71,7 +71,7 @@ def _regression(request: ResidualRequest) -> RegressionModel:
     return RegressionModel.of(p.dt, memory=a.memory, thrust_prior=a.thrust_prior, tau=(roll, pitch, yaw), limits=limits)
 
 
-def _layered(request: ResidualRequest) -> ResidualModel:
+def _make_layered(request: ResidualRequest) -> ResidualModel:
     p, least = request.preset, BLOCK * request.preset.dt
     if p.adapt.fit_every < least:
         raise ConfigError(
@@ -92,6 +92,6 @@ def _linear(request: ResidualRequest) -> LinearModel:
 
 register_residual("ensemble", _ensemble)
 register_residual("regression", _regression)
-register_residual("layered", _layered)
+register_residual("layered", _make_layered)
 register_residual("linear", _linear)
 register_residual("place", _place)

@@ -91,12 +91,12 @@ class Scenario:
         Returns:
             The scenario without these numbers, and the names of the values that the vehicle file states.
         """
-        stated = tuple[str, ...]()
+        numbers = tuple[str, ...]()
         vehicle = self.vehicle
         if isinstance(vehicle, VehicleSpec):
-            stated = tuple(field.name for field in fields(vehicle) if getattr(vehicle, field.name) is not None)
+            numbers = tuple(field.name for field in fields(vehicle) if getattr(vehicle, field.name) is not None)
             vehicle = None
-        return replace(self, vehicle=vehicle, delay=DELAY, thrust_error=THRUST_ERROR), stated
+        return replace(self, vehicle=vehicle, delay=DELAY, thrust_error=THRUST_ERROR), numbers
 
     def vehicle_name(self, trained_for: str | VehicleSpec) -> str:
         """Return the name of the vehicle that a policy trained for ``trained_for`` flies."""

@@ -29,14 +29,14 @@ from ..learn.residuals.model import FittedResidual, ResidualModel
 from ..physics.state import State
 from ..physics.vehicle import Vehicle
 from ..progress import Progress, show_progress
-from ..runtime.adaptive import AdaptivePilot, Scheduled
+from ..runtime.adaptive import AdaptivePilot, ScheduledLearner
 from ..runtime.lockstep import LockstepLearner
 from ..runtime.pilot import Pilot
 from ..tasks.abstract_reference import AbstractReference
 from ..tasks.motions import MOTIONS, NEAR
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
-from .command_paths import delayed, longest_delay, model_path
+from .command_paths import longest_delay, model_path, with_delay
 from .families import identify_vehicle, make_family, policy_controller, track_actuators
 from .initialisers import flight_starts, low_rank
 from .learners import effective_gravity_frame, nominal_model, pretraining_optimiser
@@ -94,21 +94,21 @@ class Setup:
             policy = setup.pretrained(seed=0)
         """
         preset = load(preset) if isinstance(preset, str) else preset
-        preset, entry = delayed(preset), find_task(preset.task)
+        preset, entry = with_delay(preset), find_task(preset.task)
         if reference is not None and not entry.has_reference:
             raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows none")
         NETWORKS.find(preset.pretrain.network)
         vehicle = make_vehicle(preset.vehicle)
         table = preset.track or TrackTable()
-        trained_on = make_training_reference(table) if entry.has_reference else None
+        training_reference = make_training_reference(table) if entry.has_reference else None
         if table.gravity_copies and reference is None:
             reference = table.reference
         try:
-            task = make_task(TaskRequest(preset, vehicle, trained_on))
+            task = make_task(TaskRequest(preset, vehicle, training_reference))
             flight_task = task
             if reference is not None:
-                followed = make_reference(reference) if isinstance(reference, str) else reference
-                flight_task = make_task(TaskRequest(preset, vehicle, followed))
+                flight_reference = make_reference(reference) if isinstance(reference, str) else reference
+                flight_task = make_task(TaskRequest(preset, vehicle, flight_reference))
             nominal = nominal_model(preset, vehicle)
             jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
             path = model_path(preset, vehicle)
@@ -145,10 +145,10 @@ class Setup:
         return dataclasses.replace(self, flight_task=flight_task, learner=learner)
 
     @property
-    def followed(self) -> Reference | None:
+    def flight_reference(self) -> Reference | None:
         """Reference of the flight; None if the task has no tabulated reference."""
-        followed = getattr(self.flight_task, "reference", None)
-        return followed if isinstance(followed, Reference) else None
+        flight_reference = getattr(self.flight_task, "reference", None)
+        return flight_reference if isinstance(flight_reference, Reference) else None
 
     def new_policy(self, key: Key[Array, ""]) -> AbstractPolicy:
         """Return an untrained policy; the key is consumed."""
@@ -236,8 +236,8 @@ class Setup:
         plain = policy_controller(self.preset, self.flight_task, state.policy.policy.merged())
         if self.preset.adapt.frame == "world":
             return track_actuators(plain, self.preset)
-        known = FittedResidual(self.learner.residual_model, state.residual)
-        frame = effective_gravity_frame(plain, self.preset, self.vehicle, known)
+        residual = FittedResidual(self.learner.residual_model, state.residual)
+        frame = effective_gravity_frame(plain, self.preset, self.vehicle, residual)
         if not isinstance(frame, GravityFrame):
             return frame
         monitor = track_actuators(Monitor(frame, self.flight_task), self.preset)
@@ -268,7 +268,7 @@ class Setup:
         fitter, trainer = (make_worker(self.learner, layer, state, k_learn) for layer in get_args(Layer))
         fit = LockstepLearner(fitter, a.fit_latency if fixed else None, dt)
         update = LockstepLearner(trainer, a.update_latency if fixed else None, dt)
-        learners = Scheduled(fit, a.fit_every), Scheduled(update, a.update_every)
+        learners = ScheduledLearner(fit, a.fit_every), ScheduledLearner(update, a.update_every)
         return AdaptivePilot(self.controller, state, learners, dt=dt, window=a.window)
 
     def flight_starts(self, n: int, seed: int = 0) -> list[State]:
@@ -291,4 +291,4 @@ class Setup:
         Args:
             vehicle: Vehicle of the flight; by default the training vehicle.
         """
-        return None if self.followed is None else self.followed.infeasibility(vehicle or self.vehicle)
+        return None if self.flight_reference is None else self.flight_reference.infeasibility(vehicle or self.vehicle)

@@ -84,10 +84,10 @@ class TaskRequest:
         p = self.preset
         centre = jnp.array(p.goal) if goal is None else jnp.zeros(3)
         observation = StateObs(centre, *self.observed_commands())
-        seen = observation if p.axes == "world" else HeadingObs(observation, centre)
+        base = observation if p.axes == "world" else HeadingObs(observation, centre)
         fields = (
             centre,
-            self.of_vehicle(seen),
+            self.of_vehicle(base),
             jnp.array(p.termination_box),
             jnp.array(p.pretrain.max_start_yaw),
             p.dt,
@@ -155,10 +155,12 @@ def _vision(request: TaskRequest) -> AbstractTask:
     training = Keypoints.of(
         jnp.array(p.goal), omega_max, noise=table.pixel_noise, whitened=table.whiten_pixels, dt=p.dt
     )
-    flown: OccludedKeypoints | None = None
+    occluded_observation: OccludedKeypoints | None = None
     if table.occlusion:  # the filter estimates the pose accurately, so training can ignore it
         lag = lag_of(p, request.vehicle)
-        flown = OccludedKeypoints(training, jnp.array(table.dropout), lag, delay_ticks=p.plant_delay_ticks)
+        occluded_observation = OccludedKeypoints(
+            training, jnp.array(table.dropout), lag, delay_ticks=p.plant_delay_ticks
+        )
     kind = VISION_REWARDS[p.reward]
     return kind(
         jnp.array(p.goal),
@@ -167,7 +169,7 @@ def _vision(request: TaskRequest) -> AbstractTask:
         jnp.array(p.pretrain.max_start_yaw),
         p.dt,
         p.pretrain.horizon,
-        flown,
+        occluded_observation,
     )
 
 

@@ -14,7 +14,7 @@ from ..errors import ConfigError, excerpt
 
 T = TypeVar("T")
 
-CHECKED, TOLD = 100, 8
+MAX_CHECKS, MAX_LINES = 100, 8
 """Largest number of mistakes per file that are examined, and largest number that are listed."""
 UNKNOWN = "unknown key"
 NO_NAME = "Input should be a valid string"
@@ -54,19 +54,19 @@ def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: st
     try:
         return adapter.validate_python(tables) if isinstance(tables, dict) else adapter.validate_json(tables)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_explained(kind, error)}") from error
+        raise ConfigError(f"{source}: {_explain(kind, error)}") from error
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a text that suggests the closest known name and lists all known names."""
-    near = difflib.get_close_matches(name[:100], known := list(known), n=1)
-    return (f"did you mean {near[0]!r}? " if near else "") + f"there are {', '.join(known)}"
+    near = difflib.get_close_matches(name[:100], names := list(names), n=1)
+    return (f"did you mean {near[0]!r}? " if near else "") + f"there are {', '.join(names)}"
 
 
-def _explained(kind: type[Any], error: ValidationError) -> str:
+def _explain(kind: type[Any], error: ValidationError) -> str:
     """Return a text with the first mistakes: the path of each and, for an unknown key, the valid keys."""
     result, mistakes = dict[str, str](), error.errors(include_url=False, include_context=False)
-    for each in mistakes[:CHECKED]:
+    for each in mistakes[:MAX_CHECKS]:
         path = [excerpt(str(part), quotes=False) for part in each["loc"] if not str(part).startswith("function-")]
         where = ".".join(path)
         message = each["msg"].removeprefix("Value error, ")
@@ -78,16 +78,16 @@ def _explained(kind: type[Any], error: ValidationError) -> str:
             message = f"must be a list of values in brackets, not {excerpt(str(each['input']), quotes=False)}"
         if result.get(where) in (None, NO_NAME):  # a table and a name are valid here: prefer the mistake in the table
             result[where] = message
-    ordered = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys
-    told = [f"{where}: {message}" if where else message for where, message in ordered][:TOLD]
-    more = len(result) - len(told) + max(len(mistakes) - CHECKED, 0)
-    return "; ".join(told) + (f"; and {more} more" if more else "")
+    order = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys
+    lines = [f"{where}: {message}" if where else message for where, message in order][:MAX_LINES]
+    more = len(result) - len(lines) + max(len(mistakes) - MAX_CHECKS, 0)
+    return "; ".join(lines) + (f"; and {more} more" if more else "")
 
 
 def _keys(kind: type[Any], path: Sequence[str]) -> list[str]:
     """Return the keys of the table at a path. Parts that are not keys, such as union members, are skipped."""
     for part in path:
         annotation = typing.get_type_hints(kind).get(part)
-        nested = [each for each in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(each)]
-        kind = typing.cast(type[Any], nested[0]) if nested else kind
+        parts = [each for each in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(each)]
+        kind = typing.cast(type[Any], parts[0]) if parts else kind
     return [field.name for field in dataclasses.fields(kind)]

@@ -49,16 +49,18 @@ def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
         return vehicle
     try:
         result = vehicle_from(vehicle)
-        made = result.build() if isinstance(result, VehicleSpec) else VEHICLES.find(result)()
-        if isinstance(made, Vehicle) and not is_published(result):
-            check_flyable(made)
+        built_vehicle = result.build() if isinstance(result, VehicleSpec) else VEHICLES.find(result)()
+        if isinstance(built_vehicle, Vehicle) and not is_published(result):
+            check_flyable(built_vehicle)
     except (ValueError, TypeError) as error:
         raise (
             error if isinstance(error, ConfigError) else ConfigError(f"vehicle {name_of(vehicle)}: {error}")
         ) from error
-    if not isinstance(made, Vehicle):
-        raise ConfigError(f"vehicle {name_of(vehicle)!r} gives a {type(made).__name__}, expected a retrim.Vehicle")
-    return made
+    if not isinstance(built_vehicle, Vehicle):
+        raise ConfigError(
+            f"vehicle {name_of(vehicle)!r} gives a {type(built_vehicle).__name__}, expected a retrim.Vehicle"
+        )
+    return built_vehicle
 
 
 def name_of(vehicle: str | VehicleSpec) -> str:

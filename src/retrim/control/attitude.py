@@ -36,20 +36,20 @@ def thrust_of(acceleration: Float[Array, "3"]) -> Float[Array, "3"]:
     return acceleration + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=acceleration.dtype)
 
 
-def command_for(x: State, thrust: Float[Array, "3"], wanted: Point, gain: Float[Array, "3"]) -> Command:
+def command_for(x: State, thrust: Float[Array, "3"], setpoint: Point, gain: Float[Array, "3"]) -> Command:
     """Return the command that turns a vehicle towards a thrust; the collective thrust is its part along the z axis.
 
     Args:
         x: State in which the command begins to act.
         thrust: Desired mass-normalised thrust, world [m/s^2].
-        wanted: Reference, which provides the heading and the attitude rate.
+        setpoint: Reference, which provides the heading and the attitude rate.
         gain: Body rate per radian of attitude error, about each body axis [1/s].
 
     Source:
         Lee, Leok and McClamroch 2010, at the level of body rates, with the rotation vector as the attitude error.
     """
     thrust = flyable(thrust)
-    R = attitude_of(thrust, wanted.heading)
-    feed = flat_command(thrust, wanted.jerk, wanted.heading, wanted.heading_rate)[1:]
+    R = attitude_of(thrust, setpoint.heading)
+    feed = flat_command(thrust, setpoint.jerk, setpoint.heading, setpoint.heading_rate)[1:]
     error = so3.mul(x.R.T, R)
     return Command(jnp.maximum(jnp.sum(thrust * x.R[:, 2]), 0.0), so3.act(error, feed) + gain * so3.log(error))

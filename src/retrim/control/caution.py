@@ -47,7 +47,7 @@ class Caution(eqx.Module):
         level = jnp.exp(-dt / MEMORY) * self.level + rise
         return Caution(swings, jnp.minimum(level, 1.0).astype(self.level.dtype))
 
-    def applied(self, belief: PathBelief) -> PathBelief:
+    def apply(self, belief: PathBelief) -> PathBelief:
         """Return the belief with delay and rate lag moved towards the slowest vehicle by the level of caution."""
         share = self.level * jnp.array(SLOWER)
         low, high = (end + share * (1.0 - end) for end in belief.ends)

@@ -126,10 +126,10 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
     ) -> tuple[Command, tuple[Any, Command]]:
         """Evaluate the observation and the policy once."""
-        remembered, last = memory
-        o, remembered = self.observation(remembered, t, x, last)
+        memory_of_observation, last = memory
+        o, memory_of_observation = self.observation(memory_of_observation, t, x, last)
         u = self.policy(o)
-        return u, (remembered, u)
+        return u, (memory_of_observation, u)
 
     def accepted(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
         """Remember ``u`` as the last command."""

@@ -26,16 +26,16 @@ class Gains(eqx.Module):
     integral: Float[Array, ""]
     """Gain of the integral of the position error [1/s^3]; zero disables integral action."""
 
-    def acceleration(self, x: State, wanted: Point, integral: Float[Array, "3"]) -> Float[Array, "3"]:
+    def acceleration(self, x: State, setpoint: Point, integral: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return the acceleration that brings a vehicle to its reference, in the world frame [m/s^2].
 
         Args:
             x: State.
-            wanted: Reference.
+            setpoint: Reference.
             integral: Integral of the position error [m s].
         """
-        back = self.position * (wanted.p - x.p) + self.velocity * (wanted.v - x.v)
-        return wanted.a + back + self.integral * integral
+        back = self.position * (setpoint.p - x.p) + self.velocity * (setpoint.v - x.v)
+        return setpoint.a + back + self.integral * integral
 
     def turning(self) -> Float[Array, "3"]:
         """Return the attitude gain about each body axis [1/s]; a quadrotor turns slowly about its thrust axis."""
@@ -76,11 +76,11 @@ class GeometricController(AbstractController[GeometricState]):
         """Compute the command for the state in which the command begins to act."""
         gain, dt = self.gains.integral, self.prediction.dt
         x, _ = self.prediction(memory.underway, x, gain * -memory.integral)
-        wanted = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))
+        setpoint = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))
         bound = self.limit / jnp.maximum(gain, 1e-6)
-        integral = jnp.clip(memory.integral + dt * (wanted.p - x.p), -bound, bound)
-        acceleration = self.gains.acceleration(x, wanted, integral)
-        u = command_for(x, thrust_of(acceleration), wanted, self.gains.turning()).within(self.low, self.high)
+        integral = jnp.clip(memory.integral + dt * (setpoint.p - x.p), -bound, bound)
+        acceleration = self.gains.acceleration(x, setpoint, integral)
+        u = command_for(x, thrust_of(acceleration), setpoint, self.gains.turning()).within(self.low, self.high)
         return u, GeometricState(self.prediction.issued(memory.underway, u), integral)
 
     def accepted(self, memory: GeometricState, u: Command) -> GeometricState:

@@ -43,7 +43,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
     inner: AbstractController[Any]
     observer: DisturbanceObserver
     """Observer that estimates the unknown part of the disturbance."""
-    known: Residual | None = None
+    known_residual: Residual | None = None
     """Learned residual in the world frame [m/s^2]. The deviation from its value at rest is used directly, since an
     estimate of this deviation would be late."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
@@ -52,7 +52,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
     """Actual minus commanded body rates [rad/s]; this difference is subtracted from the command."""
     trust_estimate: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
     """Share of the disturbance that turns the frame; with 0, the inner controller flies without compensation."""
-    trust_known: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
+    trust_residual: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
     """Share of the learned residual and of the learned rate bias that is used."""
     actuators: ActuatorState | None = None
     """Present thrust and body rates; None if the last command acts."""
@@ -88,26 +88,32 @@ class GravityFrame(AbstractController[GravityFrameState]):
 
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
-        observed = self.observer.init(x)
-        hover = observed.commands.newest
-        told = Command(hover.c, hover.omega - self._bias(x.p.dtype))
-        rows = jax.tree.map(lambda leaf, new: jnp.broadcast_to(new, leaf.shape), observed.commands, CommandQueue(told))
-        observed = dataclasses.replace(observed, commands=rows)
-        return GravityFrameState(observed, self.inner.init(x), EffectiveGravityFrame.of(observed.d_hat))
+        observer_state = self.observer.init(x)
+        hover = observer_state.commands.newest
+        command = Command(hover.c, hover.omega - self._bias(x.p.dtype))
+        rows = jax.tree.map(
+            lambda leaf, new: jnp.broadcast_to(new, leaf.shape), observer_state.commands, CommandQueue(command)
+        )
+        observer_state = dataclasses.replace(observer_state, commands=rows)
+        return GravityFrameState(observer_state, self.inner.init(x), EffectiveGravityFrame.of(observer_state.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
         """Return the command of the inner controller, in the frame of the present effective gravity."""
-        observer, felt = self.observer, jnp.zeros_like(x.p)
-        if self.known is not None:
-            unsteady = StateDependentResidual(self.known, self.trust_known, self.place)
-            felt = unsteady(x, memory.observer.commands.newest)
+        observer, disturbance = self.observer, jnp.zeros_like(x.p)
+        if self.known_residual is not None:
+            unsteady = StateDependentResidual(self.known_residual, self.trust_residual, self.place)
+            disturbance = unsteady(x, memory.observer.commands.newest)
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
             if self.place is not None:
                 there = x.p + (self.lead + self.age).astype(x.p.dtype) * x.v
-                felt = felt + self.trust_known.astype(x.p.dtype) * (self.place(there) - self.place(x.p))
-        observed = observer(memory.observer, t, x)
-        felt = self.trust_estimate.astype(x.p.dtype) * (observed.d_hat + felt) + self.steady.astype(x.p.dtype)
-        frame = EffectiveGravityFrame.of(capped(felt, observer.limit))
+                disturbance = disturbance + self.trust_residual.astype(x.p.dtype) * (
+                    self.place(there) - self.place(x.p)
+                )
+        observer_state = observer(memory.observer, t, x)
+        disturbance = self.trust_estimate.astype(x.p.dtype) * (observer_state.d_hat + disturbance) + self.steady.astype(
+            x.p.dtype
+        )
+        frame = EffectiveGravityFrame.of(limit_norm(disturbance, observer.limit))
         bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
         acting, flying = Command(last.c, last.omega + bias), self.inner
         if self.actuators is not None:
@@ -116,16 +122,16 @@ class GravityFrame(AbstractController[GravityFrameState]):
         u, inner = flying.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
         u = Command(u.c, u.omega - bias)
-        return u, GravityFrameState(observer.issued(observed, u), inner, frame)
+        return u, GravityFrameState(observer.issued(observer_state, u), inner, frame)
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
         """Remember the accepted command in the observer and, transformed to the frame, in the inner controller."""
         observer = self.observer.accepted(memory.observer, u)
-        meant = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
-        return GravityFrameState(observer, self.inner.accepted(memory.inner, meant), memory.frame)
+        command = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
+        return GravityFrameState(observer, self.inner.accepted(memory.inner, command), memory.frame)
 
     def _bias(self, dtype: Any) -> Float[Array, "3"]:
-        return (self.trust_known * self.rate_bias).astype(dtype)
+        return (self.trust_residual * self.rate_bias).astype(dtype)
 
 
 class PoseFrame(AbstractController[tuple[Any, Command]]):
@@ -155,12 +161,12 @@ class PoseFrame(AbstractController[tuple[Any, Command]]):
         self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
     ) -> tuple[Command, tuple[Any, Command]]:
         """Return the command of the inner controller, in the frame of the effective gravity one tick ago."""
-        (seen, last), estimator = memory, self.inner.observation.state_estimator
+        (pose, last), estimator = memory, self.inner.observation.state_estimator
         assert estimator is not None
-        frame = EffectiveGravityFrame.of(capped(estimator(seen).d, self.limit))
-        u, (seen, _) = self.inner.in_frame(frame)((seen, frame.command(last)), t, frame.state(x))
+        frame = EffectiveGravityFrame.of(limit_norm(estimator(pose).d, self.limit))
+        u, (pose, _) = self.inner.in_frame(frame)((pose, frame.command(last)), t, frame.state(x))
         u = frame.world_command(u)
-        return u, (seen, u)
+        return u, (pose, u)
 
     def accepted(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
         """Remember the accepted command."""
@@ -193,7 +199,7 @@ class NormLimited(eqx.Module):
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the residual acceleration in the world frame [m/s^2]."""
-        return capped(self.residual(x, u), self.limit)
+        return limit_norm(self.residual(x, u), self.limit)
 
 
 def lead_of(path: CommandPath, dt: float) -> Float[Array, ""]:
@@ -207,6 +213,6 @@ def lead_of(path: CommandPath, dt: float) -> Float[Array, ""]:
     return path.delay + lag + 0.5 * dt
 
 
-def capped(d: Float[Array, "3"], limit: Float[Array, ""]) -> Float[Array, "3"]:
+def limit_norm(d: Float[Array, "3"], limit: Float[Array, ""]) -> Float[Array, "3"]:
     """Return ``d`` with its norm limited to ``limit``."""
     return d * jnp.minimum(1.0, limit / jnp.sqrt(jnp.sum(d * d) + 1e-12))

@@ -67,19 +67,21 @@ class IndiController(AbstractController[IncrementalState]):
     def __call__(self, memory: IncrementalState, t: Float[Array, ""], x: State) -> tuple[Command, IncrementalState]:
         """Compute the command for the state in which the command begins to act."""
         dt, last = self.prediction.dt, memory.last
-        acted, _ = self.prediction.acted(memory.underway)
+        mean_command, _ = self.prediction.acted(memory.underway)
         a = (x.v - last.v) / dt if self.a is None else self.a
         # The accelerometer does not have latency, even if the attitude does.
         late = self.prediction.age if self.a is not None else jnp.zeros_like(self.prediction.age)
-        turned = so3.exp(late.astype(a.dtype) * (acted.omega if self.omega is None else self.omega))
-        thrust = self.prediction.thrust(memory.underway, so3.mul(last.R, turned), so3.mul(x.R, turned))
+        attitude_change = so3.exp(late.astype(a.dtype) * (mean_command.omega if self.omega is None else self.omega))
+        thrust = self.prediction.thrust(
+            memory.underway, so3.mul(last.R, attitude_change), so3.mul(x.R, attitude_change)
+        )
         share = jnp.where(follows(t, memory.t, dt), 1.0 - jnp.exp(-dt / self.tau.astype(a.dtype)), 0.0)
         excess = memory.excess + share * (thrust - thrust_of(a) - memory.excess)
         soon, _ = self.prediction(memory.underway, x, -excess, self.omega)
-        wanted = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))
-        acceleration = self.gains.acceleration(soon, wanted, jnp.zeros_like(x.p))
-        asked = command_for(soon, thrust_of(acceleration) + excess, wanted, self.gains.turning())
-        u = asked.within(self.low, self.high)
+        setpoint = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))
+        acceleration = self.gains.acceleration(soon, setpoint, jnp.zeros_like(x.p))
+        target = command_for(soon, thrust_of(acceleration) + excess, setpoint, self.gains.turning())
+        u = target.within(self.low, self.high)
         return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess, t.astype(a.dtype))
 
     def accepted(self, memory: IncrementalState, u: Command) -> IncrementalState:

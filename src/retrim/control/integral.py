@@ -39,8 +39,8 @@ class IntegralAction(AbstractController[IntegralState]):
 
     def __call__(self, memory: IntegralState, t: Float[Array, ""], x: State) -> tuple[Command, IntegralState]:
         """Integrate one tick, and return the command of the controller for the shifted position."""
-        grown = memory.integral + self.task.dt * (x.p - self.task.target(t))
-        integral = jnp.clip(grown, -self.limit, self.limit)
+        new_integral = memory.integral + self.task.dt * (x.p - self.task.target(t))
+        integral = jnp.clip(new_integral, -self.limit, self.limit)
         u, inner = self.inner(memory.inner, t, State(x.p + self.gain * integral, x.R, x.v))
         return u, IntegralState(integral, inner)
 

@@ -20,7 +20,7 @@ from ..estimation.l1 import L1Estimator, L1State
 from ..estimation.prediction import Prediction, Underway
 from ..physics import so3
 from ..physics.actuator_response import FASTEST
-from ..physics.actuators import lagged
+from ..physics.actuators import apply_lag
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.abstract_reference import Point
 from ..tasks.task import AbstractTask
@@ -87,18 +87,18 @@ class MppiController(AbstractController[MppiState]):
         dt = self.prediction.dt
         begin = t.astype(dtype) + self.prediction.path.delay.astype(dtype)
         times = begin + dt * (1 + jnp.arange(self.horizon, dtype=dtype))
-        wanted = jax.vmap(self.task.setpoint)(times)
+        setpoints = jax.vmap(self.task.setpoint)(times)
         low, high = self.low.vector().astype(dtype), self.high.vector().astype(dtype)
-        drawn = random.normal(random.fold_in(self.key, memory.tick), (self.horizon, 4, self.samples), dtype)
-        noise = jnp.tensordot(self._colour(dtype), drawn, 1)
+        samples = random.normal(random.fold_in(self.key, memory.tick), (self.horizon, 4, self.samples), dtype)
+        noise = jnp.tensordot(self._colour(dtype), samples, 1)
         plans = memory.mean[:, :, None] + self.spread.astype(dtype)[None, :, None] * noise
         plans = jnp.clip(plans, low[None, :, None], high[None, :, None])
-        cost = self._costs(plans, soon, acting, wanted, estimate.d_hat)
+        cost = self._costs(plans, soon, acting, setpoints, estimate.d_hat)
         weights = jax.nn.softmax(-(cost - jnp.min(cost)) / self.temperature.astype(dtype))
         mean = plans @ weights
         u = Command.of(mean[0])
-        planned = jnp.concatenate([mean[1:], mean[-1:]])
-        return u, MppiState(self.prediction.issued(underway, u), planned, estimate, x, memory.tick + 1)
+        plan = jnp.concatenate([mean[1:], mean[-1:]])
+        return u, MppiState(self.prediction.issued(underway, u), plan, estimate, x, memory.tick + 1)
 
     def accepted(self, memory: MppiState, u: Command) -> MppiState:
         """Remember the accepted command."""
@@ -107,17 +107,17 @@ class MppiController(AbstractController[MppiState]):
     def _colour(self, dtype: jnp.dtype) -> Float[Array, "horizon horizon"]:
         """Return the matrix that gives independent numbers the correlation exp(-|difference| / time constant)."""
         ticks = jnp.arange(self.horizon, dtype=dtype)
-        kept = jnp.exp(-self.prediction.dt / self.correlation.astype(dtype))
+        decay = jnp.exp(-self.prediction.dt / self.correlation.astype(dtype))
         since = ticks[:, None] - ticks[None, :]
-        first = jnp.where(ticks == 0.0, jnp.ones((), dtype), jnp.sqrt(1.0 - kept**2))
-        return jnp.where(since >= 0.0, kept ** jnp.abs(since) * first[None, :], 0.0)
+        first = jnp.where(ticks == 0.0, jnp.ones((), dtype), jnp.sqrt(1.0 - decay**2))
+        return jnp.where(since >= 0.0, decay ** jnp.abs(since) * first[None, :], 0.0)
 
     def _costs(
         self,
         plans: Float[Array, "horizon 4 samples"],
         x: State,
         acting: Command,
-        wanted: Point,
+        setpoints: Point,
         d: Float[Array, "3"],
     ) -> Float[Array, " samples"]:
         """Return the cost of each plan. Samples are along the last axis, so that every operation has long rows."""
@@ -133,9 +133,9 @@ class MppiController(AbstractController[MppiState]):
 
         def tick(carry: Any, plan: tuple[Array, Point]) -> tuple[Any, None]:
             p, R, v, u, cost = carry
-            commanded, goal = plan
-            mean, u = lagged(u, commanded, dt, tau)
-            before, R = R, _turned(R, dt * mean[1:])
+            commands, goal = plan
+            mean, u = apply_lag(u, commands, dt, tau)
+            before, R = R, _turn(R, dt * mean[1:])
             a = 0.5 * (before[:, 2] + R[:, 2]) * mean[:1] + pull[:, None]
             p, v = p + dt * v + 0.5 * dt**2 * a, v + dt * a
             away = jnp.sqrt(jnp.sum((p - goal.p[:, None]) ** 2, axis=0) + 1e-12)
@@ -148,21 +148,21 @@ class MppiController(AbstractController[MppiState]):
             return (p, R, v, u, cost), None
 
         start = (rows(x.p), rows(x.R), rows(x.v), rows(acting.vector()), jnp.zeros(self.samples, dtype))
-        last, _ = lax.scan(tick, start, (plans, wanted))
+        last, _ = lax.scan(tick, start, (plans, setpoints))
         cost: Array = last[-1]
         return cost
 
 
-def _turned(R: Float[Array, "3 3 n"], w: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
+def _turn(R: Float[Array, "3 3 n"], w: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
     """Return attitudes turned by rotation vectors [rad] in the body frame, all at once (Rodrigues' formula)."""
-    squared = jnp.sum(w * w, axis=0) + 1e-12
-    angle = jnp.sqrt(squared)
-    once = _hatted(R, w)
-    s, c = jnp.sin(angle) / angle, (1.0 - jnp.cos(angle)) / squared
-    return R + s[None, None] * once + c[None, None] * _hatted(once, w)
+    square = jnp.sum(w * w, axis=0) + 1e-12
+    angle = jnp.sqrt(square)
+    once = _times_hat(R, w)
+    s, c = jnp.sin(angle) / angle, (1.0 - jnp.cos(angle)) / square
+    return R + s[None, None] * once + c[None, None] * _times_hat(once, w)
 
 
-def _hatted(R: Float[Array, "3 3 n"], w: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
+def _times_hat(R: Float[Array, "3 3 n"], w: Float[Array, "3 n"]) -> Float[Array, "3 3 n"]:
     """Return R [w]x, column by column."""
     (x, y, z), (i, j, k) = w[:, None], jnp.moveaxis(R, 1, 0)
     return jnp.stack([j * z - k * y, k * x - i * z, i * y - j * x], axis=1)

@@ -18,15 +18,15 @@ from ..tasks.observation import AbstractObservation
 from .controller import AbstractController
 
 
-class SeenPoseState(eqx.Module):
+class PoseFilteredState(eqx.Module):
     """Memory of the observation and of the inner controller."""
 
-    seen: Any
+    observation: Any
     inner: Any
     last: Command
 
 
-class PoseFilteredController(AbstractController[SeenPoseState]):
+class PoseFilteredController(AbstractController[PoseFilteredState]):
     """A controller that receives position, attitude and velocity from the state estimator of an observation."""
 
     observation: AbstractObservation[Any]
@@ -53,27 +53,29 @@ class PoseFilteredController(AbstractController[SeenPoseState]):
         """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 
-    def init(self, x: State) -> SeenPoseState:
+    def init(self, x: State) -> PoseFilteredState:
         """Return the memory at the start of a flight; the filter starts near the state, not exactly at it."""
-        seen = self.observation.init(x)
-        return SeenPoseState(seen, self.inner.init(self._estimate(seen)), Command.hover(x.p.dtype))
+        memory_of_poses = self.observation.init(x)
+        return PoseFilteredState(
+            memory_of_poses, self.inner.init(self._estimate(memory_of_poses)), Command.hover(x.p.dtype)
+        )
 
-    def __call__(self, memory: SeenPoseState, t: Float[Array, ""], x: State) -> tuple[Command, SeenPoseState]:
+    def __call__(self, memory: PoseFilteredState, t: Float[Array, ""], x: State) -> tuple[Command, PoseFilteredState]:
         """Return the command for the estimated pose; the state only defines the poses of camera and inertial unit."""
-        _, seen = self.observation(memory.seen, t, x, memory.last)
-        here, controller = self._estimate(seen), self.inner
+        _, memory_of_poses = self.observation(memory.observation, t, x, memory.last)
+        here, controller = self._estimate(memory_of_poses), self.inner
         if self.omega is not None and self.a is not None:
             gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
-            felt = so3.act(x.R.T, self.a - gravity)  # as an accelerometer measures it, in the body frame
-            controller = controller.with_inertial(self.omega, so3.act(here.R, felt) + gravity)
+            specific_force = so3.act(x.R.T, self.a - gravity)  # as an accelerometer measures it, in the body frame
+            controller = controller.with_inertial(self.omega, so3.act(here.R, specific_force) + gravity)
         u, inner = controller(memory.inner, t, here)
-        return u, SeenPoseState(seen, inner, u)
+        return u, PoseFilteredState(memory_of_poses, inner, u)
 
-    def accepted(self, memory: SeenPoseState, u: Command) -> SeenPoseState:
+    def accepted(self, memory: PoseFilteredState, u: Command) -> PoseFilteredState:
         """Remember the accepted command, here and in the inner controller."""
-        return SeenPoseState(memory.seen, self.inner.accepted(memory.inner, u), u)
+        return PoseFilteredState(memory.observation, self.inner.accepted(memory.inner, u), u)
 
-    def _estimate(self, seen: Any) -> State:
+    def _estimate(self, memory_of_poses: Any) -> State:
         estimator = self.observation.state_estimator
         assert estimator is not None
-        return estimator(seen).x
+        return estimator(memory_of_poses).x

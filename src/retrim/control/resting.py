@@ -29,8 +29,8 @@ class RestingController(PolicyController):
         heading = jnp.arctan2(x.R[1, 0], x.R[0, 0])
         home = self.home.astype(x.p.dtype)
         o = self.observation.at_rest(State(home, so3.rotz(heading), jnp.zeros_like(home)))
-        shifted = PolicyController(self.observation, self.policy.shifted(-self.policy.output(o)))
-        return shifted(memory, t, x)
+        inner = PolicyController(self.observation, self.policy.shifted(-self.policy.output(o)))
+        return inner(memory, t, x)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "RestingController":
         """Return the same policy with observation and home in ``frame``."""

@@ -37,13 +37,13 @@ class Swings(eqx.Module):
         """
         direction = jnp.sign(self.extreme - self.start)
         back = (self.extreme - d) * direction
-        turned = (back > SWING) | (direction == 0.0)
-        start = jnp.where(turned, self.extreme, self.start)
-        extreme = jnp.where(turned | (back < 0.0), d, self.extreme)
+        reverses = (back > SWING) | (direction == 0.0)
+        start = jnp.where(reverses, self.extreme, self.start)
+        extreme = jnp.where(reverses | (back < 0.0), d, self.extreme)
         # A swing is counted while it grows, so that a large one counts at once.
-        gained = _squares(extreme - start) - jnp.where(turned, 0.0, _squares(self.extreme - self.start))
-        forgotten = jnp.exp(-dt / MEMORY).astype(d.dtype)
-        return Swings(start, extreme, forgotten * self.size + jnp.sum(gained))
+        energy_gain = _squares(extreme - start) - jnp.where(reverses, 0.0, _squares(self.extreme - self.start))
+        decay = jnp.exp(-dt / MEMORY).astype(d.dtype)
+        return Swings(start, extreme, decay * self.size + jnp.sum(energy_gain))
 
 
 def _squares(swing: Float[Array, "3"]) -> Float[Array, "3"]:

@@ -70,16 +70,16 @@ class BodyRates(eqx.Module):
         """
         if omega is None:
             late = jnp.clip(age / dt, 0.0, 1.0).astype(x.p.dtype)
-            predicted = (1.0 - late) * self.mean + late * self.earlier
-            error = SHARE * (so3.log(so3.mul(self.R.T, x.R)) / dt - predicted)
+            prior = (1.0 - late) * self.mean + late * self.earlier
+            error = SHARE * (so3.log(so3.mul(self.R.T, x.R)) / dt - prior)
         else:
             error = omega.astype(x.p.dtype) - self.omega
         error = jnp.where(jnp.all(jnp.isfinite(error)), error, 0.0)
         acting = self.path.actuators
         # A rate that exceeds the prediction at the end of a tick has also changed faster during the tick.
         slope = acting.slope + SHARE * (path.response.rate_lag / dt) * error
-        corrected = ActuatorState(Command(acting.command.c, acting.command.omega + error), slope)
-        return dataclasses.replace(self, R=x.R, path=dataclasses.replace(self.path, actuators=corrected))
+        corrected_state = ActuatorState(Command(acting.command.c, acting.command.omega + error), slope)
+        return dataclasses.replace(self, R=x.R, path=dataclasses.replace(self.path, actuators=corrected_state))
 
     def issued(self, u: Command, path: CommandPath, dt: float) -> "BodyRates":
         """Return the prediction for the end of the tick that begins with the command ``u``.

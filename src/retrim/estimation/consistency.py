@@ -112,13 +112,13 @@ def contradictions(before: State, after: State, dt: float, noise: Float[Array, "
     """
     same = [jnp.all(a == b) for a, b in ((before.p, after.p), (before.R, after.R), (before.v, after.v))]
     slack = SPEED * dt + SPREADS * jnp.minimum(noise, NOISE_LIMIT)
-    missed, a = gap(before, after, dt), (after.v - before.v) / dt
+    gap_size, a = gap(before, after, dt), (after.v - before.v) / dt
     skew = jnp.max(jnp.abs(so3.mul(after.R.T, after.R) - jnp.eye(3, dtype=after.R.dtype)))
     rate = so3.log(so3.mul(before.R.T, after.R)) / dt
     finite = jnp.isfinite(jnp.sum(after.p) + jnp.sum(after.R) + jnp.sum(after.v))
     return Findings(
         repeated=same[0] & same[1] & same[2] & (jnp.sum(before.v * before.v) > REST**2),
-        velocity=jnp.sum(missed * missed) > slack * slack,
+        velocity=jnp.sum(gap_size * gap_size) > slack * slack,
         acceleration=jnp.sum(a * a) > ACCELERATION**2,
         attitude=(skew > SKEW) | (jnp.sum(rate * rate) > RATE**2),
         not_finite=~finite,
@@ -167,10 +167,10 @@ class Consistency(eqx.Module):
         moving = jax.tree.map(lambda old, new: old + dt / SCALE_TAU * (new - old), self.scale, Scale.of(missing, v, dt))
         scale = where(successive & possible & self.possible, moving, self.scale)
         shows, wrong = scale.verdict(dt, self.noise)
-        scaled = jnp.where(shows, wrong, self.scaled)
-        certain = possible & self.possible & ~scaled
+        scaling = jnp.where(shows, wrong, self.scaled)
+        certain = possible & self.possible & ~scaling
         doubt = self.doubt + dt / DOUBT_TAU * (jnp.where(certain, 0.0, 1.0) - self.doubt)
         new = jnp.minimum(gap_noise(self.gap, missing), NOISE_LIMIT)
         noise = self.noise + (1.0 - jnp.exp(-dt / NOISE_TAU)) * (new - self.noise)
         noise = jnp.where(successive & possible & self.possible, noise, self.noise)
-        return Consistency(missing, noise, scale, scaled, successive & result.repeated, possible, certain, doubt)
+        return Consistency(missing, noise, scale, scaling, successive & result.repeated, possible, certain, doubt)

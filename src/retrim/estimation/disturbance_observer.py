@@ -30,7 +30,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics import so3
-from ..physics.actuators import is_followed
+from ..physics.actuators import is_unsaturated
 from ..physics.command_path import LONGEST_DELAY, CommandPath, CommandQueue
 from ..physics.dynamics import AbstractDynamics
 from ..physics.state import Command, State, where
@@ -57,7 +57,7 @@ class ObserverState(eqx.Module):
     """Estimated velocity, world [m/s]."""
     d_hat: Float[Array, "3"]
     """Estimated disturbance acceleration, world [m/s^2]."""
-    missed: Float[Array, "3"]
+    innovation: Float[Array, "3"]
     """Acceleration that the model missed in the last tick, from the measured velocities alone, world [m/s^2]."""
     noise: Float[Array, ""]
     """Estimated standard deviation of a measured velocity per axis [m/s]."""
@@ -110,13 +110,13 @@ class DisturbanceObserver(eqx.Module):
         mean, thrust = self.path.thrust(s.commands, s.thrust, dt)
         # Use the measured rotation of the vehicle instead of the commanded rates.
         u = Command(mean, so3.log(so3.mul(s.last.R.T, x.R)) / dt)
-        gained = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
-        missed = (x.v - s.last.v - gained) / dt
-        noise = self._noise(s, missed)
+        speed_change = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
+        mismatch = (x.v - s.last.v - speed_change) / dt
+        noise = self._noise(s, mismatch)
         z = jnp.exp(-jnp.sqrt(self.wander * dt**1.5 / (noise + 1e-9)))
         w = jnp.maximum(jnp.exp(-dt / self.tau), z)
-        predicted = s.v + gained + dt * s.d_hat
-        innovation = x.v - predicted
+        prior = s.v + speed_change + dt * s.d_hat
+        innovation = x.v - prior
         size = jnp.sqrt(jnp.sum(innovation * innovation) + 1e-20)
         innovation = innovation * jnp.minimum(1.0, (CORRECTION + SPREADS * noise) / size)
         d_hat = s.d_hat + (1.0 - z) * (1.0 - w) * innovation / dt
@@ -126,21 +126,21 @@ class DisturbanceObserver(eqx.Module):
         comparable = follows(t, s.t, dt)
         consistency = s.consistency.after(s.last, x, dt, comparable)
         after = ObserverState(
-            x, t, s.commands, predicted + (1.0 - z * w) * innovation, d_hat, missed, noise, thrust, consistency
+            x, t, s.commands, prior + (1.0 - z * w) * innovation, d_hat, mismatch, noise, thrust, consistency
         )
-        doubted = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
-        decay = jnp.where(consistency.certain, 1.0, doubted).astype(x.p.dtype)
+        confidence = jnp.exp(-dt / DECAY_TAU * consistency.doubt**2)
+        decay = jnp.where(consistency.certain, 1.0, confidence).astype(x.p.dtype)
         # The model bridges a few dropped frames, since the measured velocity has the full noise. After other
         # contradictions, it does not: measurements may be later than declared, so the prediction would be for a
         # different time.
-        dropped = consistency.repeated | s.consistency.repeated
-        coasts = comparable & dropped & (consistency.doubt < COAST)
-        v = jnp.where(coasts, predicted, x.v)
-        held = dataclasses.replace(after, v=v, d_hat=decay * s.d_hat, missed=s.missed, noise=s.noise)
+        skips = consistency.repeated | s.consistency.repeated
+        coasts = comparable & skips & (consistency.doubt < COAST)
+        v = jnp.where(coasts, prior, x.v)
+        result = dataclasses.replace(after, v=v, d_hat=decay * s.d_hat, innovation=s.innovation, noise=s.noise)
         comparable &= consistency.certain
         if self.limits is not None:
-            comparable &= is_followed(self.arrival(s), self.limits)
-        return where(comparable, after, held)
+            comparable &= is_unsaturated(self.arrival(s), self.limits)
+        return where(comparable, after, result)
 
     def issued(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""
@@ -150,7 +150,7 @@ class DisturbanceObserver(eqx.Module):
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
         return dataclasses.replace(s, commands=s.commands.amend(u))
 
-    def _noise(self, s: ObserverState, missed: Float[Array, "3"]) -> Float[Array, ""]:
+    def _noise(self, s: ObserverState, mismatch: Float[Array, "3"]) -> Float[Array, ""]:
         """Return the noise of the velocities, estimated from the jumps of the missed acceleration between ticks."""
-        seen = jnp.mean(jnp.abs(missed - s.missed)) * self.nominal.dt / SECOND_DIFFERENCE
-        return s.noise + (1.0 - jnp.exp(-self.nominal.dt / NOISE_TAU)) * (seen - s.noise)
+        spread = jnp.mean(jnp.abs(mismatch - s.innovation)) * self.nominal.dt / SECOND_DIFFERENCE
+        return s.noise + (1.0 - jnp.exp(-self.nominal.dt / NOISE_TAU)) * (spread - s.noise)

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
-from ..physics.actuators import lagged
+from ..physics.actuators import apply_lag
 from ..physics.dynamics import PointMass
 from ..physics.state import Command, State
 from .camera import Camera, in_camera
@@ -42,10 +42,10 @@ class PoseFilter(eqx.Module):
         off = std * jax.random.normal(key, (9,), x.p.dtype)
         push = jnp.full(3, PUSH, dtype=x.p.dtype)
         return cls(
-            _moved(x, off), jnp.zeros_like(x.p), jnp.diag(jnp.concatenate([std, push]) ** 2), Command.hover(x.p.dtype)
+            _perturb(x, off), jnp.zeros_like(x.p), jnp.diag(jnp.concatenate([std, push]) ** 2), Command.hover(x.p.dtype)
         )
 
-    def predicted(self, u: Command, dt: float, tau: Float[Array, ""] | Command | None = None) -> "PoseFilter":
+    def predict(self, u: Command, dt: float, tau: Float[Array, ""] | Command | None = None) -> "PoseFilter":
         """Return the filter ``dt`` seconds later.
 
         Args:
@@ -54,7 +54,7 @@ class PoseFilter(eqx.Module):
             tau: Time constants of the actuators [s]; None for actuators without lag.
         """
         x, dtype = self.x, self.P.dtype
-        u, end = (u, u) if tau is None else lagged(self.acting, u, dt, tau)
+        u, end = (u, u) if tau is None else apply_lag(self.acting, u, dt, tau)
         zero, eye = jnp.zeros((3, 3), dtype=dtype), jnp.eye(3, dtype=dtype)
         lean = -dt * u.c * x.R @ so3.hat(jnp.array([0.0, 0.0, 1.0], dtype=dtype))
         F = jnp.block(
@@ -70,7 +70,7 @@ class PoseFilter(eqx.Module):
         Q = jnp.diag(jnp.concatenate([drift, walk]) ** 2)
         return PoseFilter(PointMass(dt).step(x, u, self.d), self.d, F @ self.P @ F.T + Q, end)
 
-    def corrected(
+    def correct(
         self,
         camera: Camera,
         ground: Float[Array, "7 3"],
@@ -89,31 +89,31 @@ class PoseFilter(eqx.Module):
         """
 
         def expected(off: Float[Array, "12"]) -> Float[Array, "14"]:
-            here = in_camera(_moved(self.x, off), ground)
+            here = in_camera(_perturb(self.x, off), ground)
             return jax.vmap(lambda P: camera.project(P).pixel)(here).reshape(14)
 
-        seen = jnp.repeat(visible, 2).astype(pixels.dtype)
+        is_visible = jnp.repeat(visible, 2).astype(pixels.dtype)
         r = jnp.tile(noise**2, 7)
         here = (jnp.zeros(12, dtype=self.P.dtype), self.P)
 
         def scalar(carry: tuple[Array, Array], row: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
             """Correct with one coordinate of a pixel, which does not need a matrix inverse."""
-            (off, P), (h, level, r, seen) = carry, row
+            (off, P), (h, level, r, is_visible) = carry, row
             Ph = P @ h
             s = h @ Ph + r
             limit = GATE * jnp.sqrt(s)
-            gain = seen * Ph / s
+            gain = is_visible * Ph / s
             return (off + gain * jnp.clip(level - h @ off, -limit, limit), P - jnp.outer(gain, Ph)), None
 
         def look(_: Array, before: tuple[Array, Array]) -> tuple[Array, Array]:
             off, _ = before
             H = jax.jacfwd(expected)(off)
             level = pixels.reshape(14) - expected(off) + H @ off
-            return lax.scan(scalar, here, (H, level, r, seen))[0]
+            return lax.scan(scalar, here, (H, level, r, is_visible))[0]
 
         off, P = lax.fori_loop(0, ITERATIONS, look, here)
-        return PoseFilter(_moved(self.x, off), self.d + off[9:], 0.5 * (P + P.T), self.acting)
+        return PoseFilter(_perturb(self.x, off), self.d + off[9:], 0.5 * (P + P.T), self.acting)
 
 
-def _moved(x: State, off: Float[Array, " n"]) -> State:
+def _perturb(x: State, off: Float[Array, " n"]) -> State:
     return State(x.p + off[:3], x.R @ so3.exp(off[3:6]), x.v + off[6:9])

@@ -89,7 +89,7 @@ class Cluster(Executor):
                 if done.status == "error":
                     outer.set_exception(done.exception())
                     return
-                lost: object = done.status
+                status: object = done.status
                 if done.status == "finished":
                     try:
                         outer.set_result(done.result())
@@ -97,13 +97,13 @@ class Cluster(Executor):
                     except InvalidStateError:
                         raise
                     except Exception as error:  # the result was lost on its way from the worker, or is unreadable here
-                        lost = _line(error)
+                        status = _line(error)
                     finally:
                         done.release()  # otherwise the worker would keep the result as well
                 if attempts > 1 and not outer.done():
                     self._start(outer, submit, attempts - 1)
                 else:
-                    outer.set_exception(JobError(f"a job was lost {ATTEMPTS} times ({lost})"))
+                    outer.set_exception(JobError(f"a job was lost {ATTEMPTS} times ({status})"))
 
         outer.add_done_callback(lambda future: inner.cancel() if future.cancelled() else None)
         inner.add_done_callback(over)
@@ -121,7 +121,7 @@ class Cluster(Executor):
 
 
 @contextmanager
-def joined(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
+def join_cluster(address: str | None, reporter: Reporter) -> Iterator[Cluster | None]:
     """Yield the cluster at an address, and report its workers and dashboard; without an address, yield None."""
     if address is None:
         yield None

@@ -23,16 +23,16 @@ RUNS = 9  # runs of each timed program
 DECISIONS = 200
 
 
-def timed(work: Callable[[], Any], runs: int) -> tuple[float, float]:
+def time_runs(work: Callable[[], Any], runs: int) -> tuple[float, float]:
     """Return the compile time and the median run time [s]."""
     watch = Stopwatch()
     jax.block_until_ready(work())
-    times, compiled = list[float](), watch.compile_s
+    times, program = list[float](), watch.compile_s
     for _ in range(runs):
         began = time.perf_counter()
         jax.block_until_ready(work())
         times.append(time.perf_counter() - began)
-    return compiled, float(np.median(times))
+    return program, float(np.median(times))
 
 
 def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
@@ -47,10 +47,12 @@ def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
         policy = setup.low_rank(policy, random.key(2))
     learner, window = setup.learner, full_window(setup)
     state = learner.init(policy, random.key(1))
-    fit_compile, fit_s = timed(lambda: OnlineLearner.fit_residual(learner, state.residual, window), RUNS)
-    fitted, _ = learner.fit_residual(state.residual, window)
+    fit_compile, fit_s = time_runs(lambda: OnlineLearner.fit_residual(learner, state.residual, window), RUNS)
+    residual, _ = learner.fit_residual(state.residual, window)
     key = random.key(0)
-    compile_s, run_s = timed(lambda: OnlineLearner.update_policy(learner, state.policy, fitted, window, key), RUNS)
+    compile_s, run_s = time_runs(
+        lambda: OnlineLearner.update_policy(learner, state.policy, residual, window, key), RUNS
+    )
     a = setup.preset.adapt
     return {
         "fit_s": fit_s,
@@ -67,7 +69,7 @@ def decision_s(setup: Setup, controller: AbstractController[Any]) -> float:
     decide = eqx.filter_jit(lambda controller, memory, t, x: controller(memory, t, x))
     memory, t = controller.init(x), jnp.zeros_like(x.p[0])
     _, memory = jax.block_until_ready(decide(controller, memory, t, x))
-    return timed(lambda: decide(controller, memory, t, x), DECISIONS)[1]
+    return time_runs(lambda: decide(controller, memory, t, x), DECISIONS)[1]
 
 
 def full_window(setup: Setup) -> Window:

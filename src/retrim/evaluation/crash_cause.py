@@ -52,9 +52,9 @@ def _motion(log: Log, lateness: float) -> Iterator[str]:
     if len(log.t) < TICKS:
         return
     p, R, v = log.measured
-    moved, told = np.diff(p, axis=0) / log.dt, 0.5 * (v[1:] + v[:-1])
-    share = np.sum(moved * told) / max(np.sum(moved**2), 1e-9)
-    if np.sqrt(np.mean(moved**2)) > 0.1 and not 0.7 < share < 1.4:
+    steps, velocities = np.diff(p, axis=0) / log.dt, 0.5 * (v[1:] + v[:-1])
+    share = np.sum(steps * velocities) / max(np.sum(steps**2), 1e-9)
+    if np.sqrt(np.mean(steps**2)) > 0.1 and not 0.7 < share < 1.4:
         yield f"the velocity is {share:.2f} times the derivative of the position"
     a = np.diff(v, axis=0) / log.dt
     up, c = R[1:, :, 2], log.u[1:, 0]
@@ -66,8 +66,8 @@ def _motion(log: Log, lateness: float) -> Iterator[str]:
             f"world must have z upwards, the body forward, left and up"
         )
         return
-    felt = np.sum((a + np.array([0.0, 0.0, STANDARD_GRAVITY])) * up, axis=1)
-    gain = np.median(felt) / max(np.median(c), 1e-9)
+    lift = np.sum((a + np.array([0.0, 0.0, STANDARD_GRAVITY])) * up, axis=1)
+    gain = np.median(lift) / max(np.median(c), 1e-9)
     if not 0.7 < gain < 1.4:
         yield f"the thrust is {gain:.2f} times what is commanded: look at mass, thrust_max and the thrust map"
 
@@ -76,14 +76,14 @@ def _rates(log: Log, lateness: float) -> Iterator[str]:
     """Compare roll and pitch rates with their commands, behind delays and lags."""
     if len(log.t) < TICKS:
         return
-    measured, commanded = body_rates(log.measured.R, log.dt)[:, :2], log.u[1:, 1:3]
-    size, wanted = (float(np.sqrt(np.mean(part**2))) for part in (measured, commanded))
-    if wanted < 0.05:
+    rates, rate_commands = body_rates(log.measured.R, log.dt)[:, :2], log.u[1:, 1:3]
+    size, command_size = (float(np.sqrt(np.mean(part**2))) for part in (rates, rate_commands))
+    if command_size < 0.05:
         return
-    fits = {(delay, lag): _fit(measured, commanded, delay, lag, log.dt) for delay in DELAYS for lag in LAGS}
+    fits = {(delay, lag): _fit(rates, rate_commands, delay, lag, log.dt) for delay in DELAYS for lag in LAGS}
     (delay, lag), (gain, match) = max(fits.items(), key=lambda fit: abs(fit[1][1]))
     late = delay * log.dt + lag
-    numbers = f"{size:.1f} rad/s (rms) where {wanted:.1f} rad/s were commanded, {late:.2f} s later"
+    numbers = f"{size:.1f} rad/s (rms) where {command_size:.1f} rad/s were commanded, {late:.2f} s later"
     if match < -0.5:
         yield f"the vehicle turns against its command ({numbers}): look at the signs of roll and pitch"
     elif abs(match) < 0.3:
@@ -114,12 +114,12 @@ def body_rates(R: np.ndarray, dt: float) -> np.ndarray:
     return np.asarray(axis * (np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0) / dt)[:, None])
 
 
-def _fit(measured: np.ndarray, commanded: np.ndarray, delay: int, lag: float, dt: float) -> tuple[float, float]:
+def _fit(rates: np.ndarray, rate_commands: np.ndarray, delay: int, lag: float, dt: float) -> tuple[float, float]:
     """Return the gain and the correlation between measured rates and delayed, lagged commands."""
-    late = np.concatenate([np.zeros((delay, 2)), commanded[: len(commanded) - delay]])
+    late = np.concatenate([np.zeros((delay, 2)), rate_commands[: len(rate_commands) - delay]])
     share, acting, result = np.exp(-dt / lag) if lag else 0.0, np.zeros(2), np.empty_like(late)
     for k, each in enumerate(late):
         acting = each + share * (acting - each)
         result[k] = acting
-    power, both = np.sum(result**2), np.sum(result * measured)
-    return float(both / max(power, 1e-9)), float(both / max(np.sqrt(power * np.sum(measured**2)), 1e-9))
+    power, both = np.sum(result**2), np.sum(result * rates)
+    return float(both / max(power, 1e-9)), float(both / max(np.sqrt(power * np.sum(rates**2)), 1e-9))

@@ -41,7 +41,7 @@ def report_progress(advance: Callable[[float, str], None]) -> Progress:
 class Flights:
     """The completed flights of a fleet."""
 
-    flown: list[Flight]
+    flights: list[Flight]
     interrupted: bool
     """Whether flights are missing because the fleet was stopped or a job failed."""
     failed: dict[FlightSpec, str] = field(default_factory=dict)
@@ -49,12 +49,12 @@ class Flights:
 
     def rows(self) -> Rows:
         """Return one row of results per scenario and method."""
-        return rows(self.flown)
+        return rows(self.flights)
 
     def __repr__(self) -> str:
         """Return the number of flights, and the errors of the first few scenarios and methods."""
-        crashes = sum(flight.log.terminated for flight in self.flown)
-        lines = [f"Flights: {len(self.flown)} flown, {crashes} crashed, {len(self.failed)} failed"]
+        crashes = sum(flight.log.terminated for flight in self.flights)
+        lines = [f"Flights: {len(self.flights)} flown, {crashes} crashed, {len(self.failed)} failed"]
         lines[0] += ", interrupted" if self.interrupted else ""
         groups = self._groups()
         for label, flights in list(groups.items())[:MOST_ROWS]:
@@ -80,19 +80,19 @@ class Flights:
 
     def _groups(self) -> dict[str, list[Flight]]:
         """Return the flights by scenario and method; the labels state the conditions in which the flights differ."""
-        scenarios = {flight.spec.scenario for flight in self.flown}
+        scenarios = {flight.spec.scenario for flight in self.flights}
         varied = [name for name in SCENARIO if len({getattr(scenario, name) for scenario in scenarios}) > 1]
         groups: dict[str, list[Flight]] = {}
-        for flight in self.flown:
+        for flight in self.flights:
             spec = flight.spec
             conditions = [str(getattr(spec.scenario, name)) for name in ("disturbance", *varied)]
             groups.setdefault(", ".join([*conditions, spec.method]), []).append(flight)
         return groups
 
 
-def gathered(
+def gather_flights(
     specs: Sequence[FlightSpec],
-    lots: Sequence[FlightBatch],
+    batches: Sequence[FlightBatch],
     submit: Submit,
     *,
     progress: Progress | None,
@@ -105,7 +105,7 @@ def gathered(
 
     Args:
         specs: The flights, in the order in which they are returned.
-        lots: The same flights, in batches.
+        batches: The same flights, in batches.
         submit: Starts one batch.
         progress: Called in this thread when flights are completed, and periodically while they run.
         on_result: Receives completed flights, in this thread.
@@ -118,17 +118,17 @@ def gathered(
         JobError: The executor can no longer be reached.
     """
     futures: list[Future[list[Flight]]] = []
-    aloft, flown = dict[int, float](), dict[FlightSpec, Flight | None]()
-    failed = dict[FlightSpec, str]()
+    aloft, result = dict[int, float](), dict[FlightSpec, Flight | None]()
+    failures = dict[FlightSpec, str]()
     try:
-        for i, lot in enumerate(lots):
-            futures.append(submit(lot, partial(aloft.__setitem__, i)))
+        for i, batch in enumerate(batches):
+            futures.append(submit(batch, partial(aloft.__setitem__, i)))
         waiting = {future: i for i, future in enumerate(futures)}
 
-        def told() -> None:
-            in_air = sum(len(lots[i].specs) * aloft.get(i, 0.0) for i in waiting.values())
+        def report() -> None:
+            in_air = sum(len(batches[i].specs) * aloft.get(i, 0.0) for i in waiting.values())
             if progress is not None:
-                progress(len(flown) + len(failed) + in_air, len(specs))
+                progress(len(result) + len(failures) + in_air, len(specs))
 
         while waiting:
             over = wait(waiting, OFTEN, FIRST_COMPLETED).done
@@ -137,19 +137,19 @@ def gathered(
                 if error is not None and (not outlive or isinstance(error, ConfigError | JobError | FlightStopped)):
                     raise error
                 if error is not None:
-                    failed |= dict.fromkeys(lots[waiting[future]].specs, _told(error))
+                    failures |= dict.fromkeys(batches[waiting[future]].specs, _describe_error(error))
                 else:
                     flights = future.result()
-                    flown |= {flight.spec: None if forget else flight for flight in flights}
+                    result |= {flight.spec: None if forget else flight for flight in flights}
                     if on_result is not None:
                         with interrupts_only_set(stop):
                             on_result(flights)
                     if forget:
                         futures[waiting[future]] = GONE
                 del waiting[future]
-                told()
+                report()
             if not over and aloft:
-                told()
+                report()
     except (KeyboardInterrupt, FlightStopped):
         stop.set()
     except BaseException:
@@ -160,15 +160,15 @@ def gathered(
             for future in futures:
                 future.cancel()
             late = [future for future in futures if stop.is_set() and not future.cancelled()]
-            kept = [flight for each in late if each.exception() is None for flight in each.result()]
-            new = [flight for flight in kept if flight.spec not in flown]
-            flown |= {flight.spec: None if forget else flight for flight in new}
+            complete = [flight for each in late if each.exception() is None for flight in each.result()]
+            new = [flight for flight in complete if flight.spec not in result]
+            result |= {flight.spec: None if forget else flight for flight in new}
             if on_result is not None and new:
                 on_result(new)
-    kept_flights = [flight for spec in specs if (flight := flown.get(spec)) is not None]
-    return Flights(kept_flights, len(flown) < len(specs), failed)
+    result_flights = [flight for spec in specs if (flight := result.get(spec)) is not None]
+    return Flights(result_flights, len(result) < len(specs), failures)
 
 
-def _told(error: BaseException) -> str:
+def _describe_error(error: BaseException) -> str:
     """Return an error as one line of text."""
     return " ".join(f"{type(error).__name__}: {error}".split())

@@ -23,7 +23,7 @@ from ..runkit.recovery import FEW, timeline
 from ..tasks.observation import AbstractObservation
 from ..tasks.reference import Reference
 from ..tasks.track import AbstractTrack
-from ..tasks.transition import Spliced
+from ..tasks.transition import SplicedReference
 from ..viz import plots
 
 BY_HAND = ("asked", "knobs", "reference")
@@ -54,34 +54,34 @@ def picture(
     Returns:
         Paths of the PNG and the SVG; an empty list if no flight belongs to this scenario.
     """
-    shown = [f for f in flights if f.spec.scenario == scenario]
-    if not shown:
+    shown_flights = [f for f in flights if f.spec.scenario == scenario]
+    if not shown_flights:
         return []
-    methods = list(dict.fromkeys(f.spec.method for f in shown))
-    by = {method: [f for f in shown if f.spec.method == method] for method in methods}
+    methods = list(dict.fromkeys(f.spec.method for f in shown_flights))
+    by = {method: [f for f in shown_flights if f.spec.method == method] for method in methods}
     names = {method: labels.get(method, find_method(method).label.strip("*")) for method in methods}
     colours = _colours(methods)
     groups = [plots.Group(names[method], [_track(f) for f in by[method]], colours[method]) for method in methods]
     seconds = max(float(track.t[-1]) for group in groups for track in group.tracks)
     task, preset = setup.flight_task, setup.preset
-    where = f"{shown[0].vehicle} on plant {scenario.plant!r}"
+    where = f"{shown_flights[0].vehicle} on plant {scenario.plant!r}"
     kind = preset.task if ":" in preset.task else preset.task.capitalize()
     title = title or f"{kind}: {where}, disturbance {scenario.disturbance!r}, preset {preset.name!r}"
 
     firsts = [_image_track(setup.env.task.observation, by[method][0].log.true.as_state()) for method in methods]
     at_home = _image_track(setup.env.task.observation, jax.tree.map(lambda leaf: leaf[None], State.at(task.home())))
     if at_home is not None:
-        seen = [
+        visible_flights = [
             plots.Group(names[method], [track], colours[method])
             for method, track in zip(methods, firsts, strict=True)
             if track is not None
         ]
-        beside = partial(plots.camera, groups=seen, wanted=at_home.pixel[0])
+        beside = partial(plots.camera, groups=visible_flights, goal=at_home.pixel[0])
     elif isinstance(task, AbstractTrack) and isinstance(task.reference, Reference):
         beside = partial(plots.laps, groups=groups, lap=np.asarray(task.reference.rows)[:, :3])
-    elif isinstance(task, AbstractTrack) and isinstance(task.reference, Spliced):
-        last = shown[0].log.t >= shown[0].log.t[-1] - plots.LAPS_S
-        beside = partial(plots.laps, groups=groups, lap=np.asarray(shown[0].target)[last])
+    elif isinstance(task, AbstractTrack) and isinstance(task.reference, SplicedReference):
+        last = shown_flights[0].log.t >= shown_flights[0].log.t[-1] - plots.LAPS_S
+        beside = partial(plots.laps, groups=groups, lap=np.asarray(shown_flights[0].target)[last])
     else:
         x, y, z = (float(value) for value in task.home())
         beside = partial(plots.paths, groups=groups, goal=(x, y, z))
@@ -95,13 +95,13 @@ def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
     times, result, changes = timeline(name, home, seconds)
     if len(changes) > FEW:
         return [plots.Span(0.0, seconds, name, strong=False)]
-    marked = []
+    marks = []
     for first, after in itertools.pairwise([0, *changes, len(times)]):
         end = float(times[after]) if after < len(times) else seconds
         here: ExternalEffects = jax.tree.map(lambda leaf, i=first: np.asarray(leaf)[i], result)
         if label := describe_effects(here):
-            marked.append(plots.Span(float(times[first]), end, label, strong=bool(here.push[0] < 0)))
-    return marked
+            marks.append(plots.Span(float(times[first]), end, label, strong=bool(here.push[0] < 0)))
+    return marks
 
 
 def _colours(methods: Sequence[str]) -> dict[str, int]:

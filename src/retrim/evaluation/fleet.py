@@ -21,7 +21,7 @@ from ..runkit.compile_cache import release_programs
 from ..runkit.flights import Flight, FlightSpec
 from ..runkit.flying import fly_batch, fly_one, plant_of, program_of
 from .batches import FlightBatch, in_batches, lanes
-from .executor import Flights, Progress, Submit, gathered, report_progress
+from .executor import Flights, Progress, Submit, gather_flights, report_progress
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 
@@ -90,7 +90,7 @@ class Fleet:
             for start in range(starts)
         ]
 
-    def lots(self, specs: Sequence[FlightSpec]) -> list[FlightBatch]:
+    def make_batches(self, specs: Sequence[FlightSpec]) -> list[FlightBatch]:
         """Return the specifications in batches; flights that cannot share a program run individually."""
         groups: dict[Hashable, list[FlightSpec]] = {}
         for spec in specs:
@@ -128,7 +128,7 @@ class Fleet:
         on_result: Callable[[Sequence[Flight]], None] | None = None,
         stop: threading.Event | None = None,
         only: Sequence[FlightSpec] | None = None,
-        by_lot: bool = False,
+        by_batch: bool = False,
         forget: bool = False,
     ) -> Flights:
         """Fly all or some of the flights.
@@ -142,8 +142,8 @@ class Fleet:
             on_result: Receives completed flights, in this thread.
             stop: Aborts the running flights when it is set. Ctrl-C sets it, too.
             only: Fly only these specifications, a part of ``specs``.
-            by_lot: Submit batches instead of single flights to an executor with other processes. The flights then equal
-                those of the default, bit for bit.
+            by_batch: Submit batches instead of single flights to an executor with other processes. The flights then
+                equal those of the default, bit for bit.
             forget: Do not return the flights, since thousands of logs would fill the memory; ``on_result`` receives
                 them.
 
@@ -159,15 +159,15 @@ class Fleet:
                 advance(0.0, "compiling")
                 return self.run(
                     executor, progress=report_progress(advance), on_result=on_result, stop=stop, only=only,
-                    by_lot=by_lot, forget=forget,
+                    by_batch=by_batch, forget=forget,
                 )  # fmt: skip
         stop = stop or threading.Event()
         specs = self.specs if only is None else list(only)
         if isinstance(executor, ThreadPoolExecutor):
-            lots = [FlightBatch([spec], None) for spec in specs]
-            return gathered(
+            batches = [FlightBatch([spec], None) for spec in specs]
+            return gather_flights(
                 specs,
-                lots,
+                batches,
                 self._here(executor, stop),
                 progress=progress,
                 on_result=on_result,
@@ -175,58 +175,58 @@ class Fleet:
                 forget=forget,
             )
         if executor is not None:
-            lots = self.lots(specs) if by_lot else [FlightBatch([spec], None) for spec in specs]
-            submit = self._away(executor, learnt=not forget)
-            return gathered(
-                specs, lots, submit, progress=progress, on_result=on_result, stop=stop, outlive=True, forget=forget
+            batches = self.make_batches(specs) if by_batch else [FlightBatch([spec], None) for spec in specs]
+            submit = self._away(executor, keeps_state=not forget)
+            return gather_flights(
+                specs, batches, submit, progress=progress, on_result=on_result, stop=stop, outlive=True, forget=forget
             )
-        lots = self.lots(specs)
-        self.warm_up([lot.specs[0] for lot in lots if lot.compiled is None])
+        batches = self.make_batches(specs)
+        self.warm_up([batch.specs[0] for batch in batches if batch.compiled is None])
         with ThreadPoolExecutor(1 if self._latency == "measured" else lanes()) as pool:
-            return gathered(
-                specs, lots, self._here(pool, stop), progress=progress, on_result=on_result, stop=stop, forget=forget
+            return gather_flights(
+                specs, batches, self._here(pool, stop), progress=progress, on_result=on_result, stop=stop, forget=forget
             )
 
     def _here(self, pool: Executor, stop: threading.Event) -> Submit:
         """Return a function that flies batches in this process."""
-        return lambda lot, aloft: pool.submit(self._fly, lot, aloft, stop)
+        return lambda batch, aloft: pool.submit(self._fly, batch, aloft, stop)
 
-    def _away(self, executor: Executor, *, learnt: bool) -> Submit:
+    def _away(self, executor: Executor, *, keeps_state: bool) -> Submit:
         """Return a function that submits batches to an executor with other processes."""
-        return lambda lot, aloft: executor.submit(fly_job, self._job(lot.specs, learnt))
+        return lambda batch, aloft: executor.submit(fly_job, self._job(batch.specs, keeps_state))
 
-    def _fly(self, lot: FlightBatch, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
+    def _fly(self, batch: FlightBatch, aloft: Callable[[float], None], stop: threading.Event) -> list[Flight]:
         """Fly a batch in this process; ``aloft`` receives the completed share."""
-        first = lot.specs[0]
+        first = batch.specs[0]
         setup = self.setups[first.scenario.reference]
-        policies = [self.policies[spec.seed] for spec in lot.specs]
-        starts = [self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in lot.specs]
+        policies = [self.policies[spec.seed] for spec in batch.specs]
+        starts = [self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in batch.specs]
         seconds, state = self.seconds, self._state
-        if lot.compiled is None:
+        if batch.compiled is None:
             alone = fly_one(
                 setup, policies[0], first, starts[0], seconds, latency=self._latency, state=state, stop=stop
             )
             return [alone]
-        compiled, cold = lot.compiled, lot.compiles
+        program, cold = batch.compiled, batch.compiles
 
-        def told(share: float) -> None:
+        def report_share(share: float) -> None:
             if share * seconds > COMPILED_AFTER:
-                compiled.set()
+                program.set()
             aloft(share)
 
         try:
             if cold:
                 release_programs()
             else:
-                compiled.wait()
+                program.wait()
             return fly_batch(
-                setup, policies, lot.specs, starts, seconds, state=state, progress=told, stop=stop, cold=cold
+                setup, policies, batch.specs, starts, seconds, state=state, progress=report_share, stop=stop, cold=cold
             )
         finally:
-            compiled.set()
+            program.set()
 
-    def _job(self, specs: Sequence[FlightSpec], learnt: bool) -> Job:
+    def _job(self, specs: Sequence[FlightSpec], keeps_state: bool) -> Job:
         policies = tuple(self.policies[spec.seed] for spec in specs)
         starts = tuple(self._starts[spec.scenario.reference, spec.seed][spec.start] for spec in specs)
-        about = self.seconds, self._latency, self._state, learnt
+        about = self.seconds, self._latency, self._state, keeps_state
         return Job(self._id, dump(self.preset), policies, tuple(specs), starts, *about)

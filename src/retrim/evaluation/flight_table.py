@@ -28,8 +28,8 @@ def figure_cells(row: Mapping[str, Any]) -> tuple[str, str, str]:
     error = with_counts(row, _mean_and_deviation(row["mean"], row["std"]))
     if row["mean"] is None:
         return error, "-", "-"
-    settled = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
-    return error, millimetres(row["peak_after_5s"]), settled
+    has_settled = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
+    return error, millimetres(row["peak_after_5s"]), has_settled
 
 
 def millimetres(value: float | None) -> str:

@@ -27,7 +27,7 @@ class Job:
     seconds: float
     latency: Latency
     state: LearnerState | None
-    learnt: bool = True
+    keeps_state: bool = True
     """Whether to return each flight's learner state, too; it is as large as the log."""
 
 
@@ -40,7 +40,7 @@ def fly_job(job: Job) -> list[Flight]:
     else:
         (policy,), (spec,), (x0,) = job.policies, job.specs, job.starts
         flights = [fly_one(setup, policy, spec, x0, job.seconds, latency=job.latency, state=job.state)]
-    return flights if job.learnt else [replace(flight, learnt=None) for flight in flights]
+    return flights if job.keeps_state else [replace(flight, learner_state=None) for flight in flights]
 
 
 @functools.lru_cache(maxsize=16)

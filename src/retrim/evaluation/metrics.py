@@ -35,9 +35,9 @@ EFFORT = ("rates_rms", "rates_change_rms")
 
 def record(flight: Flight) -> dict[str, Any]:
     """Return one flight's figures; the errors of a terminated flight are None."""
-    spec, crashed = flight.spec, flight.log.terminated
+    spec, crashes = flight.spec, flight.log.terminated
     effort = flight.effort if find_method(spec.method).on_board is None else (np.nan, np.nan)  # no rates are commanded
-    behind, unshifted = flight.behind or (None, None)
+    behind, aligned_error = flight.behind or (None, None)
     scenario = spec.scenario
     return {
         "disturbance": scenario.disturbance,
@@ -52,15 +52,15 @@ def record(flight: Flight) -> dict[str, Any]:
         "seed": spec.seed,
         "start": spec.start,
         "metric": flight.metric,
-        "error": None if crashed else flight.steady,
+        "error": None if crashes else flight.steady,
         "peak_after_5s": _finite(flight.peak),
         "settle_s": _finite(flight.settle_s),
-        "cross_track_m": None if crashed else flight.cross_track,
+        "cross_track_m": None if crashes else flight.cross_track,
         "behind_s": behind,
-        "unshifted_m": unshifted,
+        "unshifted_m": aligned_error,
         "rates_rms": _finite(effort[0]),
         "rates_change_rms": _finite(effort[1]),
-        "crashed": crashed,
+        "crashed": crashes,
         "failed": None,
     }
 
@@ -156,8 +156,8 @@ def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[fl
         return None
     draw, groups, means = np.random.default_rng(0), [np.array(errors) for errors in by_seed.values()], []
     for _ in range(draws):
-        chosen = (groups[i] for i in draw.integers(len(groups), size=len(groups)))
-        means.append(np.concatenate([draw.choice(group, len(group)) for group in chosen]).mean())
+        sample = (groups[i] for i in draw.integers(len(groups), size=len(groups)))
+        means.append(np.concatenate([draw.choice(group, len(group)) for group in sample]).mean())
     low, high = np.percentile(means, (2.5, 97.5))
     return [float(low), float(high)]
 
@@ -180,7 +180,7 @@ def metres(value: float, digits: int | None = None) -> str:
         value: The error [m].
         digits: Decimal places; three by default, four below a millimetre.
     """
-    return _shown(value, digits or _digits(value))
+    return _format(value, digits or _digits(value))
 
 
 def mean_and_deviation(values: np.ndarray) -> str:
@@ -190,7 +190,7 @@ def mean_and_deviation(values: np.ndarray) -> str:
 
 
 def _with_deviation(mean: float, deviation: float | None, digits: int) -> str:
-    text = _shown(mean, digits)
+    text = _format(mean, digits)
     return text if deviation is None or text.startswith("<") else f"{text} ± {deviation:.{digits}f}"
 
 
@@ -198,7 +198,7 @@ def _digits(value: float) -> int:
     return 3 if value >= 1e-3 else 4
 
 
-def _shown(value: float, digits: int) -> str:
+def _format(value: float, digits: int) -> str:
     least = 10.0**-digits
     return f"{value:.{digits}f}" if value >= 0.5 * least else f"< {least:.{digits}f}"
 
@@ -223,10 +223,10 @@ def with_counts(row: Mapping[str, Any], text: str) -> str:
         row: Result from :func:`summary`.
         text: The mean error; not used if no flight has one.
     """
-    failed = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
+    failures = f", {len(row['failures'])} of {row['n']} failed" if row.get("failures") else ""
     if row["mean"] is None:
-        return f"crashed, {row['crashes']} of {row['n']}" + failed if row["crashes"] else failed.removeprefix(", ")
-    return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "") + failed
+        return f"crashed, {row['crashes']} of {row['n']}" + failures if row["crashes"] else failures.removeprefix(", ")
+    return text + (f", {row['crashes']} of {row['n']} crashed" if row["crashes"] else "") + failures
 
 
 def _finite(value: float) -> float | None:
@@ -239,9 +239,9 @@ def notes(flights: Sequence[Flight], preset: Preset) -> list[str]:
     lines = []
     for method in dict.fromkeys(flight.spec.method for flight in flights):
         same = [flight for flight in flights if flight.spec.method == method]
-        if crashed := [flight for flight in same if flight.log.terminated]:
-            lines.append(_crashes(method, crashed, len(same), preset))
-    learning = [flight for flight in flights if flight.learnt is not None]
+        if crashes := [flight for flight in same if flight.log.terminated]:
+            lines.append(_crashes(method, crashes, len(same), preset))
+    learning = [flight for flight in flights if flight.learner_state is not None]
     if learning and not any(flight.swaps for flight in learning):
         first = preset.adapt.update_every + preset.adapt.update_latency
         lines.append(f"no policy update took effect; with fixed latencies the first one comes at {first:g} s")
@@ -256,5 +256,5 @@ def _crashes(method: str, crashed: Sequence[Flight], n: int, preset: Preset) -> 
     which = f"start {first.spec.start}"
     which = which if len(crashed) == 1 else f"{len(crashed)} of {n} starts, {which}"
     cause = likely_cause(first.log, lateness)
-    told = f"crashed: {method}, {which}, after {first.log.t[-1]:.2f} s: {first.events[-1].note}"
-    return told if cause is None else f"{told}; likely because {cause}"
+    message = f"crashed: {method}, {which}, after {first.log.t[-1]:.2f} s: {first.events[-1].note}"
+    return message if cause is None else f"{message}; likely because {cause}"

@@ -13,7 +13,7 @@ from ..runkit.provenance import section_key
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from ..runkit.store import Store
-from ..runkit.training import train, trained_elsewhere
+from ..runkit.training import train, train_elsewhere
 
 POLICIES = "policies"
 UNSAFE = re.compile(r"[^\w.+=-]+")
@@ -38,7 +38,7 @@ def train_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Rep
     """
     inputs = section_key(preset=dump(preset), files=file_digests(*preset_names(preset)))
     stem = f"{POLICIES}/{UNSAFE.sub('-', preset.name)}-{inputs[:8]}"
-    store, codec = Store(run.trained, reporter=reporter, stop=run.stop), policy_codec(preset)
+    store, codec = Store(run.policy_folder, reporter=reporter, stop=run.stop), policy_codec(preset)
     result = dict[int, AbstractPolicy]()
     for seed in seeds:
         if (policy := store.get(f"{stem}-seed{seed}", codec)) is not None:
@@ -50,7 +50,7 @@ def train_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Rep
 
     missing = [seed for seed in dict.fromkeys(seeds) if seed not in result]
     if missing and run.executor is not None and not run.interrupted:
-        trained_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, on_result=on_result)
+        train_elsewhere(preset, missing, run.executor, reporter=reporter, stop=run.stop, on_result=on_result)
         missing = []
     setup = Setup.from_preset(preset)  # one set-up, so that the seeds share its programs
     for seed in missing:

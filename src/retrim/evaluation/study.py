@@ -73,8 +73,8 @@ def refuse_misfits(
     """
     for scenario in scenarios:
         scenario.make(preset.vehicle, dt=preset.dt)
-    untrained = Setup.from_preset(preset).new_policy(random.key(0))
-    Fleet(preset, untrained, scenarios, methods=methods, starts=starts, seconds=seconds)
+    untrained_policy = Setup.from_preset(preset).new_policy(random.key(0))
+    Fleet(preset, untrained_policy, scenarios, methods=methods, starts=starts, seconds=seconds)
 
 
 def fly_all(
@@ -122,10 +122,10 @@ def fly_all(
                 progress=report_progress(advance),
                 on_result=None if groups is None else groups.save,
                 only=left,
-                by_lot=True,
+                by_batch=True,
             )
     if flights.failed:
         why = next(iter(flights.failed.values()))
         raise JobError(f"{len(flights.failed)} of {len(fleet.specs)} flights failed elsewhere, the first by {why}")
-    flown = earlier | {flight.spec: flight for flight in flights.flown}
-    return replace(flights, flown=[flown[spec] for spec in fleet.specs if spec in flown])
+    by_spec = earlier | {flight.spec: flight for flight in flights.flights}
+    return replace(flights, flights=[by_spec[spec] for spec in fleet.specs if spec in by_spec])

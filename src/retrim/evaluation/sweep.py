@@ -109,7 +109,7 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     """
     check_seeds(sweep.seeds)
     presets = [changed(load(name), **sweep.overlay) for name in sweep.presets]
-    fleets = [_fleet(preset, _untrained(preset, sweep), sweep) for preset in presets]
+    fleets = [_fleet(preset, _make_untrained(preset, sweep), sweep) for preset in presets]
     for fleet in fleets:
         for scenario in sweep.scenarios():
             scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # fails if a package is missing
@@ -132,7 +132,7 @@ def _fleet(preset: Preset, policies: Mapping[int, AbstractPolicy], sweep: Sweep)
     return Fleet(preset, policies, sweep.scenarios(), methods=sweep.methods, starts=sweep.starts, seconds=sweep.seconds)
 
 
-def _untrained(preset: Preset, sweep: Sweep) -> dict[int, AbstractPolicy]:
+def _make_untrained(preset: Preset, sweep: Sweep) -> dict[int, AbstractPolicy]:
     """Return untrained policies for planning the flights before training."""
     return dict.fromkeys(sweep.seeds, Setup.from_preset(preset).new_policy(random.key(0)))
 
@@ -154,7 +154,7 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], rows: "_FlightRows", run:
             only=missing,
             on_result=on_result,
             progress=report_progress(advance),
-            by_lot=True,
+            by_batch=True,
             forget=True,
         )
     for spec, why in flights.failed.items():
@@ -205,14 +205,16 @@ def _report(sweep: Sweep, rows: Sequence[dict[str, Any]], run: Run, reporter: Re
     for row in rows:
         groups.setdefault(tuple(row[name] for name in GROUP), []).append(row)
     result, cells = Rows(), list[tuple[str, ...]]()
-    varied = [name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"]
+    varying_groups = [
+        name for i, name in enumerate(GROUP) if len({group[i] for group in groups}) > 1 or name == "method"
+    ]
     for flights in groups.values():
         row = summary(flights, GROUP)
         result.append(row)
         none = "crashed" if row["crashes"] else "-"
         spread = (none if row[name] is None else millimetres(row[name]) for name in ("median", "max"))
         error, *others = figure_cells(row)
-        cells.append((*(str(flights[0][name]) for name in varied), error, *spread, *others))
+        cells.append((*(str(flights[0][name]) for name in varying_groups), error, *spread, *others))
     intro = (
         "Made by `retrim sweep`. Error over the last seconds of each flight: mean ± standard deviation, median and "
         "maximum over seeds and starts. Median of the largest error after the flight to the goal, and of the time from "
@@ -221,21 +223,21 @@ def _report(sweep: Sweep, rows: Sequence[dict[str, Any]], run: Run, reporter: Re
     more = {"sweep": dataclasses.asdict(sweep)}
     document = Document(run, "sweep", "Sweep", intro, sweep.seeds, reporter, more)
     if cells:
-        drawn = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
+        picture_path = save(bars("Error at the end of the flights [m]", _bar_groups(groups)), run.folder, "sweep")
         error, *others = figure_columns(sweep.seconds)
-        columns = (*varied, error, "median [mm]", "maximum [mm]", *others)
-        document.add(TableSection(columns, tuple(cells), picture=drawn[0]), result)
+        columns = (*varying_groups, error, "median [mm]", "maximum [mm]", *others)
+        document.add(TableSection(columns, tuple(cells), picture=picture_path[0]), result)
     document.write()
     return result
 
 
 def _bar_groups(groups: Mapping[tuple[Any, ...], list[dict[str, Any]]]) -> dict[str, dict[str, list[float]]]:
     """Return the flights' errors by scenario and method; a crashed flight's error is infinite."""
-    shown: dict[str, dict[str, list[float]]] = {}
-    varied = [i for i, name in enumerate(GROUP[:-1]) if len({group[i] for group in groups}) > 1] or [5]
+    bar_groups: dict[str, dict[str, list[float]]] = {}
+    varying_groups = [i for i, name in enumerate(GROUP[:-1]) if len({group[i] for group in groups}) > 1] or [5]
     for group, flights in groups.items():
-        label = ", ".join(str(group[i]) for i in varied)
-        shown.setdefault(label, {})[str(group[-1])] = [
+        label = ", ".join(str(group[i]) for i in varying_groups)
+        bar_groups.setdefault(label, {})[str(group[-1])] = [
             float("inf") if row["error"] is None else row["error"] for row in flights if not row.get("failed")
         ]
-    return shown
+    return bar_groups

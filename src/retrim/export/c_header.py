@@ -180,14 +180,14 @@ def _step(name: str, policy: Portable) -> list[str]:
     """Return the code for the observation and a step from state to command, for policies that observe the state."""
     if policy.observation is None:
         return []
-    seen, past = policy.observation, 4 * policy.observation["history"]
-    gravity, size = _number(seen["gravity"]), policy.sizes[0]
+    observation, past = policy.observation, 4 * policy.observation["history"]
+    gravity, size = _number(observation["gravity"]), policy.sizes[0]
     shift = [
         f"    for (int i = 0; i < {past - 4}; ++i) next.past[i] = next.past[i + 4];",
         f"    next.past[{past - 4}] = next.last[0] / {gravity} - 1.0f;",
         *(
             f"    next.past[{past - 4 + i}] = next.last[{i}] / {_number(w)};"
-            for i, w in enumerate(seen["rates_max"], 1)
+            for i, w in enumerate(observation["rates_max"], 1)
         ),
         f"    memcpy(observation + 15, next.past, {past} * sizeof(float));",
     ]
@@ -209,10 +209,10 @@ def _step(name: str, policy: Portable) -> list[str]:
         f"    float observation[{size}];",
         "    memcpy(command, memory->last, sizeof memory->last);",
         f"    if (!{name}_finite(p, 3) || !{name}_finite(r, 9) || !{name}_finite(v, 3)) return 0;",
-        *(f"    observation[{i}] = (p[{i}] - {_number(x)}) / {_number(seen['position_scale'])};"
-          for i, x in enumerate(seen["origin"])),
+        *(f"    observation[{i}] = (p[{i}] - {_number(x)}) / {_number(observation['position_scale'])};"
+          for i, x in enumerate(observation["origin"])),
         "    memcpy(observation + 3, r, 9 * sizeof(float));",
-        f"    for (int i = 0; i < 3; ++i) observation[12 + i] = v[i] / {_number(seen['velocity_scale'])};",
+        f"    for (int i = 0; i < 3; ++i) observation[12 + i] = v[i] / {_number(observation['velocity_scale'])};",
         *(shift if past else []),
         f"    if (!{name}_command(observation, command)) return 0;",
         "    memcpy(next.last, command, sizeof next.last);",

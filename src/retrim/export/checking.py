@@ -56,13 +56,15 @@ class Parity:
     """Time of one step [s]: the median; for C, the mean."""
 
 
-def check_npz(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
+def check_npz(path: Path, policy: Portable, rows: np.ndarray, commands: np.ndarray) -> Parity | None:
     """Check an NPZ file with the NumPy runner."""
     runner = Runner(path)
-    return Parity("NumPy", _worst(policy, runner.command(rows), wanted), _timed(lambda o: runner.command(o), rows))
+    return Parity(
+        "NumPy", _worst(policy, runner.command(rows), commands), _time_steps(lambda o: runner.command(o), rows)
+    )
 
 
-def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
+def check_onnx(path: Path, policy: Portable, rows: np.ndarray, commands: np.ndarray) -> Parity | None:
     """Check a model with ONNX Runtime; return None if ONNX Runtime is not installed."""
     if find_spec("onnxruntime") is None:
         return None
@@ -73,11 +75,11 @@ def check_onnx(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarra
     spoilt = session.run(["command", "finite"], {"observation": _spoilt(rows)})
     if not np.isnan(spoilt[0]).all() or np.any(spoilt[1]):
         return Parity("ONNX Runtime, for numbers that are not finite,", math.inf, math.inf)
-    step = _timed(lambda o: session.run(["command"], {"observation": o[None]}), rows)
-    return Parity("ONNX Runtime", _worst(policy, np.asarray(result), wanted), step)
+    step = _time_steps(lambda o: session.run(["command"], {"observation": o[None]}), rows)
+    return Parity("ONNX Runtime", _worst(policy, np.asarray(result), commands), step)
 
 
-def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) -> Parity | None:
+def check_c(path: Path, policy: Portable, rows: np.ndarray, commands: np.ndarray) -> Parity | None:
     """Compile and check a header; return None if there is no compiler.
 
     Raises:
@@ -92,13 +94,13 @@ def check_c(path: Path, policy: Portable, rows: np.ndarray, wanted: np.ndarray) 
         text = MAIN.format(header="policy.h", rows=len(rows), size=rows.shape[1], name=name_of(path))
         (place / "main.c").write_text("#define _POSIX_C_SOURCE 199309L\n" + text)
         words = [compiler, *FLAGS, "main.c", "-o", "main", "-lm"]
-        built = subprocess.run(words, cwd=place, capture_output=True, text=True, timeout=LONGEST)
-        if built.returncode != 0:
-            raise ConfigError(f"{path}: does not compile: {built.stderr[:300]}")
-        ran = subprocess.run([str(place / "main")], input=rows.tobytes(), capture_output=True, timeout=LONGEST)
-    seconds, own = (float(word) for word in ran.stderr.split())
-    given = np.frombuffer(ran.stdout, dtype=np.float32).reshape(-1, 4)
-    return Parity(Path(compiler).name, max(own, _worst(policy, given, wanted)), seconds / len(rows))
+        compilation = subprocess.run(words, cwd=place, capture_output=True, text=True, timeout=LONGEST)
+        if compilation.returncode != 0:
+            raise ConfigError(f"{path}: does not compile: {compilation.stderr[:300]}")
+        process = subprocess.run([str(place / "main")], input=rows.tobytes(), capture_output=True, timeout=LONGEST)
+    seconds, own = (float(word) for word in process.stderr.split())
+    outputs = np.frombuffer(process.stdout, dtype=np.float32).reshape(-1, 4)
+    return Parity(Path(compiler).name, max(own, _worst(policy, outputs, commands)), seconds / len(rows))
 
 
 def _spoilt(rows: np.ndarray) -> np.ndarray:
@@ -108,14 +110,14 @@ def _spoilt(rows: np.ndarray) -> np.ndarray:
     return np.array([np.where(np.arange(size) == i, x, rows[0]) for x in bad for i in range(size)], np.float32)
 
 
-def _worst(policy: Portable, found: np.ndarray, wanted: np.ndarray) -> float:
-    return float(np.max(np.abs(found - wanted) / (policy.high - policy.low)))
+def _worst(policy: Portable, outputs: np.ndarray, commands: np.ndarray) -> float:
+    return float(np.max(np.abs(outputs - commands) / (policy.high - policy.low)))
 
 
-def _timed(step: Callable[[np.ndarray], Any], rows: np.ndarray) -> float:
-    taken = []
+def _time_steps(step: Callable[[np.ndarray], Any], rows: np.ndarray) -> float:
+    durations = []
     for row in rows[:STEPS]:
         began = time.perf_counter()
         step(row)
-        taken.append(time.perf_counter() - began)
-    return float(np.median(taken))
+        durations.append(time.perf_counter() - began)
+    return float(np.median(durations))

@@ -9,7 +9,7 @@ import numpy as np
 from ..config.setup import Setup
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
-from ..io.trained import load_policy
+from ..io.policies import load_policy
 from ..runkit.reporter import Reporter
 from .c_header import write_c
 from .checking import ROWS, Parity, check_c, check_npz, check_onnx
@@ -72,14 +72,14 @@ def export(
     if delta is not None:
         weights = load_delta(delta, weights).merged()
     portable = portable_of(weights, Setup.from_preset(preset))
-    written = FORMATS[to].write(path, portable)
+    paths = FORMATS[to].write(path, portable)
     rows = SPREAD * observations(portable.sizes[0], ROWS, seed=1)
     result = FORMATS[to].check(path, portable, rows, commands(weights, rows))
     if result is None:
         reporter.say(f"{path} was not run: there is nothing here that runs it")
-        return written
+        return paths
     if not result.worst <= PARITY:
-        for each in written:
+        for each in paths:
             each.unlink(missing_ok=True)
         raise ConfigError(
             f"{path}: {result.by} misses JAX by {result.worst:.1e} of the command range; nothing was kept"
@@ -90,4 +90,4 @@ def export(
     )
     if portable.observation is None:
         reporter.say(f"a {preset.task} policy does not see the state alone: its observation is yours to compute")
-    return written
+    return paths

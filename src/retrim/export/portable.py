@@ -62,11 +62,11 @@ def portable_of(policy: AbstractPolicy, setup: Setup) -> Portable:
         raise ConfigError(f"export needs a perceptron (pretrain.network = 'mlp'), and this policy has {network!r}")
     single = [(_single(l.weight.T), _single(l.bias)) for l in policy.linear_layers()]
     low, high, hover = (_single(u.vector()) for u in (policy.u_min, policy.u_max, policy.u_hover))
-    preset, seen = setup.preset, setup.env.task.observation
+    preset, sensor = setup.preset, setup.env.task.observation
     observation = None
-    if isinstance(seen, StateObs):
+    if isinstance(sensor, StateObs):
         observation = {
-            "origin": seen.origin.tolist(), "rates_max": seen.omega_max.tolist(), "history": seen.history,
+            "origin": sensor.origin.tolist(), "rates_max": sensor.omega_max.tolist(), "history": sensor.history,
             "position_scale": POSITION_SCALE, "velocity_scale": VELOCITY_SCALE, "gravity": STANDARD_GRAVITY,
         }  # fmt: skip
     about = {"preset": preset.name, "task": preset.task, "dt": preset.dt, "weights": fingerprint(policy)}

@@ -39,9 +39,9 @@ class Runner:
         self.about: dict[str, Any] = json.loads(str(self._arrays["about"]))
         self._layers = [(self._arrays[f"w{i}"], self._arrays[f"b{i}"]) for i in range(self.about["layers"])]
         result = self.command(self._arrays["test_observations"])
-        missed = np.abs(result - self._arrays["test_commands"]) / (self._arrays["high"] - self._arrays["low"])
-        if not missed.max() <= TOLERANCE:
-            raise ValueError(f"{path}: its test vectors are missed by {missed.max():.1e} of the command range")
+        deviation = np.abs(result - self._arrays["test_commands"]) / (self._arrays["high"] - self._arrays["low"])
+        if not deviation.max() <= TOLERANCE:
+            raise ValueError(f"{path}: its test vectors are missed by {deviation.max():.1e} of the command range")
         if not self._survives_bad_numbers():
             raise ValueError(f"{path}: a number that is not finite changes more than the command of its tick")
         if delta is not None:
@@ -75,9 +75,9 @@ class Runner:
     def reset(self) -> None:
         """Reset the history of commands to hover."""
         self._repeats = 0
-        seen = self.about["observation"]
-        self._past = np.zeros((0 if seen is None else seen["history"], 4), dtype=np.float32)
-        self._last = np.array([0.0 if seen is None else seen["gravity"], 0.0, 0.0, 0.0], np.float32)
+        observation = self.about["observation"]
+        self._past = np.zeros((0 if observation is None else observation["history"], 4), dtype=np.float32)
+        self._last = np.array([0.0 if observation is None else observation["gravity"], 0.0, 0.0, 0.0], np.float32)
 
     def step(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the command for a state; call this method once per control tick.
@@ -102,13 +102,15 @@ class Runner:
 
     def observe(self, p: np.ndarray, R: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the observation of a state, after the last command of :meth:`step`."""
-        seen = self.about["observation"]
-        if seen is None:
+        observation = self.about["observation"]
+        if observation is None:
             raise ValueError("this policy does not see the state alone; call command() with its observation")
-        past = np.concatenate([[self._last[0] / seen["gravity"] - 1.0], self._last[1:] / np.array(seen["rates_max"])])
+        past = np.concatenate(
+            [[self._last[0] / observation["gravity"] - 1.0], self._last[1:] / np.array(observation["rates_max"])]
+        )
         self._past = np.concatenate([self._past, past[None].astype(np.float32)])[1:]
-        near = (np.asarray(p) - np.array(seen["origin"])) / seen["position_scale"]
-        parts = [near, np.asarray(R).reshape(9), np.asarray(v) / seen["velocity_scale"], self._past.reshape(-1)]
+        near = (np.asarray(p) - np.array(observation["origin"])) / observation["position_scale"]
+        parts = [near, np.asarray(R).reshape(9), np.asarray(v) / observation["velocity_scale"], self._past.reshape(-1)]
         return np.concatenate(parts).astype(np.float32)
 
     def _survives_bad_numbers(self) -> bool:

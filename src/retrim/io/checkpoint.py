@@ -136,9 +136,9 @@ def load_delta(path: str | Path, base: AbstractPolicy) -> LoraPolicy:
     try:
         header = wire.describe(data, kind="delta", source=str(path))
         if header.get("base") != fingerprint(base):
-            made_for = header.get("base", "unnamed")[:12]
+            base_name = header.get("base", "unnamed")[:12]
             raise CheckpointError(
-                f"{path}: made for another base policy, {made_for}..., not for {fingerprint(base)[:12]}..."
+                f"{path}: made for another base policy, {base_name}..., not for {fingerprint(base)[:12]}..."
             )
         like = lora_like(base, header, source=str(path))
         delta, shift = wire.unpack(data, (like.delta, like.shift), kind="delta", source=str(path))

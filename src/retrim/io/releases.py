@@ -24,9 +24,9 @@ def newer_release(header: Mapping[str, str]) -> str | None:
     Args:
         header: Header of the file.
     """
-    told = header.get("version", "")
-    theirs, ours = _numbers(told), _numbers(this_release())
-    return told if theirs is not None and ours is not None and theirs > ours else None
+    release = header.get("version", "")
+    theirs, ours = _numbers(release), _numbers(this_release())
+    return release if theirs is not None and ours is not None and theirs > ours else None
 
 
 def _numbers(text: str) -> tuple[int, int, int] | None:

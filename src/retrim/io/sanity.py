@@ -33,12 +33,12 @@ def check_policy(policy: AbstractPolicy, *, source: str, observation: np.ndarray
     most = np.array([THRUST, RATES, RATES, RATES])
     if not all(np.all(np.abs(u) <= most) for u in (low, hover, high)):
         raise CheckpointError(
-            f"{source}: command limits {_shown(low)} to {_shown(high)} must be within +-{THRUST:g} m/s^2 and "
+            f"{source}: command limits {_format(low)} to {_format(high)} must be within +-{THRUST:g} m/s^2 and "
             f"+-{RATES:g} rad/s"
         )
     if not (np.all(low < hover) and np.all(hover < high)):
         raise CheckpointError(
-            f"{source}: command limits {_shown(low)} to {_shown(high)} do not enclose hover, {_shown(hover)}"
+            f"{source}: command limits {_format(low)} to {_format(high)} do not enclose hover, {_format(hover)}"
         )
     check_size(policy.params, source=source)
     layers = policy.linear_layers()
@@ -92,5 +92,5 @@ def _double(vector: Any) -> np.ndarray:
     return np.asarray(vector, dtype=float)
 
 
-def _shown(vector: np.ndarray) -> str:
+def _format(vector: np.ndarray) -> str:
     return "[" + ", ".join(f"{x:.4g}" for x in vector) + "]"

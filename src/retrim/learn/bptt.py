@@ -27,13 +27,13 @@ class PolicyState(eqx.Module):
 
 def policy_loss(policy: AbstractPolicy, env: Env, x0: Start) -> Float[Array, ""]:
     """Return the negative reward, averaged over ticks and over the batch of starts ``x0`` (leading axis)."""
-    flying, laid = with_transposed_copy((policy, env))
+    flying, copies = with_transposed_copy((policy, env))
 
     def fly(start: Start) -> Trajectory:
-        return rollout(laid, flying, start)
+        return rollout(copies, flying, start)
 
-    flown = jax.vmap(fly)(x0)
-    return -jnp.mean(flown.reward)
+    trajectory = jax.vmap(fly)(x0)
+    return -jnp.mean(trajectory.reward)
 
 
 def policy_gradient(policy: AbstractPolicy, env: Env, x0: Start) -> tuple[Float[Array, ""], Any]:
@@ -51,15 +51,15 @@ def policy_gradient(policy: AbstractPolicy, env: Env, x0: Start) -> tuple[Float[
 
 
 def _perceptron_gradient(policy: Policy, env: Env, x0: Start) -> tuple[Float[Array, ""], Any]:
-    flying, laid = with_transposed_copy((policy, env))
+    flying, copies = with_transposed_copy((policy, env))
 
     def loss(zeros: Perturbations) -> tuple[Float[Array, ""], Inputs]:
         def fly(start: Start, z: Perturbations) -> tuple[Trajectory, Inputs]:
-            return perturbed_rollout(laid, flying, start, z)
+            return perturbed_rollout(copies, flying, start, z)
 
         # Keep time as the leading axis, as the scan lays it out, to avoid transposing activations.
-        flown, inputs = jax.vmap(fly, in_axes=(0, 1), out_axes=(0, 1))(x0, zeros)
-        return -jnp.mean(flown.reward), inputs
+        trajectory, inputs = jax.vmap(fly, in_axes=(0, 1), out_axes=(0, 1))(x0, zeros)
+        return -jnp.mean(trajectory.reward), inputs
 
     return weight_gradients.value_and_grad(loss, policy, (env.task.horizon, x0.t.shape[0]))
 
@@ -84,8 +84,8 @@ def bptt(
 
     def update(state: PolicyState, starts: Start) -> tuple[PolicyState, Float[Array, ""]]:
         # Map params to those of the merged policy, and pull the gradient back; without a delta both are the identity.
-        merged, pull = jax.vjp(lambda params: state.policy.with_params(params).merged().params, state.policy.params)
-        plain = state.policy.merged().with_params(merged)
+        policy, pull = jax.vjp(lambda params: state.policy.with_params(params).merged().params, state.policy.params)
+        plain = state.policy.merged().with_params(policy)
         loss, by_params = policy_gradient(plain, env, starts)
         (gradient,) = pull(by_params)
         change, memory = optimiser.update(gradient, state.optimiser, state.policy.params)

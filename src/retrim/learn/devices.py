@@ -60,12 +60,12 @@ def shard(tree: T, *, axis: int = 0) -> T:
         ConfigError: There are several hosts, and the length of the axis cannot be divided among their devices.
     """
     leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
-    return _laid(tree, leaves[0].shape[axis], PartitionSpec(*[None] * axis, MANY)) if leaves else tree
+    return _lay_out(tree, leaves[0].shape[axis], PartitionSpec(*[None] * axis, MANY)) if leaves else tree
 
 
 def replicate(tree: T, n: int) -> T:
     """Replicate the arrays of a tree on each device that shares ``n`` pieces of work; see :func:`shard`."""
-    return _laid(tree, n, PartitionSpec())
+    return _lay_out(tree, n, PartitionSpec())
 
 
 def to_default_device(tree: T) -> T:
@@ -79,7 +79,7 @@ def to_default_device(tree: T) -> T:
     return here
 
 
-def _laid(tree: T, n: int, how: PartitionSpec) -> T:
+def _lay_out(tree: T, n: int, how: PartitionSpec) -> T:
     count = num_shards(n, jax.device_count())
     if jax.process_count() > 1 and count < jax.device_count():
         hosts = jax.process_count()
@@ -88,5 +88,5 @@ def _laid(tree: T, n: int, how: PartitionSpec) -> T:
         return tree
     arrays, rest = eqx.partition(tree, eqx.is_array)
     mesh = Mesh(np.array(jax.devices()[:count]), (MANY,))
-    laid: T = eqx.combine(lax.with_sharding_constraint(arrays, NamedSharding(mesh, how)), rest)
-    return laid
+    tree_on_devices: T = eqx.combine(lax.with_sharding_constraint(arrays, NamedSharding(mesh, how)), rest)
+    return tree_on_devices

@@ -78,42 +78,44 @@ def _scan(
     commands = CommandQueue.of(hover, task.dt, longest=env.longest_delay)
     shares = commands.weights(env.delay, task.dt)  # the same in every tick
 
-    def framed(x: State, issued: Command) -> tuple[EffectiveGravityFrame | None, AbstractTask, State]:
+    def to_frame(x: State, newest: Command) -> tuple[EffectiveGravityFrame | None, AbstractTask, State]:
         """Return the policy's frame, and the task and the state in this frame."""
-        frame = env.frame(x, issued)
+        frame = env.frame(x, newest)
         return (None, task, x) if frame is None else (frame, task.in_frame(frame), frame.state(x))
 
     def tick(carry: Any, xs: Any) -> Any:
-        s, memory, last, issued, commands, alive, worst = carry
+        s, memory, last, newest, commands, alive, worst = carry
         k, perturbation = xs
         t = start.t + k * task.dt
         x = dynamics.state(s)
-        frame, seen, x_seen = framed(x, issued)
-        actuators, observation = dynamics.actuators(s), seen.observation
+        frame, task_in_frame, x_in_frame = to_frame(x, newest)
+        actuators, observation = dynamics.actuators(s), task_in_frame.observation
         if actuators is not None:
             observation = observation.with_actuators(actuators if frame is None else frame.actuators(actuators))
         if start.member is not None:
             observation = observation.with_belief(start.member.belief)
-        o, memory = observation(memory, t, x_seen, last)
+        o, memory = observation(memory, t, x_in_frame, last)
         before = last
         last, inputs = act(o, perturbation)
-        issued = last if frame is None else frame.world_command(last)
-        commands = commands.push(issued)
+        newest = last if frame is None else frame.world_command(last)
+        commands = commands.push(newest)
         acting = commands.combine(shares)
-        reward = seen.reward(t, x_seen, acting if frame is None else frame.command(acting))
+        reward = task_in_frame.reward(t, x_in_frame, acting if frame is None else frame.command(acting))
         reward = jnp.where(alive, reward - env.cost_of_jump(before, last), worst)
         after = dynamics.step(s, acting, calm)
-        survived = alive & ~task.terminated(t + task.dt, dynamics.state(after))
+        still_alive = alive & ~task.terminated(t + task.dt, dynamics.state(after))
         # A terminated vehicle is frozen at its last good state: a diverging state turns masked rewards into NaN
         # gradients.
-        s = where(survived, after, lax.stop_gradient(s))
+        s = where(still_alive, after, lax.stop_gradient(s))
         worst = jnp.minimum(worst, lax.stop_gradient(reward))
-        return (s, memory, last, issued, commands, survived, worst), ((x, acting, reward, ~alive), inputs)
+        return (s, memory, last, newest, commands, still_alive, worst), ((x, acting, reward, ~alive), inputs)
 
-    _, seen, x_seen = framed(start.x, hover)  # the memory of the time before the start has the same frame
+    _, task_in_frame, x_in_frame = to_frame(
+        start.x, hover
+    )  # the memory of the time before the start has the same frame
     carry = (
         dynamics.init(start.x),
-        seen.observation.init(x_seen),
+        task_in_frame.observation.init(x_in_frame),
         hover,
         hover,
         commands,
@@ -121,5 +123,5 @@ def _scan(
         jnp.zeros_like(start.t),
     )
     ticks = jnp.arange(task.horizon, dtype=start.t.dtype)
-    _, (flown, inputs) = lax.scan(tick, carry, (ticks, perturbations))
-    return Trajectory(*flown), inputs
+    _, (trajectory, inputs) = lax.scan(tick, carry, (ticks, perturbations))
+    return Trajectory(*trajectory), inputs

@@ -57,8 +57,8 @@ def screen(window: Window, dt: float) -> Screening:
         dt: Control tick [s].
     """
     before, after = (_rows(window.x, part) for part in (slice(None, -1), slice(1, None)))
-    taken = window.t if window.age is None else window.t - window.age
-    successive = jnp.abs(jnp.diff(taken) - dt) < 0.25 * dt
+    stamps = window.t if window.age is None else window.t - window.age
+    successive = jnp.abs(jnp.diff(stamps) - dt) < 0.25 * dt
     valid = window.valid[:-1] & window.valid[1:] & successive
     gaps = jax.vmap(lambda a, b: gap(a, b, dt))(before, after)
     noise = _median(jax.vmap(gap_noise)(gaps[:-1], gaps[1:]), valid[:-1] & valid[1:])
@@ -74,10 +74,10 @@ def screen(window: Window, dt: float) -> Screening:
     counts = jnp.stack([jnp.sum(leaf & valid) for leaf in jax.tree.leaves(result)])
     good, nothing = valid & ~bad, jnp.zeros(1, dtype=bool)
     beside = jnp.concatenate([nothing, good]) | jnp.concatenate([good, nothing])
-    judged = jnp.concatenate([nothing, valid]) | jnp.concatenate([valid, nothing])
-    samples = window.valid & (beside | ~judged)
-    trusted = ~(shows & wrong) & (jnp.sum(bad & valid) <= jnp.sum(valid) // 2)  # learn only from a good majority
-    return Screening(~(bad & valid), samples, counts, trusted)
+    checks = jnp.concatenate([nothing, valid]) | jnp.concatenate([valid, nothing])
+    samples = window.valid & (beside | ~checks)
+    usable = ~(shows & wrong) & (jnp.sum(bad & valid) <= jnp.sum(valid) // 2)  # learn only from a good majority
+    return Screening(~(bad & valid), samples, counts, usable)
 
 
 def _rows(x: State, part: slice) -> State:
@@ -86,6 +86,6 @@ def _rows(x: State, part: slice) -> State:
 
 def _median(values: Float[Array, " n"], counts: Bool[Array, " n"]) -> Float[Array, ""]:
     """Return the median of the values that count; return zero if no value counts."""
-    ordered = jnp.sort(jnp.where(counts & jnp.isfinite(values), values, jnp.inf))
-    middle = ordered[(jnp.sum(counts) - 1) // 2]  # the last value, which is infinite, if the count is zero
+    order = jnp.sort(jnp.where(counts & jnp.isfinite(values), values, jnp.inf))
+    middle = order[(jnp.sum(counts) - 1) // 2]  # the last value, which is infinite, if the count is zero
     return jnp.where(jnp.isfinite(middle), middle, 0.0)

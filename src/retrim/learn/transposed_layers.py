@@ -41,8 +41,8 @@ def with_transposed_copy(tree: Tree) -> Tree:
     def is_layer(leaf: object) -> TypeGuard[eqx.nn.Linear]:
         return type(leaf) is eqx.nn.Linear and "scalar" not in (leaf.in_features, leaf.out_features)
 
-    laid: Tree = jax.tree.map(lambda leaf: TransposedLinear(leaf) if is_layer(leaf) else leaf, tree, is_leaf=is_layer)
-    return laid
+    copies: Tree = jax.tree.map(lambda leaf: TransposedLinear(leaf) if is_layer(leaf) else leaf, tree, is_leaf=is_layer)
+    return copies
 
 
 @jax.custom_vjp
@@ -56,8 +56,8 @@ def _forward(weight: Array, transposed: Array, x: Array) -> tuple[Array, tuple[A
     return x @ transposed, (weight, x)
 
 
-def _backward(seen: tuple[Array, Array], y: Array) -> tuple[Array, Array, Array]:
-    weight, x = seen
+def _backward(inputs: tuple[Array, Array], y: Array) -> tuple[Array, Array, Array]:
+    weight, x = inputs
     return jnp.outer(y, x), jnp.zeros_like(weight.T), y @ weight
 
 

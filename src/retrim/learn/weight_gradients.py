@@ -31,8 +31,8 @@ def value_and_grad(loss: PerturbedLoss, policy: Policy, rows: tuple[int, ...]) -
     """Return the loss and its gradient with respect to ``policy.layers``, as ``jax.value_and_grad`` does."""
     (value, inputs), cotangents = jax.value_and_grad(loss, has_aux=True)(zero_perturbations(policy, rows))
     gradients = []
-    for layer, seen, cotangent in zip(policy.layers, inputs, cotangents, strict=True):
-        flat = seen.reshape(-1, seen.shape[-1])
+    for layer, layer_input, cotangent in zip(policy.layers, inputs, cotangents, strict=True):
+        flat = layer_input.reshape(-1, layer_input.shape[-1])
         _, pull = jax.vjp(lambda l, flat=flat: jax.vmap(l)(flat), layer)
         gradients.extend(pull(cotangent.reshape(-1, cotangent.shape[-1])))
     return value, tuple(gradients)

@@ -16,7 +16,7 @@ EVERY = 0.05  # [s] between two reads of the status
 LAST = 1.0  # [s], longest wait for a terminal to display the end of a flight
 
 
-def watched(
+def watch_flight(
     supervisor: Supervisor,
     seconds: float,
     events: LiveEvents,
@@ -38,19 +38,19 @@ def watched(
         The last status.
     """
     supervisor.take_off()
-    landed_by = float("inf")
+    deadline = float("inf")
     with _Screen(show) as screen:
         while True:
             status = supervisor.watch()
             new = events.take(status, wishes.obey(status) if wishes is not None else ())
             if not screen.show(status, new):  # the display has closed: land the vehicle
                 stop.set()
-            if status.ended is not None or time.monotonic() > landed_by:
+            if status.end_reason is not None or time.monotonic() > deadline:
                 supervisor.finish()
                 return status
-            if (stop.is_set() or supervisor.landing or status.t >= seconds) and landed_by == float("inf"):
+            if (stop.is_set() or supervisor.landing or status.t >= seconds) and deadline == float("inf"):
                 supervisor.land()
-                landed_by = time.monotonic() + LANDING
+                deadline = time.monotonic() + LANDING
             time.sleep(EVERY)
 
 
@@ -62,7 +62,7 @@ class _Screen:
         self._last: Status | None = None
         self._thread = ThreadPoolExecutor(1)
         self._work: Future[None] | None = None
-        self._lost = False
+        self._unusable = False
 
     def __enter__(self) -> "_Screen":
         return self
@@ -72,7 +72,7 @@ class _Screen:
         with contextlib.suppress(TimeoutError, OSError, SystemExit):
             if self._work is not None:
                 self._work.result(LAST)
-            if self._last is not None and not self._lost:
+            if self._last is not None and not self._unusable:
                 self._thread.submit(self._show, self._last, self._waiting).result(LAST)
         self._thread.shutdown(wait=False, cancel_futures=True)
 
@@ -80,13 +80,13 @@ class _Screen:
         """Show the status if the previous call has finished; return whether the display still works."""
         self._waiting += new
         self._last = status
-        if self._lost or (self._work is not None and not self._work.done()):
-            return not self._lost
+        if self._unusable or (self._work is not None and not self._work.done()):
+            return not self._unusable
         try:
             if self._work is not None:
                 self._work.result()
         except (OSError, SystemExit):
-            self._lost = True
+            self._unusable = True
             return False
         self._work, self._waiting = self._thread.submit(self._show, status, self._waiting), []
         return True

@@ -30,10 +30,10 @@ FIGURES: tuple[tuple[str, str, tuple[str, ...], float], ...] = (
 def live_line(status: Status) -> str:
     """Return the status of a flight as one line."""
     control = status.control
-    flown_by = "watchdog" if status.watchdog_flies else control.get("mode", "not started")
+    controller = "watchdog" if status.watchdog_flies else control.get("mode", "not started")
     versions = ", ".join(f"{half} {n}" for half, n in control.get("versions", {}).items())
     return (
-        f"{max(0.0, status.t):.0f} s, {flown_by}, error {control.get('error', 0.0):.3f} m, "
+        f"{max(0.0, status.t):.0f} s, {controller}, error {control.get('error', 0.0):.3f} m, "
         f"versions: {versions}, missed ticks: {control.get('missed', 0)}"
     )
 
@@ -47,11 +47,11 @@ def live_rows(status: Status, events: LiveEvents) -> list[tuple[str, str]]:
     for half, version in control.get("versions", {}).items():
         rows.append((f"{half} updates", str(version)))
     rows.append(("missed ticks", str(control.get("missed", 0))))
-    if refused := control.get("refused"):
-        rows.append(("refused messages", ", ".join(f"{what}: {n}" for what, n in refused.items())))
+    if refusals := control.get("refused"):
+        rows.append(("refused messages", ", ".join(f"{what}: {n}" for what, n in refusals.items())))
     rows.append(("late samples, held commands", f"{status.world.get('late', 0)}, {status.world.get('held', 0)}"))
-    if lost := status.world.get("lost"):
-        rows.append(("simulation lost", f"{lost:.2f} s: the machine is busy"))
+    if lost_time := status.world.get("lost"):
+        rows.append(("simulation lost", f"{lost_time:.2f} s: the machine is busy"))
     rows.append(("processes", ", ".join(role if alive else f"{role} (dead)" for role, alive in status.alive.items())))
     if events.all:
         rows.append(("last event", f"{events.all[-1].t:.1f} s {events.all[-1].kind}: {events.all[-1].note}"))
@@ -67,15 +67,15 @@ def figures(rows: Sequence[dict[str, Any]]) -> tuple[tuple[str, str, str], ...]:
     values = {row["metric"]: row["value"] for row in rows}
     known = {name for _, _, names, _ in FIGURES for name in names}
     result = [
-        (label, unit, ", ".join(_shown(values[name], factor) for name in names))
+        (label, unit, ", ".join(_format(values[name], factor) for name in names))
         for label, unit, names, factor in FIGURES
         if values.keys() >= set(names)
     ]
-    rest = [(name.replace("_", " "), "", _shown(value, 1.0)) for name, value in values.items() if name not in known]
+    rest = [(name.replace("_", " "), "", _format(value, 1.0)) for name, value in values.items() if name not in known]
     return (*result, *rest)
 
 
-def _shown(value: Any, factor: float) -> str:
+def _format(value: Any, factor: float) -> str:
     if value is None:
         return "-"
     return f"{factor * value:.3g}" if isinstance(value, float) else str(value)

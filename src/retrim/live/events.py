@@ -27,16 +27,16 @@ class LiveEvents:
         """Swaps: time [s], parameter group, version, and age of the flight data from which it was learned [s]."""
         self._newest: dict[str, int] = {}
         self._mode, self._watchdog, self._log_failed = "policy", False, False
-        self._log_moved, self._watchdog_ticks = "", 0
+        self._log_location, self._watchdog_ticks = "", 0
         self._restarts: dict[str, int] = {}
         self._hangs: dict[str, int] = {}
-        self._given_up: set[int] = set()
-        self._refused: dict[str, int] = {}
-        self._knobs_refused = ""
-        self._next_excluded = 0.0  # [s]
+        self._withdrawals: set[int] = set()
+        self._refusals: dict[str, int] = {}
+        self._knob_refusal = ""
+        self._next_exclusion = 0.0  # [s]
         self._last_stage = -1.0  # [s], time of the last stage change that became an event
         self._vehicle_notes: set[str] = set()
-        self._identified = 0
+        self._identifications = 0
 
     def take(self, status: Status, others: Iterable[Event] = ()) -> list[Event]:
         """Return the new events, including ``others``."""
@@ -48,37 +48,37 @@ class LiveEvents:
                 self.swaps.append((at, half, version, age))
                 new.append(Event(at, half, f"version {version}, learnt from flight until {age:.2f} s before"))
         for version in control.get("given_up", []):
-            if version not in self._given_up:
-                self._given_up.add(version)
+            if version not in self._withdrawals:
+                self._withdrawals.add(version)
                 new.append(Event(t, "guard", f"policy: version {version} is taken back, or comes from one that was"))
         changes = [(at, stage, cause) for at, stage, cause in control.get("stages", []) if at > self._last_stage]
         for at, stage, cause in changes:
             self._last_stage = at
             new.append(Event(at, "stage", describe_condition(stage, cause)))
-        new += [Event(at, "vehicle", note) for at, note in status.vehicles[self._identified :]]
-        self._identified = max(self._identified, len(status.vehicles))
-        if (excluded := describe_counts(status.excluded)) and t >= self._next_excluded:
-            self._next_excluded = t + EXCLUDED_EVERY
-            new.append(Event(t, "excluded", f"measurements that contradict each other, in the window: {excluded}"))
-        new += [Event(t, "rejected", said) for said in status.rejections]
+        new += [Event(at, "vehicle", note) for at, note in status.vehicles[self._identifications :]]
+        self._identifications = max(self._identifications, len(status.vehicles))
+        if (exclusions := describe_counts(status.excluded)) and t >= self._next_exclusion:
+            self._next_exclusion = t + EXCLUDED_EVERY
+            new.append(Event(t, "excluded", f"measurements that contradict each other, in the window: {exclusions}"))
+        new += [Event(t, "rejected", text) for text in status.rejections]
         for what, count in control.get("refused", {}).items():
-            if count > self._refused.get(what, 0):
-                self._refused[what] = count
+            if count > self._refusals.get(what, 0):
+                self._refusals[what] = count
                 new.append(Event(t, "refused", f"message: {what}, {count} so far"))
-        new += [Event(t, "refused", said) for said in status.refusals]
+        new += [Event(t, "refused", text) for text in status.refusals]
         for note in status.world.get("notes", []):
             if note not in self._vehicle_notes:
                 self._vehicle_notes.add(note)
                 new.append(Event(t, "refused", f"vehicle: {note}; such messages are ignored"))
         new += self._processes(status)
-        if (refused := status.world.get("knobs_refused", "")) and refused != self._knobs_refused:
-            new.append(Event(t, "refused", f"knobs: {refused}"))
-        self._knobs_refused = refused
+        if (refusal := status.world.get("knobs_refused", "")) and refusal != self._knob_refusal:
+            new.append(Event(t, "refused", f"knobs: {refusal}"))
+        self._knob_refusal = refusal
         if status.log_failed and not self._log_failed:
             self._log_failed = True
             new.append(Event(t, "guard", f"log: the flight is no longer written down, {status.log_failed}"))
-        if status.log_moved != self._log_moved:
-            self._log_moved = status.log_moved
+        if status.log_moved != self._log_location:
+            self._log_location = status.log_moved
             new.append(Event(t, "log", status.log_moved))
         if status.watchdog_flies and not self._watchdog:
             new.append(Event(t, "guard", WATCHDOG))
@@ -96,12 +96,12 @@ class LiveEvents:
         """Return events about processes that hang or were restarted."""
         new = []
         for role in sorted(status.hangs.keys() | status.restarts.keys()):
-            hung = status.hangs.get(role, 0) > self._hangs.get(role, 0)
+            hangs = status.hangs.get(role, 0) > self._hangs.get(role, 0)
             again = status.restarts.get(role, 0) > self._restarts.get(role, 0)
-            why = f"the {role} process {HUNG if hung else 'had died'}"
+            why = f"the {role} process {HUNG if hangs else 'had died'}"
             if again:
                 new.append(Event(status.t, "restarted", why))
-            elif hung:
+            elif hangs:
                 new.append(Event(status.t, "guard", f"{why}; {WITHOUT.get(role, 'the flight goes on without it')}"))
         self._hangs, self._restarts = dict(status.hangs), dict(status.restarts)
         return new

@@ -24,12 +24,12 @@ from ..runkit.outputs import clear_outputs, write_events, write_learner_state, w
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from ..runtime.events import Event
-from ..tasks.transition import spliced
-from .child_processes import watched
+from ..tasks.transition import splice
+from .child_processes import watch_flight
 from .events import LiveEvents
 from .operator.page_access import page_url
 from .operator.requests import OperatorRequests
-from .report import complaints, flight_of, histograms, learnt_in, missing, results
+from .report import collect_learner_state, complaints, flight_of, histograms, missing, results
 from .session import LiveRequest, live_spec
 from .status import Status
 from .supervisor import Supervisor
@@ -49,7 +49,7 @@ class LiveFlight(NamedTuple):
     """Output files, with the most interesting ones first."""
     request: LiveRequest
     """Request for the flight; its set-up follows all references of the flight in sequence."""
-    landed: bool
+    has_landed: bool
     """Whether the vehicle landed normally, rather than being lost or crashing."""
     outlet: Outlet
     """Folder of the output files, with descriptions of the faults for missing files."""
@@ -82,62 +82,62 @@ def fly_live(
     events, outlet = LiveEvents(), Outlet(run.folder)
     with ExitStack() as screen:  # the display closes last, since a blocked terminal would delay everything else
         with Supervisor(replace(live_spec(request), spare=outlet.spare)) as supervisor:
-            if not _warmed_up(supervisor, run, reporter):
+            if not _warm_up(supervisor, run, reporter):
                 return None
             page = supervisor.spec.page
             if request.page is not None and page is not None and supervisor.page_port is not None:
                 opened(page_url(request.page[0], supervisor.page_port, page.token))
             show = screen.enter_context(display(events))
             with closing(OperatorRequests(request, supervisor)) as wishes:
-                status = watched(supervisor, request.seconds, events, show, run.stop, wishes)
-            if request.until_stopped and status.ended == "landed":
+                status = watch_flight(supervisor, request.seconds, events, show, run.stop, wishes)
+            if request.until_stop and status.end_reason == "landed":
                 run.stop.clear()  # this is the intended end
             start, trust = supervisor.start, supervisor.spec.trust
             learns = find_method(request.method).learns is not None
-            learnt = learnt_in(supervisor.bus, status, start, trust) if learns else None
+            state = collect_learner_state(supervisor.bus, status, start, trust) if learns else None
         if len(pieces := wishes.following.pieces) > 1:  # errors and figures cover all references of the flight
-            request = replace(request, setup=request.setup.on(spliced(pieces)))
-        done = _written(request, run, outlet, status, events, learnt, supervisor.refused)
-    reporter.say(f"flight over: {status.ended}")
+            request = replace(request, setup=request.setup.on(splice(pieces)))
+        done = _write(request, run, outlet, status, events, state, supervisor.refusals)
+    reporter.say(f"flight over: {status.end_reason}")
     return done
 
 
-def _written(
-    request: LiveRequest, run: Run, outlet: Outlet, status: Status, events: LiveEvents, learnt: LearnerState | None,
-    refused: dict[str, list[str]],
+def _write(
+    request: LiveRequest, run: Run, outlet: Outlet, status: Status, events: LiveEvents, state: LearnerState | None,
+    refusals: dict[str, list[str]],
 ) -> LiveFlight:  # fmt: skip
     """Write the output files of a flight, the learned parameters first."""
     preset, log = request.setup.preset, log_path(run.folder / "flight.csv", outlet.spare)
     try:
-        flight, rows = flight_of(request, events.all, status, learnt, log)
+        flight, rows = flight_of(request, events.all, status, state, log)
     except (PlantError, OSError):
-        if learnt is not None:
-            outlet.write("what was learnt", partial(write_state, learnt, preset))
+        if state is not None:
+            outlet.write("what was learnt", partial(write_state, state, preset))
         raise
     outlet.faults += missing(rows, status, preset.dt)
     if log.parent != run.folder:
         outlet.faults.append(status.log_moved or f"flight.csv cannot be written to {run.folder}; it is in {log.parent}")
     outlet.write("what was learnt", partial(write_learner_state, [flight], preset))
     outlet.write("events.jsonl", partial(write_events, [flight]))
-    recorded = _recorded(request, rows, events, outlet)
+    recording_path = _record(request, rows, events, outlet)
     result = results(request, flight, rows, status, events)
     path = outlet.write_results(
         run, result, seeds=[request.seed], preset=preset.name, seconds=float(flight.log.t[-1]),
-        ended=status.ended, scheduling=refused, histograms_ms=histograms(rows),
+        ended=status.end_reason, scheduling=refusals, histograms_ms=histograms(rows),
     )  # fmt: skip
     for start in run.folder.glob("start*.safetensors"):  # initial states, which the learned state contains
         start.unlink(missing_ok=True)
-    paths = [*recorded, *([] if path is None else [path]), log, *complaints(run.folder)]
-    return LiveFlight(flight, result, paths, request, status.ended == "landed", outlet)
+    paths = [*recording_path, *([] if path is None else [path]), log, *complaints(run.folder)]
+    return LiveFlight(flight, result, paths, request, status.end_reason == "landed", outlet)
 
 
-def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
+def _record(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
     """Write the flight with its landing as NPZ and for viewers; return the path of the requested recording, if any."""
     target = np.asarray(jax.jit(jax.vmap(request.setup.flight_task.target))(rows[:, 1]), dtype=float)
     recording = Recording(
         rows[:, 1], rows[:, MEASURED], rows[:, TRUE], rows[:, 2], rows[:, COMMAND],
         np.linalg.norm(rows[:, TRUE][:, :3] - target, axis=1), target,
-        flown_by=[Mode(int(row[-1])).name.lower() for row in rows], policy_age=rows[:, ACCOUNTS["policy_age"]],
+        controllers=[Mode(int(row[-1])).name.lower() for row in rows], policy_age=rows[:, ACCOUNTS["policy_age"]],
         events=events.all,
     )  # fmt: skip
     outlet.write("flight.npz", lambda folder: write_npz(folder / "flight.npz", recording))
@@ -154,7 +154,7 @@ def _recorded(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet
     return [place for path, place in result.items() if path == request.record and place is not None]
 
 
-def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:
+def _warm_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:
     """Wait until all processes are ready; return False if the user interrupted the wait."""
     with reporter.progress("warming up") as advance:
         for waiting, _ in supervisor.warm_up():
@@ -162,7 +162,7 @@ def _warmed_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:
             if run.interrupted:
                 reporter.say("interrupted before take-off; nothing has flown")
                 return False
-    for role, refused in supervisor.refused.items():
-        for what in refused:
+    for role, refusals in supervisor.refusals.items():
+        for what in refusals:
             reporter.say(f"{role}: no {what}")
     return True

@@ -41,8 +41,8 @@ class LearnerMission:
     def of(cls, number: int, reference: str | None, seed: int, base: str, layers: tuple[Layer, ...],
            floor: int, capacities: Mapping[str, int], start: Path) -> "LearnerMission":  # fmt: skip
         """Return the mission of a flight whose learners start from a file."""
-        carried = {topic: size for topic, size in capacities.items() if topic in (*OUT, *INTO)}
-        return cls(number, reference, seed, base, layers, floor, carried, start.read_bytes())
+        topic_sizes = {topic: size for topic, size in capacities.items() if topic in (*OUT, *INTO)}
+        return cls(number, reference, seed, base, layers, floor, topic_sizes, start.read_bytes())
 
     def check(self, trust: Collection[str]) -> None:
         """Check that the mission uses only Python names that the user of this machine trusts.
@@ -57,8 +57,8 @@ class LearnerMission:
         header = describe(self.start, kind="learnt", source="mission")
         preset = parse(header.get("preset", ""), source="mission, preset")
         check_trust((preset, self.reference), trust, source="mission")
-        followed = (self.reference or "", "" if preset.track is None else preset.track.reference)
-        if files := [name for name in (*followed, str(preset.vehicle)) if LOCAL.search(name)]:
+        references = (self.reference or "", "" if preset.track is None else preset.track.reference)
+        if files := [name for name in (*references, str(preset.vehicle)) if LOCAL.search(name)]:
             raise MessageError(f"mission: names a file of this machine, {excerpt(files[0])}; built-in names only")
 
     def pack(self) -> bytes:

@@ -56,10 +56,10 @@ class LearnerServer:
         self._distrust: float | None = None
         self._bus: SharedMemoryBus | None = None
         self._bridge: Bridge | None = None
-        self.carried = False
+        self.has_traffic = False
         """Whether the last step transferred a message; if not, the caller may sleep."""
-        self._known, self._beaten, self._standing = 0, float("-inf"), "waiting for a flight"
-        self._heard = (0, time.monotonic())
+        self._version, self._last_beat, self._standing = 0, float("-inf"), "waiting for a flight"
+        self._last_note = (0, time.monotonic())
 
     def __enter__(self) -> "LearnerServer":
         """Return the ground station."""
@@ -95,25 +95,25 @@ class LearnerServer:
             self._look()
             assert self._bridge is not None
             assert self._bus is not None
-            self.carried = self._bridge.step() > 0
-            if time.monotonic() - self._beaten > BEAT_EVERY:
-                self._beaten = time.monotonic()
+            self.has_traffic = self._bridge.step() > 0
+            if time.monotonic() - self._last_beat > BEAT_EVERY:
+                self._last_beat = time.monotonic()
                 self._standing = self._beat()
-            if ended := last_note(self._bus, "ended"):
+            if end_note := last_note(self._bus, "ended"):
                 self._tell(over=True)
                 time.sleep(FAREWELL)  # the flight keeps its bridge until it receives this note
-                yield one_line(f"flight over: {ended.get('reason', '')}")
+                yield one_line(f"flight over: {end_note.get('reason', '')}")
                 return
             yield self._standing
 
     def _look(self) -> bool:
         """Accept a new mission if one has arrived; return whether this station has a mission."""
-        message = self._network.latest("mission", self._known)
+        message = self._network.latest("mission", self._version)
         try:
             mission = None if message is None else LearnerMission.unpack(message.data)
         except MessageError:
             mission = None
-        self._known = self._known if message is None else message.version
+        self._version = self._version if message is None else message.version
         if mission is None:
             return self._mission is not None
         try:
@@ -139,11 +139,11 @@ class LearnerServer:
         self._end()
         self._bus = SharedMemoryBus.create({**mission.capacities, **{beat_topic(x): 1024 for x in mission.layers}})
         topics = mission.capacities  # a controller without a residual has no topic for residual parameters
-        out, into = ([topic for topic in carried if topic in topics] for carried in (OUT, INTO))
+        out, into = ([topic for topic in carried_topics if topic in topics] for carried_topics in (OUT, INTO))
         # The network still holds messages from the previous flight; its ticks, orders and reference do not apply here.
-        before = {} if self._bridge is None else self._bridge.known
-        known = {topic: before.get(topic, 0) for topic in out}
-        self._bridge = Bridge(self._network, self._bus, out=out, into=into, known=known)
+        before = {} if self._bridge is None else self._bridge.versions
+        versions = {topic: before.get(topic, 0) for topic in out}
+        self._bridge = Bridge(self._network, self._bus, out=out, into=into, versions=versions)
         self._mission, self.restarts = mission, {}
         self._pulses = Pulses(self._bus)
         for layer in mission.layers:
@@ -183,7 +183,7 @@ class LearnerServer:
     def _beat(self) -> str:
         """Report to the flight which learners are alive, restart dead ones, and return the status."""
         assert self._mission is not None
-        failed = ""
+        failure = ""
         for layer in self._pulses.hanging([each for each in self.processes if self.processes[each].poll() is None]):
             self.processes[layer].kill()
             self.processes[layer].wait()
@@ -194,15 +194,15 @@ class LearnerServer:
                 self.restarts[layer] = self.restarts.get(layer, 0) + 1
                 self._begin_with(layer)
             else:
-                failed = f"the {layer} learner on the ground died: {last_words(self.folder / f'{layer}.log')}"
-        self._tell(failed)
-        return failed or self._stands()
+                failure = f"the {layer} learner on the ground died: {last_words(self.folder / f'{layer}.log')}"
+        self._tell(failure)
+        return failure or self._stands()
 
-    def _tell(self, failed: str = "", *, over: bool = False) -> None:
+    def _tell(self, failure: str = "", *, over: bool = False) -> None:
         """Report to the flight which learners are alive and whether this station knows that the flight is over."""
         assert self._mission is not None
         alive = {layer: process.poll() is None for layer, process in self.processes.items()}
-        note = pack_note("ground", base=self._mission.base, alive=alive, failed=failed, over=over)
+        note = pack_note("ground", base=self._mission.base, alive=alive, failed=failure, over=over)
         self._network.publish("ground", note)
 
     def _stands(self) -> str:
@@ -212,21 +212,21 @@ class LearnerServer:
         if not all(last_note(self._bus, f"ready.{layer}", "ready") for layer in self.processes):
             return "compiling; the flight waits"
         done = {layer: last_note(self._bus, f"learner.{layer}").get("learnt", 0) for layer in self.processes}
-        refused = f"; messages refused: {n}" if (n := self._network.refused) else ""
-        return "learnt: " + ", ".join(f"{layer} {n}" for layer, n in done.items()) + refused
+        refusals = f"; messages refused: {n}" if (n := self._network.refusals) else ""
+        return "learnt: " + ", ".join(f"{layer} {n}" for layer, n in done.items()) + refusals
 
     def _silence(self) -> float:
         message = None if self._bus is None else self._bus.latest("status")
         version = 0 if message is None else message.version
-        if version != self._heard[0] or not version:
-            self._heard = version, time.monotonic()
-        return time.monotonic() - self._heard[1]
+        if version != self._last_note[0] or not version:
+            self._last_note = version, time.monotonic()
+        return time.monotonic() - self._last_note[1]
 
 
 def learn_for(
     addresses: Sequence[Address],
     stop: threading.Event,
-    told: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     trust: tuple[str, ...] = (),
 ) -> str:
     """Learn for flights on other machines until all of them are over.
@@ -237,7 +237,7 @@ def learn_for(
     Args:
         addresses: Addresses of the flights.
         stop: Event that ends learning early; the flights continue with their last policies.
-        told: Function that is called at a high rate with the status of the flights.
+        report: Function that is called at a high rate with the status of the flights.
         trust: Python names that a flight may use, e.g. ``mine:task``; this machine imports these names.
 
     Returns:
@@ -269,7 +269,7 @@ def learn_for(
                 for flight in now.done:  # report a failure immediately, since the other flights may last long
                     if (error := flight.exception()) is not None:
                         stands[flights[flight]] = f"failed: {error!r}"
-                told(_summary(stands))
+                report(_summary(stands))
         except BaseException:
             stop.set()  # end the threads, too
             raise
@@ -288,7 +288,7 @@ def _serve(ground: LearnerServer, stands: dict[LearnerServer, str], stop: thread
         stands[ground] = words
         if stop.is_set():
             return
-        if not ground.carried:
+        if not ground.has_traffic:
             time.sleep(IDLE)
 
 

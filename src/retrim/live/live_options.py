@@ -24,8 +24,8 @@ def choices(setup: Setup, present: str) -> tuple[str, ...]:
         setup: Set-up of the flight.
         present: Name of the current reference.
     """
-    seen = jax.tree.leaves(setup.flight_task.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
-    if not any(isinstance(part, Reference) for part in seen):
+    leaves = jax.tree.leaves(setup.flight_task.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
+    if not any(isinstance(part, Reference) for part in leaves):
         return ()
     return (present, *(name for name in REFERENCES if name != present))
 

@@ -25,35 +25,35 @@ class RefusedNotes:
         """
         self.count = 0
         """Number of refused notes and inputs so far."""
-        self._bus, self._known = bus, {topic: 0 for topic in topics if topic.startswith(NOTES)}
-        self._refused, self._told_so_far = dict.fromkeys(self._known, 0), dict[str, int]()
+        self._bus, self._versions = bus, {topic: 0 for topic in topics if topic.startswith(NOTES)}
+        self._refusals, self._report_counts = dict.fromkeys(self._versions, 0), dict[str, int]()
 
     def look(self) -> list[str]:
         """Return one line for each topic that has reached its 1st, 10th, 100th, etc. refusal since the last call."""
-        said = []
-        for topic, known in self._known.items():
-            message = self._bus.latest(topic, known)
+        lines = []
+        for topic, version in self._versions.items():
+            message = self._bus.latest(topic, version)
             if message is None:
                 continue
-            self._known[topic] = message.version
+            self._versions[topic] = message.version
             try:
                 unpack_note(message.data, "ready" if topic.startswith("ready.") else topic)
             except MessageError as error:
-                said += self._count(topic, 1, str(error))
+                lines += self._count(topic, 1, str(error))
             else:
-                said += self._told(topic) if topic in (PAGE, NETWORK) else []
-        return said
+                lines += self._count_refusals(topic) if topic in (PAGE, NETWORK) else []
+        return lines
 
-    def _told(self, topic: str) -> list[str]:
+    def _count_refusals(self, topic: str) -> list[str]:
         """Count the new refusals that a process has published."""
         note = last_note(self._bus, topic)
-        before, now = self._told_so_far.get(topic, 0), note.get("count", 0)
-        self._told_so_far[topic] = now
+        before, now = self._report_counts.get(topic, 0), note.get("count", 0)
+        self._report_counts[topic] = now
         more = now - before if now >= before else now  # the process was restarted
         return self._count(topic, more, note.get("last", "")) if more else []
 
     def _count(self, topic: str, more: int, why: str) -> list[str]:
-        before, now = self._refused[topic], self._refused[topic] + more
-        self._refused[topic], self.count = now, self.count + more
+        before, now = self._refusals[topic], self._refusals[topic] + more
+        self._refusals[topic], self.count = now, self.count + more
         source = topic.partition(".")[2] if topic in (PAGE, NETWORK) else f"note {topic}"
         return [f"{source}: {why}; {now} so far"] if len(str(now)) > len(str(before)) or not before else []

@@ -36,13 +36,13 @@ class RemoteLearners:
 
     def alive(self) -> dict[str, bool]:
         """Return whether each learner is alive according to the last message from the learners' machine."""
-        message, said = self._bus.latest("ground"), None
+        message, note = self._bus.latest("ground"), None
         if message is not None:
             if message.version != self._beat[0]:
                 self._beat = message.version, time.monotonic()
-            said = last_note(self._bus, "ground").get("alive")
+            note = last_note(self._bus, "ground").get("alive")
         fresh = time.monotonic() - self._beat[1] < LOST
-        return {layer: fresh and isinstance(said, dict) and bool(said.get(layer)) for layer in self._spec.layers}
+        return {layer: fresh and isinstance(note, dict) and bool(note.get(layer)) for layer in self._spec.layers}
 
     def ready(self, layer: str) -> bool:
         """Return whether a learner is ready for this flight rather than for an earlier one."""
@@ -54,9 +54,9 @@ class RemoteLearners:
         self._distrust = (self._distrust or time.monotonic()) if fault else None
         if self._distrust is not None and time.monotonic() > self._distrust + DISTRUST:
             return f"{self._spec.learners}: {fault}"
-        said = last_note(self._bus, "ground")
-        words = said.get("failed")
-        if said.get("base") != self._spec.controller.base or not isinstance(words, str) or not words:
+        note = last_note(self._bus, "ground")
+        words = note.get("failed")
+        if note.get("base") != self._spec.controller.base or not isinstance(words, str) or not words:
             return None
         return words
 
@@ -66,10 +66,10 @@ class RemoteLearners:
         The learners run until they receive the note about the end of the flight.
         """
         base, began = self._spec.controller.base, time.monotonic()
-        while (waited := time.monotonic() - began) < PARTING:
-            said = last_note(self._bus, "ground")
-            if said.get("over") and said.get("base") == base:
+        while (waiting_time := time.monotonic() - began) < PARTING:
+            note = last_note(self._bus, "ground")
+            if note.get("over") and note.get("base") == base:
                 return
-            if waited > FAREWELL and not any(self.alive().values()):  # their last message may be in transit
+            if waiting_time > FAREWELL and not any(self.alive().values()):  # their last message may be in transit
                 return
             time.sleep(0.02)

@@ -21,7 +21,7 @@ from ..config.setup import Setup
 from ..config.trust import python_names
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError
-from ..io.trained import save_learner_state
+from ..io.policies import save_learner_state
 from ..onboard.guard import Limits
 from ..onboard.messages import MOST_TICKS
 from ..physics.state import State
@@ -90,11 +90,11 @@ class LiveRequest:
     """Maximum age of the flight data from which the policy was learned [s]."""
     record: Path | None = None
     """Path of an additional recording; None for no additional recording."""
-    until_stopped: bool = False
+    until_stop: bool = False
     """Whether an interruption is the intended end of the flight."""
 
     @property
-    def followed(self) -> str:
+    def reference_name(self) -> str:
         """Name of the initial reference; empty if there is no reference."""
         track = self.setup.preset.track
         return self.scenario.reference or ("" if track is None else track.reference)
@@ -178,12 +178,12 @@ def learners_at(text: str | None, say: Callable[[str], None], key: Path | None =
         ConfigError: The text is not an address, a required package is not installed, an address outside this machine
             has no key, or a key was passed but is not needed.
     """
-    shared = read_key(key)
+    key_shared = read_key(key)
     if text is None:
         if key is not None:
             raise ConfigError("--key without --learners: learners on this machine need no key")
         return None
-    address = Address.of(text, shared)
+    address = Address.of(text, key_shared)
     address.check_shared()
     if address.kind == "zenoh" and find_spec("zenoh") is None:
         raise ConfigError("a bus by zenoh needs zenoh: pip install eclipse-zenoh")
@@ -198,18 +198,18 @@ def _check_remote(request: LiveRequest) -> None:
     if find_method(request.method).learns is None:
         raise ConfigError(f"--learners: {request.method!r} does not learn; {' and '.join(learning_methods())} do")
     preset = request.setup.preset
-    trained_on = preset.track.reference if preset.track is not None else ""
-    flown_on = request.scenario.reference or ""
-    named = (
+    training_reference = preset.track.reference if preset.track is not None else ""
+    reference = request.scenario.reference or ""
+    names = (
         preset.task,
         preset.adapt.residual,
         preset.adapt.learner,
         preset.adapt.optimiser,
         preset.pretrain.network,
-        *trained_on.split("+"),
-        *flown_on.split("+"),
+        *training_reference.split("+"),
+        *reference.split("+"),
     )
-    if local := sorted({name for name in named if ":" in name or ".csv" in name.lower()}):
+    if local := sorted({name for name in names if ":" in name or ".csv" in name.lower()}):
         raise ConfigError(f"--learners: another machine does not have {', '.join(local)}; built-in ones only")
 
 
@@ -223,8 +223,8 @@ def learner_state(request: LiveRequest, policy: AbstractPolicy, method: str, res
         residual: State of the fitted residual; None for the initial state.
     """
     key, prepare = request.flight.key(), find_method(method).learns
-    chosen = policy if prepare is None else prepare(request.setup, policy, key)
-    state = request.setup.learner.init(chosen, random.split(key)[0])
+    start_policy = policy if prepare is None else prepare(request.setup, policy, key)
+    state = request.setup.learner.init(start_policy, random.split(key)[0])
     return state if residual is None else LearnerState(state.policy, residual)
 
 
@@ -236,14 +236,14 @@ def _page(request: LiveRequest) -> PageSpec:
     methods = tuple(dict.fromkeys((request.method, *learning_methods()))) if learns else ()
     arm = float(np.hypot(*np.asarray(vehicle.arm)))
     name, mass = request.setup.preset.name, float(vehicle.mass)
-    offered = choices(request.setup, request.followed) if methods else ()
+    offer = choices(request.setup, request.reference_name) if methods else ()
     places = _places(request, PATH_S)
     scenario = request.scenario
     world = f"plant {scenario.plant}, disturbance {scenario.disturbance}"
     seconds = min(request.seconds, WORLD_S)
     if effects := describe_disturbance(scenario.disturbance, request.setup.flight_task.home(), seconds):
         world += f" ({effects})"
-    return PageSpec(host, free_port(host, port), name, places, methods, arm, mass, paths(offered, PATH_S), world)
+    return PageSpec(host, free_port(host, port), name, places, methods, arm, mass, paths(offer, PATH_S), world)
 
 
 def _limits(request: LiveRequest) -> Limits:

@@ -14,7 +14,7 @@ class Status:
     world: dict[str, Any]
     alive: dict[str, bool]
     restarts: dict[str, int]
-    ended: str | None
+    end_reason: str | None
     """Reason for the end of the flight; None before the end."""
     rejections: list[str]
     """Reasons why learners have rejected their own results since the last status."""

@@ -13,7 +13,7 @@ from typing import Any
 from ..errors import MessageError, PlantError
 from ..onboard.heartbeat import Heart
 from ..onboard.launch import last_words, launch
-from ..onboard.messages import STOPPED, last_height, last_note, last_sent, pack_note, ticks_of
+from ..onboard.messages import STOPPED, last_height, last_note, last_send_time, pack_note, ticks_of
 from ..onboard.note_fields import plain
 from ..onboard.pulses import SILENCE, Pulses
 from ..onboard.realtime import cores_of
@@ -42,13 +42,13 @@ class Supervisor:
     restarts: dict[str, int] = field(default_factory=dict)
     hangs: dict[str, int] = field(default_factory=dict)
     """Number of times each process was ended because it was silent."""
-    refused: dict[str, list[str]] = field(default_factory=dict)
+    refusals: dict[str, list[str]] = field(default_factory=dict)
     """Requests that the operating system refused, by role."""
     epoch: float | None = None
     _landing: bool = False
-    _moved: str = ""
+    _log_location: str = ""
     _airborne_ordered: bool = False
-    _said: dict[str, int] = field(default_factory=dict)
+    _report_versions: dict[str, int] = field(default_factory=dict)
     _remote: RemoteLearners | None = None
 
     def __enter__(self) -> "Supervisor":
@@ -107,10 +107,10 @@ class Supervisor:
                 raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; nothing has flown")
             yield ", ".join(waiting), time.monotonic() - began
             time.sleep(0.1)
-        if failed := last_note(self.bus, "ready.recorder", "ready").get("failed"):
-            raise PlantError(f"the flight cannot be written down: {failed}")
+        if failure := last_note(self.bus, "ready.recorder", "ready").get("failed"):
+            raise PlantError(f"the flight cannot be written down: {failure}")
         for name in (name for name, role in ROLES.items() if role.priority):
-            self.refused[name] = last_note(self.bus, f"ready.{name}", "ready").get("refused", [])
+            self.refusals[name] = last_note(self.bus, f"ready.{name}", "ready").get("refused", [])
         if last_note(self.bus, "ready.plant", "ready").get("stands"):
             yield from self._lift_off()
 
@@ -141,9 +141,9 @@ class Supervisor:
             self._landing = True
             self.bus.publish("order", pack_note("order", epoch=self.epoch, order="land"))
 
-    def learn(self, *, paused: bool, flown: bool) -> None:
+    def learn(self, *, pause: bool, active: bool) -> None:
         """Run or pause the learners, and fly with the learned parameters or the initial ones."""
-        self.bus.publish("learning", pack_note("learning", paused=paused, flown=flown))
+        self.bus.publish("learning", pack_note("learning", paused=pause, flown=active))
 
     def learn_from(self, start: Path) -> None:
         """Restart the policy learner from the learned state in a file."""
@@ -171,32 +171,32 @@ class Supervisor:
         """Restart processes that died or hang if their role permits a restart; return the flight's status."""
         assert self.epoch is not None
         self._heart.beat()
-        ended = last_note(self.bus, "ended").get("reason")
-        if ended is None:
+        reason = last_note(self.bus, "ended").get("reason")
+        if reason is None:
             self._end_hanging()
             for role, process in self.processes.items():
-                died = process.poll() not in (None, 0)  # a regular exit means that the flight is over
-                if ROLES[role].restarted and died and self.restarts.get(role, 0) < ATTEMPTS:
+                has_failed = process.poll() not in (None, 0)  # a regular exit means that the flight is over
+                if ROLES[role].restarted and has_failed and self.restarts.get(role, 0) < ATTEMPTS:
                     self._restart(role)
             if self.processes["plant"].poll() is not None:
-                ended = self._lost_plant()
+                reason = self._lost_plant()
         alive = {role: process.poll() is None for role, process in self.processes.items()}
         if self._remote is not None:
             alive |= self._remote.alive()
         control, world = last_note(self.bus, "status"), last_note(self.bus, "world")
         log = last_note(self.bus, "ready.recorder", "ready")
-        self._moved = log.get("moved") or self._moved
+        self._log_location = log.get("moved") or self._log_location
         t, fallback = time.monotonic() - self.epoch, self.bus.latest("fallback")
-        by_watchdog = last_sent(self.bus, "fallback") > last_sent(self.bus, "setpoint")
+        by_watchdog = last_send_time(self.bus, "fallback") > last_send_time(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
-        said, stalls, excluded = (
+        lines, stalls, fit = (
             self._rejections(),
             last_note(self.bus, "stalls"),
             last_note(self.bus, "learner.residual"),
         )
         return Status(
-            t, control, world, alive, dict(self.restarts), ended, said, by_watchdog, ticks, log.get("failed"), stalls,
-            self._notes.look(), self._notes.count, excluded.get("excluded", []), dict(self.hangs), self._moved,
+            t, control, world, alive, dict(self.restarts), reason, lines, by_watchdog, ticks, log.get("failed"), stalls,
+            self._notes.look(), self._notes.count, fit.get("excluded", []), dict(self.hangs), self._log_location,
             ticks_of(self.bus), last_note(self.bus, "identified").get("reports", []),
         )  # fmt: skip
 
@@ -239,8 +239,8 @@ class Supervisor:
 
     def _lost_plant(self) -> str:
         """Return the reason for the end of a flight whose plant process has ended."""
-        if said := last_note(self.bus, "ended").get("reason"):
-            return str(said)
+        if lines := last_note(self.bus, "ended").get("reason"):
+            return str(lines)
         if "plant" in self.hangs:
             flies_on = self.spec.scenario.entry.is_vehicle
             what = "left to its autopilot" if flies_on else STOPPED
@@ -261,8 +261,8 @@ class Supervisor:
         return role in self.processes and self.processes[role].poll() is None
 
     def _check_alive(self) -> None:
-        if self._remote is not None and (failed := self._remote.failed()) is not None:
-            raise PlantError(failed)
+        if self._remote is not None and (failure := self._remote.failed()) is not None:
+            raise PlantError(failure)
         if why := last_note(self.bus, "ended").get("reason"):
             raise PlantError(f"the flight ended before it began: {why}")
         for role in self.processes:
@@ -272,13 +272,13 @@ class Supervisor:
     def _rejections(self) -> list[str]:
         result = []
         for layer in self.spec.layers:
-            message = self.bus.latest(f"said.{layer}", self._said.get(layer, 0))
+            message = self.bus.latest(f"said.{layer}", self._report_versions.get(layer, 0))
             if message is None:
                 continue
-            self._said[layer] = message.version
+            self._report_versions[layer] = message.version
             with contextlib.suppress(MessageError, KeyError, ValueError, TypeError):
-                said = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
-                result.append(f"{layer}: {plain(str(said['reason']))}")
+                lines = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
+                result.append(f"{layer}: {plain(str(lines['reason']))}")
         return result
 
     def _start(self, role: str) -> None:

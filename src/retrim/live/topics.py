@@ -14,7 +14,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
     half = {name: sum(a.nbytes for a in arrays.values()) for name, arrays in spec.controller.parameters.items()}
     rows = 8 * len(COLUMNS) * spec.window + 10_000
     # Leave room for a policy with its optimiser's moments, even if the current method learns only a low-rank delta.
-    learnt = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
+    state_size = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
     beating = [name for name, role in ROLES.items() if role.restarted]
     return (
         dict.fromkeys(SMALL, 4096)
@@ -22,7 +22,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
         | {f"ready.{role}": 8192 for role in ROLES}
         | {f"beat.{role}": 1024 for role in ("supervisor", *beating)}
         | {f"parameters.{name}": size + 100_000 for name, size in ({REFERENCE: 0} | half).items()}
-        | {"mission": learnt}
-        | {slot(layer, i): learnt for layer in LAYERS for i in range(SLOTS)}
+        | {"mission": state_size}
+        | {slot(layer, i): state_size for layer in LAYERS for i in range(SLOTS)}
         | {f"{what}.{layer}": 8192 for what in ("said", "learner") for layer in LAYERS}
     )

@@ -11,7 +11,7 @@ def wait_for_take_off(bus: Bus, parent: ParentWatch) -> float | None:
 
     Return None if the supervisor ends before it gives this order.
     """
-    while not parent.gone(0.01):
+    while not parent.has_ended(0.01):
         message = bus.latest("order")
         try:
             epoch = None if message is None else unpack_note(message.data, "order").get("epoch")

@@ -21,7 +21,7 @@ REPORT_EVERY = 5  # ticks
 GAPS = 100  # number of gaps that are kept, the newest ones
 LANDING = "landing"
 BRIEF = PHASE / 4  # of a tick: longest duration of a decision that is rehearsed
-FELT = 0.1  # weight of a tick in the running mean of the disturbance
+SMOOTHING = 0.1  # weight of a tick in the running mean of the disturbance
 
 
 class ControlLoop:
@@ -40,26 +40,26 @@ class ControlLoop:
         self.over = False
         """Whether the flight has ended and all its ticks have been reported."""
         self.error = 0.0
-        self.missed, self.late_samples = 0, 0  # before the landing
+        self.missed_ticks, self.late_samples = 0, 0  # before the landing
         self.gaps: deque[tuple[float, float, int]] = deque(maxlen=GAPS)
         """Gaps in the ticks: start and end on the monotonic clock [s], and number of missed ticks."""
-        self.felt, self.estimate = np.zeros(3), np.zeros(3)
+        self.disturbance, self.estimate = np.zeros(3), np.zeros(3)
         """Running means of the simple model's acceleration error and of the residual model's estimate of this error, in
         the world frame [m/s^2]."""
         self.stages: deque[tuple[float, int, int]] = deque(maxlen=GAPS)
         """Changes of the controller's stage: time since the start [s], stage and cause."""
         self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
         self._row: np.ndarray | None = None
-        self._start, self._issued, self._target = 0.0, np.array([]), np.zeros(3)
+        self._start, self._command, self._target = 0.0, np.array([]), np.zeros(3)
         self._commands: deque[np.ndarray] = deque(maxlen=plan.delay_ticks + 1)
-        self._known = {"sample": 0, "order": 0, "learning": 0}
+        self._versions = {"sample": 0, "order": 0, "learning": 0}
         self._landing, self._gap, self._ticks = "", "", 0
-        self._ended: tuple[Sample, Sample] | None = None
+        self._end_samples: tuple[Sample, Sample] | None = None
         self._usual = float("inf")  # usual duration of a decision [s]
 
     def new_sample(self) -> bool:
         """Return whether there is an unanswered measurement."""
-        return self.bus.latest("sample", self._known["sample"]) is not None
+        return self.bus.latest("sample", self._versions["sample"]) is not None
 
     def warm_up(self) -> None:
         """Run every program before the flight so that its first call in flight is not slow.
@@ -75,7 +75,7 @@ class ControlLoop:
             Setpoint(i, began, u, self.pilot.target(t)).pack()
             took.append(time.monotonic() - began)
             self.pilot.accepted(u)
-            self.pilot.predicted(x, u)
+            self.pilot.predict(x, u)
             self._fallback.hover.command(x, x[:3])
         self._fallback.rest()
         self._usual = float(np.median(took))
@@ -91,24 +91,24 @@ class ControlLoop:
         sample, stamp = self.sample, self.stamp
         if sample is None or stamp is None:
             return None
-        t, age = sample.t - self._start, sample.age + now - sample.sent
+        t, age = sample.t - self._start, sample.age + now - sample.send_time
         fresh = age <= self.plan.limits.state_age
         u = self._policy(sample, t, age, new) if self.mode == Mode.POLICY else None
         if u is None:
             u, self.mode = self._fallback.step(sample.state, fresh, self._target, land=bool(self._landing))
-            self._issued = u if self.mode in OVER else self.plan.limits.within(u)
+            self._command = u if self.mode in OVER else self.plan.limits.within(u)
         over, blind = self.mode in OVER, self.mode == Mode.DROP
-        setpoint = Setpoint(stamp.tick, time.monotonic(), self._issued, self._target, over, blind)
-        if not setpoint.landed:
+        setpoint = Setpoint(stamp.tick, time.monotonic(), self._command, self._target, over, blind)
+        if not setpoint.is_final:
             self.bus.publish("setpoint", setpoint.pack())
         if new:
-            accounts = [lateness, time.monotonic() - began, 0.0, age, t - self.intake.learnt, self.mode]
+            accounts = [lateness, time.monotonic() - began, 0.0, age, t - self.intake.data_time, self.mode]
             head = [sample.tick, t, sample.age]
-            self._row = np.concatenate([head, sample.state, sample.truth, self._issued, accounts])
+            self._row = np.concatenate([head, sample.state, sample.truth, self._command, accounts])
         elif self.mode in (Mode.BLIND, Mode.DROP):
             self._finish_row(None)
-            self.rows.append(blind_row(sample, stamp, now, self._start, self.plan.dt, self._issued, self.mode))
-        if setpoint.landed:  # publish the ticks first, since the plant and the recorder end at this command
+            self.rows.append(blind_row(sample, stamp, now, self._start, self.plan.dt, self._command, self.mode))
+        if setpoint.is_final:  # publish the ticks first, since the plant and the recorder end at this command
             self._finish_row(None)
             self._publish_rows()
             self.bus.publish("setpoint", setpoint.pack())
@@ -118,7 +118,7 @@ class ControlLoop:
         """Repeat the computation for the newest measurement to fill the processor's caches, and discard the result."""
         if (sample := self.sample) is not None and self.mode == Mode.POLICY and self._usual < BRIEF * self.plan.dt:
             self.pilot.rehearse(sample.t - self._start, sample.age, sample.state)
-            self.plan.limits.broken(Sample.unpack(sample.pack()).state)
+            self.plan.limits.find_violation(Sample.unpack(sample.pack()).state)
 
     def idle(self) -> None:
         """Do the work that is not urgent, such as reading orders and new parameters and publishing reports."""
@@ -134,8 +134,8 @@ class ControlLoop:
         if self.mode == Mode.POLICY:
             self.intake.poll(t)
         self._ticks += 1
-        ended = self.bus.latest("ended") is not None and not self.new_sample()
-        self.over = self.mode in OVER or ended
+        has_end = self.bus.latest("ended") is not None and not self.new_sample()
+        self.over = self.mode in OVER or has_end
         if self.over:  # no later measurement will report the command that the plant accepted
             self._finish_row(None)
         self._publish_rows()  # on each tick, so the log contains the last tick whenever this process dies
@@ -149,9 +149,10 @@ class ControlLoop:
         intake = self.intake
         self.bus.publish("status", pack_note(
             "status", mode=self.mode.name.lower(), reason=self.reason, error=self.error, versions=self.pilot.versions,
-            newest=intake.newest, given_up=intake.given_up, refused=intake.refused, swaps=list(intake.swaps),
-            missed=self.missed, gaps=list(self.gaps), late_samples=self.late_samples, felt=self.felt.tolist(),
-            estimate=self.estimate.tolist(), target=self._target.tolist(), learning=self.intake.open,
+            newest=intake.newest, given_up=intake.withdrawals, refused=intake.refusals, swaps=list(intake.swaps),
+            missed=self.missed_ticks, gaps=list(self.gaps), late_samples=self.late_samples,
+            felt=self.disturbance.tolist(), estimate=self.estimate.tolist(),
+            target=self._target.tolist(), learning=self.intake.open,
             stages=list(self.stages),
         ))  # fmt: skip
 
@@ -165,23 +166,23 @@ class ControlLoop:
         wrong = self._landing or self._gap
         if age > limits.state_age:
             wrong = wrong or f"the newest measurement is {age:.3f} s old"
-        wrong = wrong or limits.broken(sample.state) or ""
-        if t - self.intake.learnt > limits.policy_age:
-            wrong = wrong or f"the policy was learnt {t - self.intake.learnt:.1f} s ago"
-        if not wrong and not new and len(self._issued):
-            return self._issued
+        wrong = wrong or limits.find_violation(sample.state) or ""
+        if t - self.intake.data_time > limits.policy_age:
+            wrong = wrong or f"the policy was learnt {t - self.intake.data_time:.1f} s ago"
+        if not wrong and not new and len(self._command):
+            return self._command
         if not wrong:
             stage = self.pilot.condition[0]
-            u, aimed = self.pilot.act(t, sample.age, sample.state), self._aim(t)
+            u, target = self.pilot.act(t, sample.age, sample.state), self._aim(t)
             if self.pilot.condition[0] != stage:
                 self.stages.append((t, *self.pilot.condition))
-            if aimed and np.isfinite(u).all():
-                self._issued = self.plan.limits.within(u)
-                if (self._issued != u).any():
-                    self.pilot.accepted(self._issued)
+            if target and np.isfinite(u).all():
+                self._command = self.plan.limits.within(u)
+                if (self._command != u).any():
+                    self.pilot.accepted(self._command)
                 self.error = float(np.linalg.norm(sample.state[:3] - self._target))
-                return self._issued
-            wrong = "the policy's command is not finite" if aimed else "the target is not finite"
+                return self._command
+            wrong = "the policy's command is not finite" if target else "the target is not finite"
         self.mode, self.reason = Mode.HOLD, wrong
         return None
 
@@ -193,10 +194,10 @@ class ControlLoop:
         return finite
 
     def _receive(self) -> bool:
-        message = self.bus.latest("sample", self._known["sample"])
+        message = self.bus.latest("sample", self._versions["sample"])
         if message is None:
             return False
-        self._known["sample"] = message.version
+        self._versions["sample"] = message.version
         try:
             sample = Sample.unpack(message.data)
         except MessageError:
@@ -215,45 +216,45 @@ class ControlLoop:
             return False
         else:
             self._follow(before, sample)
-        self.sample, self.stamp = sample, Stamp(sample.tick, sample.sent)
+        self.sample, self.stamp = sample, Stamp(sample.tick, sample.send_time)
         return True
 
     def _follow(self, before: Sample, sample: Sample) -> None:
         """Process the accepted command and the number of missed ticks since the previous sample."""
-        accepted, lost = np.asarray(sample.accepted), sample.tick - before.tick - 1
-        if lost and not self._landing:
-            self.missed += lost
-            self.gaps.append((before.sent, sample.sent, lost))
-        if lost * self.plan.dt > self.plan.limits.state_age:
-            self._gap = f"{lost} measurements were not answered"
-        if self.mode == Mode.POLICY and np.abs(accepted - self._issued).max() > 1e-4:
-            self.pilot.accepted(accepted)
-        self._finish_row(None if lost else accepted)
-        self._commands.append(accepted)
-        self._ended = None if lost else (before, sample)
+        accepted_u, lost_ticks = np.asarray(sample.accepted), sample.tick - before.tick - 1
+        if lost_ticks and not self._landing:
+            self.missed_ticks += lost_ticks
+            self.gaps.append((before.send_time, sample.send_time, lost_ticks))
+        if lost_ticks * self.plan.dt > self.plan.limits.state_age:
+            self._gap = f"{lost_ticks} measurements were not answered"
+        if self.mode == Mode.POLICY and np.abs(accepted_u - self._command).max() > 1e-4:
+            self.pilot.accepted(accepted_u)
+        self._finish_row(None if lost_ticks else accepted_u)
+        self._commands.append(accepted_u)
+        self._end_samples = None if lost_ticks else (before, sample)
 
     def _watch(self) -> None:
         """Evaluate the model errors and the distance from the target over the past tick."""
-        if self._ended is None:
+        if self._end_samples is None:
             return
-        (before, sample), self._ended = self._ended, None
+        (before, sample), self._end_samples = self._end_samples, None
         self._fallback.hover.feel(before.state, sample.state, self._commands[0])
         if self.mode == Mode.POLICY:
             a = (sample.state[12:] - before.state[12:]) / self.plan.dt
-            predicted = self.pilot.predicted(before.state, self._commands[0])
+            prediction = self.pilot.predict(before.state, self._commands[0])
             simple = self._commands[0][0] * before.state[[5, 8, 11]] - G * UP
-            self.felt += FELT * (a - simple - self.felt)
-            self.estimate += FELT * (predicted - simple - self.estimate)
-            missed = float(np.linalg.norm(a - predicted))
+            self.disturbance += SMOOTHING * (a - simple - self.disturbance)
+            self.estimate += SMOOTHING * (prediction - simple - self.estimate)
+            model_error = float(np.linalg.norm(a - prediction))
             target = self.pilot.target(sample.t - self._start)
-            self.intake.watch(float(np.linalg.norm(sample.state[:3] - target)), missed)
+            self.intake.watch(float(np.linalg.norm(sample.state[:3] - target)), model_error)
 
-    def _finish_row(self, accepted: np.ndarray | None) -> None:
+    def _finish_row(self, accepted_u: np.ndarray | None) -> None:
         """Add the last tick to the report, with the command that the plant accepted if that command is known."""
         if self._row is None:
             return
-        if accepted is not None:
-            self._row[COMMAND] = accepted
+        if accepted_u is not None:
+            self._row[COMMAND] = accepted_u
         self.rows.append(self._row)
         self._row = None
 
@@ -262,10 +263,10 @@ class ControlLoop:
             self.bus.publish("flight", FlightRows(np.stack(self.rows)).pack())
 
     def _new(self, topic: str) -> dict[str, Any] | None:
-        message = self.bus.latest(topic, self._known[topic])
+        message = self.bus.latest(topic, self._versions[topic])
         if message is None:
             return None
-        self._known[topic] = message.version
+        self._versions[topic] = message.version
         try:
             return unpack_note(message.data, topic)
         except MessageError:

@@ -31,16 +31,16 @@ class Schedule:
 
     def done(self, now: float, sample: Stamp | None) -> None:
         """Record the sample that the step answered, and its lateness."""
-        answered = self._tick
+        last_answer = self._tick
         if sample is not None:
-            drift = sample.sent - sample.tick * self._dt - self._epoch
+            drift = sample.send_time - sample.tick * self._dt - self._epoch
             self._behind = self._behind + 1 if drift > PHASE * self._dt else 0
             if self._behind >= 3:  # one late sample does not count; several in a row mean that the plant had stopped
-                self._epoch, answered, self._behind = self._epoch + drift, sample.tick, 0
+                self._epoch, last_answer, self._behind = self._epoch + drift, sample.tick, 0
             elif drift <= PHASE * self._dt:
                 self._epoch += 0.1 * drift
         due = math.floor((now - self._epoch) / self._dt - PHASE - LATE)
-        self._tick = max(answered, due) + 1
+        self._tick = max(last_answer, due) + 1
 
 
 def _ready(loop: ControlLoop, due: float, ahead: float) -> float:
@@ -58,26 +58,26 @@ def _ready(loop: ControlLoop, due: float, ahead: float) -> float:
 
 def fly(plan: ControlPlan) -> None:
     """Run the control loop until the flight is over; this is the main function of the process."""
-    refused = be_punctual(plan.priority, set(plan.cores))
+    refusals = be_punctual(plan.priority, set(plan.cores))
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     loop = ControlLoop(plan, bus)
     loop.warm_up()
-    bus.publish("ready.control", pack_note("ready", refused=refused))
+    bus.publish("ready.control", pack_note("ready", refused=refusals))
     epoch = wait_for_take_off(bus, parent)
     if epoch is None:
         return
     schedule, pulses = Schedule(epoch, plan.dt), Pulses(bus, silence=ALONE)
     pulses.expect("supervisor", within=float("inf"))  # a flight without heartbeats from a supervisor is allowed
     while not loop.over:
-        scheduled = schedule.next()
-        woke = _ready(loop, scheduled, AHEAD * plan.dt)
+        due_time = schedule.next()
+        woke = _ready(loop, due_time, AHEAD * plan.dt)
         late = not loop.new_sample()
-        while not loop.new_sample() and time.monotonic() < scheduled + PATIENCE * plan.dt:
+        while not loop.new_sample() and time.monotonic() < due_time + PATIENCE * plan.dt:
             time.sleep(2e-4)
         now = time.monotonic()
         loop.late_samples += late
-        loop.tick(now, (woke if late else now) - scheduled)  # the wait for a sample does not count as lateness
-        if parent.gone():
+        loop.tick(now, (woke if late else now) - due_time)  # the wait for a sample does not count as lateness
+        if parent.has_ended():
             loop.land("the supervisor is gone")
         elif pulses.hanging(["supervisor"]):
             loop.land(f"the supervisor hangs: it said nothing for {ALONE:g} s")

@@ -8,7 +8,7 @@ import numpy as np
 G = 9.81  # [m/s^2]
 HOVER = np.array([G, 0.0, 0.0, 0.0])
 UP = np.array([0.0, 0.0, 1.0])
-FELT_TAU = 0.2  # [s]
+DISTURBANCE_TAU = 0.2  # [s]
 BLIND_S = 2.0  # [s], after which the motors of a vehicle with an unknown state stop
 
 
@@ -58,10 +58,10 @@ class Limits:
 
     def within(self, u: np.ndarray) -> np.ndarray:
         """Return a command [c, omega] clipped to the vehicle's limits."""
-        taken: np.ndarray = np.clip(u, self.u_min, self.u_max)
-        return taken
+        limited_u: np.ndarray = np.clip(u, self.u_min, self.u_max)
+        return limited_u
 
-    def broken(self, x: np.ndarray) -> str | None:
+    def find_violation(self, x: np.ndarray) -> str | None:
         """Return a description of the limit that a state violates; None if the state is within all limits.
 
         Args:
@@ -88,7 +88,7 @@ class GeometricHover:
     limits: Limits
     dt: float
     integral: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    felt: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    disturbance: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """Low-pass-filtered acceleration from external disturbances in the world frame [m/s^2]."""
 
     def feel(self, before: np.ndarray, after: np.ndarray, u: np.ndarray) -> None:
@@ -101,7 +101,9 @@ class GeometricHover:
         """
         a = (after[12:15] - before[12:15]) / self.dt - u[0] * before[3:12].reshape(3, 3)[:, 2] + G * UP
         if np.isfinite(a).all():
-            self.felt = np.clip(self.felt + min(1.0, self.dt / FELT_TAU) * (a - self.felt), -5.0, 5.0)
+            self.disturbance = np.clip(
+                self.disturbance + min(1.0, self.dt / DISTURBANCE_TAU) * (a - self.disturbance), -5.0, 5.0
+            )
 
     def command(self, x: np.ndarray, target: np.ndarray, velocity: np.ndarray | None = None) -> np.ndarray:
         """Return the command [c, omega].
@@ -114,7 +116,7 @@ class GeometricHover:
         p, R, v = x[:3], x[3:12].reshape(3, 3), x[12:15]
         error = np.clip(target - p, -1.0, 1.0)
         self.integral = np.clip(self.integral + self.dt * error, -2.0, 2.0)
-        a = 4.0 * error + 2.0 * self.integral + 3.5 * ((0.0 if velocity is None else velocity) - v) - self.felt
+        a = 4.0 * error + 2.0 * self.integral + 3.5 * ((0.0 if velocity is None else velocity) - v) - self.disturbance
         a[:2] *= min(1.0, 6.0 / (np.hypot(a[0], a[1]) + 1e-9))
         force = np.clip(a, -6.0, 6.0) + G * UP
         along = force / np.sqrt(force @ force)

@@ -37,7 +37,7 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     """
     # One thread: the arrays are small, and a thread pool would add delays.
     quiet = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    with _opened(complaints) as file:
+    with _open_log(complaints) as file:
         process = subprocess.Popen(
             [*PYTHON, "retrim.onboard.launch", main],
             stdin=subprocess.PIPE,
@@ -55,7 +55,7 @@ def launch(main: str, plan: Any, complaints: Path, cores: set[int] | None = None
     return process
 
 
-def _opened(complaints: Path) -> BinaryIO:
+def _open_log(complaints: Path) -> BinaryIO:
     """Open a file to append to it; if its folder is not writable, open the null device instead."""
     try:
         complaints.parent.mkdir(parents=True, exist_ok=True)

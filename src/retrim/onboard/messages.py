@@ -27,7 +27,7 @@ class Stamp:
 
     tick: int
     """Ticks since the start of the flight."""
-    sent: float
+    send_time: float
     """Send time on the machine's monotonic clock [s]."""
 
     @classmethod
@@ -51,7 +51,7 @@ class Sample:
     """Ticks since the start of the flight."""
     t: float
     """Time on the plant's clock [s]."""
-    sent: float
+    send_time: float
     """Send time on the machine's monotonic clock [s]."""
     age: float
     """Time since the state was valid [s]."""
@@ -64,7 +64,7 @@ class Sample:
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
-        row = np.concatenate([[self.tick, self.t, self.sent, self.age], self.state, self.truth, self.accepted])
+        row = np.concatenate([[self.tick, self.t, self.send_time, self.age], self.state, self.truth, self.accepted])
         # as bits, so that the checksum also covers the stamp of a sample whose state is not finite
         return pack_arrays({"row": row.view(np.int64)}, kind="sample", about={})
 
@@ -78,8 +78,8 @@ class Sample:
         row = _numbers(data)
         if not (finite := np.isfinite(row)).all():
             raise MessageError(f"sample: {row.size - np.count_nonzero(finite)} numbers are not finite")
-        state, truth, accepted = row[4 : 4 + STATE], row[4 + STATE : 4 + 2 * STATE], row[4 + 2 * STATE :]
-        return cls(int(row[0]), float(row[1]), float(row[2]), float(row[3]), state, truth, accepted)
+        state, truth, accepted_u = row[4 : 4 + STATE], row[4 + STATE : 4 + 2 * STATE], row[4 + 2 * STATE :]
+        return cls(int(row[0]), float(row[1]), float(row[2]), float(row[3]), state, truth, accepted_u)
 
 
 def _numbers(data: bytes) -> np.ndarray:
@@ -94,20 +94,20 @@ class Setpoint:
 
     tick: int
     """Tick of the sample that this command answers."""
-    sent: float
+    send_time: float
     """Send time on the monotonic clock [s]."""
     u: np.ndarray
     """Command: c [m/s^2], omega [rad/s]."""
     target: np.ndarray
     """Current target position in the world frame [m]; a controller that takes over holds the vehicle there."""
-    landed: bool = False
+    is_final: bool = False
     """Whether the vehicle has landed or its motors must stop; the plant then stops."""
     blind: bool = False
     """Whether the motors must stop in the air because the state of the vehicle is unknown."""
 
     def pack(self) -> bytes:
         """Return the bytes; the inverse of :meth:`unpack`."""
-        row = np.concatenate([[self.tick, self.sent, self.landed], self.u, self.target, [self.blind]])
+        row = np.concatenate([[self.tick, self.send_time, self.is_final], self.u, self.target, [self.blind]])
         return pack_arrays({"row": row}, kind="setpoint", about={})
 
     @classmethod
@@ -211,15 +211,15 @@ class Parameters:
         header = describe(data, kind=kind, source=half)
         if header.get("base") != base:
             raise MessageError(f"{half}: parameters for another controller, {header.get('base', 'unnamed')!r}")
-        version, computed = header.get("version", ""), header.get("computed_from", "")
+        version, data_text = header.get("version", ""), header.get("computed_from", "")
         try:
-            number, learnt, parent = int(version[:20]), float(computed[:40]), int(header.get("parent", "")[:20])
+            number, data_time, parent = int(version[:20]), float(data_text[:40]), int(header.get("parent", "")[:20])
         except ValueError as error:
-            raise MessageError(f"{half}: version {version[:20]!r}, computed from {computed[:40]!r}") from error
+            raise MessageError(f"{half}: version {version[:20]!r}, computed from {data_text[:40]!r}") from error
         arrays = unpack_arrays(data, expected, kind=kind, source=half)
-        if number <= after or not np.isfinite(learnt):
+        if number <= after or not np.isfinite(data_time):
             raise StaleError(f"{half}: version {number} is stale, {after} was taken")
-        return cls(half, number, base, learnt, arrays, parent)
+        return cls(half, number, base, data_time, arrays, parent)
 
 
 def pack_note(kind: str, **fields: Any) -> bytes:
@@ -257,7 +257,7 @@ def last_note(bus: Bus, topic: str, kind: str | None = None) -> dict[str, Any]:
         return {}
 
 
-def last_sent(bus: Bus, topic: str) -> float:
+def last_send_time(bus: Bus, topic: str) -> float:
     """Return when a topic's newest command was sent [s, monotonic clock]; minus infinity if there is no valid command.
 
     Args:
@@ -266,7 +266,7 @@ def last_sent(bus: Bus, topic: str) -> float:
     """
     message = bus.latest(topic)
     try:
-        return float("-inf") if message is None else Setpoint.unpack(message.data).sent
+        return float("-inf") if message is None else Setpoint.unpack(message.data).send_time
     except MessageError:
         return float("-inf")
 

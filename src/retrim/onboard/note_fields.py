@@ -15,7 +15,7 @@ MANY, MOST, LONG = 2**53, 1e300, 1000
 LAST_STAGE, LAST_CAUSE = 4, 5
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Return a short text without control characters for a value in an error message."""
     text = ascii(value) if isinstance(value, str | int | float | bool | type(None)) else type(value).__name__
     return text if len(text) <= 80 else f"{text[:77]}..."
@@ -23,8 +23,8 @@ def shown(value: Any) -> str:
 
 def plain(text: str) -> str:
     """Return a text with its control characters escaped and its length limited."""
-    written = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[: LONG + 1])
-    return written if len(written) <= LONG else f"{written[: LONG - 3]}..."
+    printable = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[: LONG + 1])
+    return printable if len(printable) <= LONG else f"{printable[: LONG - 3]}..."
 
 
 def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = True) -> Read:
@@ -158,10 +158,10 @@ def read_fields(kind: str, fields: Any) -> dict[str, Any]:
     """
     if not isinstance(fields, dict):
         raise MessageError(f"{kind}: no fields")
-    known, result = FIELDS.get(kind.partition(".")[0], {}), dict(fields)
-    for name in known.keys() & result.keys():
+    known_fields, result = FIELDS.get(kind.partition(".")[0], {}), dict(fields)
+    for name in known_fields.keys() & result.keys():
         try:
-            result[name] = known[name](result[name])
+            result[name] = known_fields[name](result[name])
         except ValueError as error:
-            raise MessageError(f"{kind}: {name} = {shown(fields[name])} must be {error}") from None
+            raise MessageError(f"{kind}: {name} = {format_value(fields[name])} must be {error}") from None
     return result

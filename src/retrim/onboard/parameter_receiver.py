@@ -11,7 +11,7 @@ from ..errors import MessageError
 from ..transport.bus import Bus
 from .messages import Parameters, StaleError
 from .pilot import LivePilot
-from .rollback import FlownError
+from .rollback import RollbackMonitor
 from .topics import REFERENCE, UNLEARNED, VEHICLE
 
 AHEAD = 1.0  # [s], how far the time stamp of parameters may lie in the future
@@ -32,19 +32,19 @@ class ParameterReceiver:
             dt: Control tick [s].
         """
         self.pilot = pilot
-        self.refused: dict[str, int] = {}
-        self.given_up: list[int] = []
+        self.refusals: dict[str, int] = {}
+        self.withdrawals: list[int] = []
         self.newest = dict.fromkeys(pilot.versions, 0)
         self.swaps: deque[list[Any]] = deque(maxlen=REMEMBERED)
         self._bus, self._base = bus, base
-        self._known = dict.fromkeys(pilot.versions, 0)
-        self._dt, self._flown, self._open = dt, FlownError(dt), True
-        self._computed_from = {0: 0.0}
+        self._versions = dict.fromkeys(pilot.versions, 0)
+        self._dt, self._trials, self._open = dt, RollbackMonitor(dt), True
+        self._data_times = {0: 0.0}
 
     @property
-    def learnt(self) -> float:
+    def data_time(self) -> float:
         """Flight time of the newest measurement in the training data of the active policy [s]."""
-        return self._computed_from.get(self.pilot.versions.get("policy", 0), 0.0)
+        return self._data_times.get(self.pilot.versions.get("policy", 0), 0.0)
 
     @property
     def open(self) -> bool:
@@ -52,24 +52,24 @@ class ParameterReceiver:
         return self._open
 
     @open.setter
-    def open(self, learnt: bool) -> None:
-        if learnt == self._open:
+    def open(self, learning: bool) -> None:
+        if learning == self._open:
             return
-        self._open, self._flown = learnt, FlownError(self._dt)
-        if learnt:
+        self._open, self._trials = learning, RollbackMonitor(self._dt)
+        if learning:
             self.pilot.resume()
         else:
             self.pilot.restart()
 
     def poll(self, t: float) -> None:
         """Read the parameters that have arrived by flight time ``t`` [s]; use valid ones and refuse the others."""
-        for half in self._known:
+        for half in self._versions:
             if half not in UNLEARNED and not self._open:
                 continue
-            message = self._bus.latest(f"parameters.{half}", self._known[half])
+            message = self._bus.latest(f"parameters.{half}", self._versions[half])
             if message is None:
                 continue
-            self._known[half] = message.version
+            self._versions[half] = message.version
             try:
                 result = Parameters.unpack(
                     message.data, self.pilot.expected(half), half=half, base=self._base, after=self.newest[half]
@@ -86,38 +86,38 @@ class ParameterReceiver:
                 else:
                     self._take(result, t)
 
-    def watch(self, error: float, missed: float) -> None:
+    def watch(self, error: float, model_error: float) -> None:
         """Process the result of one tick of the policy, and roll back policies that fly clearly worse.
 
         Args:
             error: Distance from the target [m].
-            missed: Acceleration error of the corrected model [m/s^2].
+            model_error: Acceleration error of the corrected model [m/s^2].
         """
-        result = self._flown.take(error, missed)
-        if result.proven is not None:
-            self.pilot.proven(result.proven)
+        result = self._trials.take(error, model_error)
+        if result.confirmed_version is not None:
+            self.pilot.confirm(result.confirmed_version)
         if result.worse:
-            self.given_up = [*self.given_up, *self.pilot.back()][-REMEMBERED:]
+            self.withdrawals = [*self.withdrawals, *self.pilot.back()][-REMEMBERED:]
 
     def refuse(self, what: str) -> None:
         """Count a message that must not be used."""
-        self.refused[what] = self.refused.get(what, 0) + 1
+        self.refusals[what] = self.refusals.get(what, 0) + 1
 
-    def _take(self, found: Parameters, t: float) -> None:
-        self.newest[found.half] = found.version
-        if found.half == "policy" and {found.parent, found.version} & set(self.given_up):
-            self.given_up.append(found.version)
+    def _take(self, parameters: Parameters, t: float) -> None:
+        self.newest[parameters.half] = parameters.version
+        if parameters.half == "policy" and {parameters.parent, parameters.version} & set(self.withdrawals):
+            self.withdrawals.append(parameters.version)
             self.refuse("trained from a policy that was taken back")
             return
-        self.pilot.swap(found)
-        if found.half == REFERENCE:
-            self._flown = FlownError(self._dt)  # errors on different references are not comparable
+        self.pilot.swap(parameters)
+        if parameters.half == REFERENCE:
+            self._trials = RollbackMonitor(self._dt)  # errors on different references are not comparable
             return
-        if found.half == VEHICLE:
+        if parameters.half == VEHICLE:
             return
-        self.swaps.append([t, found.half, found.version, t - found.computed_from])
-        if found.half == "policy":
-            self._computed_from[found.version] = found.computed_from
-            for old in sorted(self._computed_from)[1:-REMEMBERED]:
-                del self._computed_from[old]
-            self._flown.swapped(found.version)
+        self.swaps.append([t, parameters.half, parameters.version, t - parameters.computed_from])
+        if parameters.half == "policy":
+            self._data_times[parameters.version] = parameters.computed_from
+            for old in sorted(self._data_times)[1:-REMEMBERED]:
+                del self._data_times[old]
+            self._trials.start_trial(parameters.version)

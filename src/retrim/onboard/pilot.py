@@ -42,23 +42,23 @@ class LivePilot:
     def __init__(self, source: ControllerSource) -> None:
         self._source = source
         self._init, self._decide = NumpyProgram(source.init), NumpyProgram(source.decide)
-        self._accepted, self._target = NumpyProgram(source.accepted), NumpyProgram(source.target)
-        self._predicted = NumpyProgram(source.predicted)
+        self._acceptance, self._target = NumpyProgram(source.accepted), NumpyProgram(source.target)
+        self._prediction = NumpyProgram(source.predicted)
         self._parameters = {half: list(arrays.values()) for half, arrays in source.parameters.items()}
         self.versions = dict.fromkeys(source.parameters, 0)
         self._policies: dict[int, Arrays] = {0: self._parameters["policy"]}  # the last proven policy and all later ones
-        self._parked: tuple[dict[str, Arrays], dict[str, int], dict[int, Arrays]] | None = None
+        self._backup: tuple[dict[str, Arrays], dict[str, int], dict[int, Arrays]] | None = None
         self._memory: Arrays = []
         self.condition = 0, 0
         """Stage of the controller's degradation, and its cause; see :mod:`retrim.control.condition`."""
         self._prepared = self._prepare()
         self._old = self._prepared[1]
-        self._jump, self._left, self._swapped = np.zeros(4), 0, False
+        self._jump, self._left, self._just_swapped = np.zeros(4), 0, False
 
     def reset(self, x: np.ndarray) -> None:
         """Start a flight in the state ``x``, a vector of p, R by rows and v."""
         self._memory = self._init.step(self._prepared[0], self._state(x))
-        self._left, self._swapped, self._jump = 0, False, np.zeros(4)
+        self._left, self._just_swapped, self._jump = 0, False, np.zeros(4)
         self.condition = 0, 0
 
     def target(self, t: float) -> np.ndarray:
@@ -78,10 +78,10 @@ class LivePilot:
         c, omega, stage, cause, *self._memory = self._decide.step(decide, [*memory, *inputs])
         self.condition = int(stage), int(cause)
         u = np.concatenate([[c], omega]).astype(float)
-        if self._swapped:
+        if self._just_swapped:
             before, rates, *_ = self._decide.step(self._old, [*memory, *inputs])
             going = np.concatenate([[before], rates]).astype(float) + self._jump * self._left / BLEND
-            self._jump, self._left, self._swapped = going - u, BLEND, False
+            self._jump, self._left, self._just_swapped = going - u, BLEND, False
         if self._left:
             u = u + self._jump * self._left / BLEND
             self._left -= 1
@@ -95,12 +95,12 @@ class LivePilot:
     def accepted(self, u: np.ndarray) -> None:
         """Correct the memory if the plant accepted ``u`` instead of the last issued command."""
         command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
-        self._memory = self._accepted.step(self._prepared[2], [*self._memory, *command])
+        self._memory = self._acceptance.step(self._prepared[2], [*self._memory, *command])
 
-    def predicted(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def predict(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return the acceleration that the corrected model predicts in the world frame [m/s^2]."""
         command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
-        return np.asarray(self._predicted.step(self._prepared[3], [*self._state(x), *command])[0], dtype=float)
+        return np.asarray(self._prediction.step(self._prepared[3], [*self._state(x), *command])[0], dtype=float)
 
     def swap(self, parameters: Parameters) -> None:
         """Use new parameters from the next tick on.
@@ -120,18 +120,18 @@ class LivePilot:
 
     def restart(self) -> None:
         """Use the learned parameters from take-off again, starting with the next tick."""
-        self._parked = self._parameters, self.versions, self._policies
-        followed = {half: leaves for half, leaves in self._parameters.items() if half in UNLEARNED}
+        self._backup = self._parameters, self.versions, self._policies
+        reference = {half: leaves for half, leaves in self._parameters.items() if half in UNLEARNED}
         first = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
-        self._parameters = first | followed
+        self._parameters = first | reference
         self.versions = {half: self.versions[half] if half in UNLEARNED else 0 for half in first}
         self._policies = {0: self._parameters["policy"]}
         self._change()
 
     def resume(self) -> None:
         """Use the learned parameters from before :meth:`restart` again."""
-        if self._parked is not None:
-            (parameters, versions, self._policies), self._parked = self._parked, None
+        if self._backup is not None:
+            (parameters, versions, self._policies), self._backup = self._backup, None
             self._parameters |= {half: leaves for half, leaves in parameters.items() if half not in UNLEARNED}
             self.versions |= {half: version for half, version in versions.items() if half not in UNLEARNED}
             self._change()
@@ -140,26 +140,26 @@ class LivePilot:
         """Return the initial parameters of a part, which define the expected shapes and types."""
         return self._source.parameters[half]
 
-    def proven(self, version: int) -> None:
+    def confirm(self, version: int) -> None:
         """Record that a policy has flown long enough without harm, and discard the earlier policies."""
         self._policies = {v: leaves for v, leaves in self._policies.items() if v >= version}
 
     def back(self) -> list[int]:
         """Roll back to the last proven policy; return the versions that were given up."""
         version = min(self._policies)
-        given_up = sorted(v for v in self._policies if v > version)
+        withdrawals = sorted(v for v in self._policies if v > version)
         self._policies = {version: self._policies[version]}
         self._parameters["policy"], self.versions["policy"] = self._policies[version], version
         self._change()
-        return given_up
+        return withdrawals
 
     def _change(self) -> None:
-        if not self._swapped:
+        if not self._just_swapped:
             self._old = self._prepared[1]
-        self._prepared, self._swapped = self._prepare(), True
+        self._prepared, self._just_swapped = self._prepare(), True
 
     def _prepare(self) -> tuple[Arrays, ...]:
-        programs = (self._init, self._decide, self._accepted, self._predicted, self._target)
+        programs = (self._init, self._decide, self._acceptance, self._prediction, self._target)
         return tuple(program.prepare(self._flat()) for program in programs)
 
     def _flat(self) -> Arrays:

@@ -22,7 +22,7 @@ class Pulses:
             silence: Time without a heartbeat after which a process counts as hanging [s].
         """
         self._bus, self._clock, self._last, self._silence = bus, clock, clock(), silence
-        self._versions, self._silent, self._allowed = dict[str, int](), dict[str, float](), dict[str, float]()
+        self._versions, self._silent, self._allowances = dict[str, int](), dict[str, float](), dict[str, float]()
 
     def expect(self, role: str, within: float | None = None) -> None:
         """Expect a process to send heartbeats from now on.
@@ -33,7 +33,7 @@ class Pulses:
                 heartbeats.
         """
         self._versions[role], self._silent[role] = self._version(role), 0.0
-        self._allowed[role] = self._silence if within is None else within
+        self._allowances[role] = self._silence if within is None else within
 
     def hanging(self, roles: Iterable[str]) -> list[str]:
         """Return the processes that have been silent for too long.
@@ -42,15 +42,15 @@ class Pulses:
             roles: Processes that are alive. Other processes and those without expected heartbeats are not checked.
         """
         now = self._clock()
-        passed, self._last = min(now - self._last, LOOK), now
-        return [role for role in roles if role in self._versions and self._hangs(role, passed)]
+        elapsed, self._last = min(now - self._last, LOOK), now
+        return [role for role in roles if role in self._versions and self._hangs(role, elapsed)]
 
-    def _hangs(self, role: str, passed: float) -> bool:
+    def _hangs(self, role: str, elapsed: float) -> bool:
         if self._version(role) != self._versions[role]:
             self.expect(role)
             return False
-        self._silent[role] += passed
-        return self._silent[role] > self._allowed[role]
+        self._silent[role] += elapsed
+        return self._silent[role] > self._allowances[role]
 
     def _version(self, role: str) -> int:
         message = self._bus.latest(beat_topic(role))

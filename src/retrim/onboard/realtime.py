@@ -21,27 +21,27 @@ def be_punctual(priority: int, cores: set[int]) -> list[str]:
     Returns:
         Descriptions of the refused requests; empty if all were granted.
     """
-    refused = []
+    refusals = []
     gc.collect()
     gc.freeze()
     gc.disable()
     # Locking touches all the memory and takes a while, so lock before raising the priority.
     try:
         if ctypes.CDLL(None, use_errno=True).mlockall(LOCK_NOW_AND_LATER) != 0:
-            refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
+            refusals.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
     except (OSError, AttributeError) as error:
-        refused.append(f"locked memory: {error}")
+        refusals.append(f"locked memory: {error}")
     try:
         for thread in _threads():
             os.sched_setaffinity(thread, cores)
     except (OSError, AttributeError) as error:
-        refused.append(f"cores {sorted(cores)}: {error}")
+        refusals.append(f"cores {sorted(cores)}: {error}")
     try:
         for thread in _threads():  # a thread pool that computes for this process is as urgent as the process
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
-        refused.append(f"SCHED_FIFO: {error}")
-    return refused
+        refusals.append(f"SCHED_FIFO: {error}")
+    return refusals
 
 
 def _threads() -> list[int]:
@@ -51,15 +51,15 @@ def _threads() -> list[int]:
     return [0]
 
 
-def cores_of(role: str, allowed: set[int] | None = None) -> set[int]:
+def cores_of(role: str, available: set[int] | None = None) -> set[int]:
     """Return the cores of a role: the first core to fly, the other cores to learn; both roles share a single core.
 
     Args:
         role: ``fly`` or ``learn``.
-        allowed: Cores to distribute; by default those of this process.
+        available: Cores to distribute; by default those of this process.
     """
     mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else {0}
-    cores = sorted(allowed or mine)
+    cores = sorted(available or mine)
     return {cores[0]} if role == "fly" or len(cores) == 1 else set(cores[1:])
 
 
@@ -91,7 +91,7 @@ class ParentWatch:
             self._descriptor = os.pidfd_open(pid)
             self._poll.register(self._descriptor, select.POLLIN)
 
-    def gone(self, wait: float = 0.0) -> bool:
+    def has_ended(self, wait: float = 0.0) -> bool:
         """Wait at most ``wait`` [s] for the end of the process, and return whether it has ended."""
         if self._descriptor is not None:
             return bool(self._poll.poll(max(0.0, 1e3 * wait)))

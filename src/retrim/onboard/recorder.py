@@ -20,7 +20,7 @@ from .heartbeat import Heart
 from .log_file import HEADER, LogFile, log_path
 from .messages import ACCOUNTS, COLUMNS, FlightRows, last_note, pack_note
 from .realtime import ParentWatch
-from .timing_stats import accounted
+from .timing_stats import is_from_control
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
 ENDS = tuple(mode.name.lower() for mode in OVER)
@@ -57,9 +57,9 @@ class Recorder:
         self._versions = {"flight": 0, "fallback.flight": 0}
         self.failed: str | None = None
         """Reason why the log has ended; None while the log continues."""
-        self.moved = ""
+        self.notice = ""
         """Message about a change of the file, with the reason and the new file; empty if there was no change."""
-        self._written: set[tuple[int, bool, bool]] = set()
+        self._row_keys: set[tuple[int, bool, bool]] = set()
         self._file: LogFile | None = None
         try:
             self._file = LogFile(log_path(path, spare))
@@ -73,7 +73,7 @@ class Recorder:
 
     def tell(self) -> None:
         """Publish that the log is ready, and whether it failed or moved."""
-        self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed, moved=self.moved))
+        self._bus.publish("ready.recorder", pack_note("ready", failed=self.failed, moved=self.notice))
 
     def close(self) -> None:
         """Close the log."""
@@ -89,7 +89,7 @@ class Recorder:
             rows = FlightRows.unpack(message.data).rows
         except MessageError:
             return 0
-        return self._append(rows[[each not in self._written for each in _authors(rows)]])
+        return self._append(rows[[each not in self._row_keys for each in _authors(rows)]])
 
     def _append(self, new: np.ndarray) -> int:
         lines = "".join(",".join(f"{value:.9g}" for value in row) + "\n" for row in new).encode()
@@ -109,16 +109,16 @@ class Recorder:
         for path in self._paths:
             with contextlib.suppress(OSError):
                 path.parent.mkdir(parents=True, exist_ok=True, mode=0o777 if path == self._paths[0] else 0o700)
-                moved = LogFile(path, new=True)
+                log_file = LogFile(path, new=True)
                 try:
-                    moved.append(HEADER if self._file is None else self._file.all())
+                    log_file.append(HEADER if self._file is None else self._file.all())
                 except OSError:
                     path.unlink()
                     raise
                 self.close()
-                self._file = moved
+                self._file = log_file
                 where = "is written anew" if path == self._paths[0] else f"goes on in {path}"
-                self.moved = f"{reason}; the log {where}"
+                self.notice = f"{reason}; the log {where}"
                 break
         else:
             self.failed = reason
@@ -127,7 +127,7 @@ class Recorder:
     def _note(self, rows: np.ndarray) -> None:
         """Record the written rows; a row from a watchdog that did not command is redundant if the tick has any row."""
         for tick, has, flew in _authors(rows):
-            self._written |= {(tick, has, flew), (tick, False, False)}
+            self._row_keys |= {(tick, has, flew), (tick, False, False)}
 
 
 def read_log(path: Path) -> np.ndarray:
@@ -140,7 +140,7 @@ def read_log(path: Path) -> np.ndarray:
         OSError: There is no such file.
     """
     rows = _lines(path)
-    has, flew = accounted(rows), rows[:, -1] == Mode.WATCHDOG
+    has, flew = is_from_control(rows), rows[:, -1] == Mode.WATCHDOG
     order = np.lexsort((~has, ~flew, rows[:, 0]))
     ticks, first = np.unique(rows[order, 0], return_index=True)
     result: np.ndarray = rows[order[first]]
@@ -163,7 +163,7 @@ def _rows(data: bytes) -> np.ndarray:
 def _authors(rows: np.ndarray) -> list[tuple[int, bool, bool]]:
     """Return each row's tick, whether the control process reported it, and whether the watchdog commanded it."""
     flew = rows[:, -1] == Mode.WATCHDOG
-    return list(zip(rows[:, 0].astype(int).tolist(), accounted(rows).tolist(), flew.tolist(), strict=True))
+    return list(zip(rows[:, 0].astype(int).tolist(), is_from_control(rows).tolist(), flew.tolist(), strict=True))
 
 
 def record(plan: RecorderPlan) -> None:
@@ -171,16 +171,16 @@ def record(plan: RecorderPlan) -> None:
     bus = SharedMemoryBus(plan.folder)
     recorder = Recorder(plan.path, bus, plan.spare)
     recorder.tell()
-    parent, heard, left, heart = ParentWatch(plan.parent), time.monotonic(), LINGER, Heart(bus, "recorder")
-    while left and not (parent.gone() and time.monotonic() > heard + SILENCE):
-        if recorder.step() or (bus.latest("sample") is None and not parent.gone()):
-            heard = time.monotonic()
+    parent, last_message, left, heart = ParentWatch(plan.parent), time.monotonic(), LINGER, Heart(bus, "recorder")
+    while left and not (parent.has_ended() and time.monotonic() > last_message + SILENCE):
+        if recorder.step() or (bus.latest("sample") is None and not parent.has_ended()):
+            last_message = time.monotonic()
         left -= _over(bus)
         heart.beat()
         time.sleep(plan.dt)
     recorder.step()
     recorder.close()
-    if parent.gone():
+    if parent.has_ended():
         bus.remove()
 
 

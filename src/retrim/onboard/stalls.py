@@ -12,7 +12,7 @@ from typing import Any
 from .messages import pack_note
 
 STALL = 0.003  # [s]
-KEPT = 100  # number of stalls that are kept, the newest ones
+MEMORY = 100  # number of stalls that are kept, the newest ones
 
 
 class Stalls:
@@ -25,7 +25,7 @@ class Stalls:
             every: Time between wake-ups [s].
         """
         self.count, self.longest = 0, 0.0
-        self.newest: deque[tuple[float, float]] = deque(maxlen=KEPT)
+        self.newest: deque[tuple[float, float]] = deque(maxlen=MEMORY)
         """Start and end of each stall [s]."""
         self._every = every
         self._woke: float | None = None
@@ -49,7 +49,7 @@ class Stalls:
         return pack_note("stalls", count=self.count, longest=self.longest, newest=newest)
 
 
-def lost_in(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]], dt: float) -> int:
+def count_lost_ticks(stalls: Sequence[Sequence[Any]], gaps: Sequence[Sequence[Any]], dt: float) -> int:
     """Return the number of ticks missed during a stall or within one tick after the stall, while the plant caught up.
 
     Args:

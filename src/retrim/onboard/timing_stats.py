@@ -24,7 +24,7 @@ def summary(seconds: np.ndarray) -> dict[str, Any]:
     return {"p50": float(p50), "p99": float(p99), "max": float(ms.max()), "histogram": counts.tolist()}
 
 
-def accounted(rows: np.ndarray) -> np.ndarray:
+def is_from_control(rows: np.ndarray) -> np.ndarray:
     """Return which ticks the control process reported; rows from the watchdog do not contain a step duration.
 
     Args:
@@ -48,17 +48,17 @@ def blind_row(
         u: Command [c, omega].
         mode: Active mode of the guard.
     """
-    after = max(stamp.tick - sample.tick, int((now - sample.sent) / dt), 1)
-    age = sample.age + now - sample.sent
+    after = max(stamp.tick - sample.tick, int((now - sample.send_time) / dt), 1)
+    age = sample.age + now - sample.send_time
     head = [sample.tick + after, sample.t + after * dt - start, age]
     return np.concatenate([head, sample.state, sample.truth, u, [0.0, 0.0, 0.0, age, 0.0, mode]])
 
 
-def measured(rows: np.ndarray) -> np.ndarray:
+def has_measurement(rows: np.ndarray) -> np.ndarray:
     """Return which rows contain a new measurement; the other rows contain an old state.
 
     Args:
         rows: Rows with the columns in :data:`retrim.onboard.messages.COLUMNS`.
     """
-    result: np.ndarray = accounted(rows) | ~np.isin(rows[:, -1], (Mode.BLIND, Mode.DROP))
+    result: np.ndarray = is_from_control(rows) | ~np.isin(rows[:, -1], (Mode.BLIND, Mode.DROP))
     return result

@@ -45,37 +45,37 @@ class Watchdog:
     def __init__(self, plan: WatchdogPlan, bus: Bus) -> None:
         self.plan, self.bus = plan, bus
         self._fallback = Fallback(GeometricHover(plan.limits, plan.dt))
-        self.heard: float | None = None
+        self.last_message: float | None = None
         self.done = False
         self._version = 0
         self._sample: Sample | None = None
         self._stamp: Stamp | None = None
-        self._seen = 0
+        self._last_version = 0
         self._next = 0.0
         self._target = plan.home
         self._rows: deque[np.ndarray] = deque(maxlen=ROWS)
         self._start = 0.0
 
-    def check(self, now: float, gone: bool) -> Setpoint | None:
+    def check(self, now: float, control_ended: bool) -> Setpoint | None:
         """Publish and return a command if one is due.
 
         Args:
             now: Current time of the monotonic clock [s].
-            gone: Whether the control process has ended.
+            control_ended: Whether the control process has ended.
         """
         if (message := self.bus.latest("setpoint", self._version)) is not None:
             self._version = message.version
             self._hear(message.data, now)
         new = self._look()
-        if self.heard is None and self._sample is not None:
-            self.heard = now  # the first measurement already needs an answer
-        silent = self.heard is not None and (gone or now - self.heard > PATIENCE * self.plan.dt)
+        if self.last_message is None and self._sample is not None:
+            self.last_message = now  # the first measurement already needs an answer
+        silent = self.last_message is not None and (control_ended or now - self.last_message > PATIENCE * self.plan.dt)
         if not silent or self.done or not (new or now >= self._next):
             return None
         if self._sample is None or self._stamp is None:
             return None
         self._next = now + 1.5 * self.plan.dt  # latest time, in case no sample arrives
-        fresh = self._sample.age + now - self._sample.sent <= self.plan.limits.state_age
+        fresh = self._sample.age + now - self._sample.send_time <= self.plan.limits.state_age
         u, mode = self._fallback.step(self._sample.state, fresh, self._target, land=False)
         self.done = mode in OVER
         setpoint = Setpoint(self._stamp.tick, now, u, self._target, self.done, mode == Mode.DROP)
@@ -91,19 +91,19 @@ class Watchdog:
     def _hear(self, data: bytes, now: float) -> None:
         """Record a command from the control process: its time, the target, and whether the vehicle has landed."""
         try:
-            said = Setpoint.unpack(data)
+            setpoint = Setpoint.unpack(data)
         except MessageError:
             return
-        self.heard = now  # an unreadable command returns above, and so counts as silence
+        self.last_message = now  # an unreadable command returns above, and so counts as silence
         self._fallback.rest()
-        self._target, self.done = said.target, self.done or said.landed
+        self._target, self.done = setpoint.target, self.done or setpoint.is_final
 
     def _look(self) -> bool:
         """Read a new sample if one has arrived; return whether it needs an answer."""
-        message = self.bus.latest("sample", self._seen)
+        message = self.bus.latest("sample", self._last_version)
         if message is None:
             return False
-        self._seen = message.version
+        self._last_version = message.version
         try:
             sample = Sample.unpack(message.data)
         except MessageError:
@@ -116,7 +116,7 @@ class Watchdog:
         accounts = [0.0, 0.0, 0.0, sample.age, 0.0, Mode.POLICY]
         head = [sample.tick, sample.t - self._start, sample.age]
         self._rows.append(np.concatenate([head, sample.state, sample.truth, sample.accepted, accounts]))
-        self._sample, self._stamp = sample, Stamp(sample.tick, sample.sent)
+        self._sample, self._stamp = sample, Stamp(sample.tick, sample.send_time)
         return True
 
     def _look_at_stamp(self, data: bytes) -> bool:
@@ -130,22 +130,22 @@ class Watchdog:
 
 def watch(plan: WatchdogPlan) -> None:
     """Watch until the flight is over; this is the main function of the process."""
-    refused = be_punctual(plan.priority, set(plan.cores))
+    refusals = be_punctual(plan.priority, set(plan.cores))
     bus = SharedMemoryBus(plan.folder)
     watchdog, control, parent = Watchdog(plan, bus), ParentWatch(plan.control), ParentWatch(plan.parent)
-    bus.publish("ready.watchdog", pack_note("ready", refused=refused))
+    bus.publish("ready.watchdog", pack_note("ready", refused=refusals))
     # Without real-time priority the process also waits for other processes, which is not a stall of the machine.
-    stalls = None if refused else Stalls(CHECK_EVERY)
+    stalls = None if refusals else Stalls(CHECK_EVERY)
     if stalls is not None:
         bus.publish("stalls", stalls.pack())
     heart = Heart(bus, "watchdog")
     while not watchdog.done:
         heart.beat()
-        if stalls is not None and watchdog.heard is not None and stalls.woke(time.monotonic()):
+        if stalls is not None and watchdog.last_message is not None and stalls.woke(time.monotonic()):
             bus.publish("stalls", stalls.pack())
-        gone = control.gone(CHECK_EVERY)
-        if gone:
+        control_ended = control.has_ended(CHECK_EVERY)
+        if control_ended:
             time.sleep(CHECK_EVERY)
-            if watchdog.heard is None and parent.gone():
+            if watchdog.last_message is None and parent.has_ended():
                 return
-        watchdog.check(time.monotonic(), gone)
+        watchdog.check(time.monotonic(), control_ended)

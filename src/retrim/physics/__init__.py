@@ -6,7 +6,7 @@ Random keys are used only at construction.
 from . import precision as precision
 from .actuator_response import ActuatorResponse as ActuatorResponse
 from .actuator_response import ActuatorState as ActuatorState
-from .actuators import Lagged as Lagged
+from .actuators import LaggedModel as LaggedModel
 from .bem import BemQuadrotor as BemQuadrotor
 from .betaflight import Betaflight as Betaflight
 from .command_path import CommandPath as CommandPath

@@ -25,7 +25,7 @@ class LagState(eqx.Module, Generic[X]):
     actuators: ActuatorState
 
 
-def lagged(acting: U, u: U, dt: float, tau: Float[Array, "*axes"] | Command) -> tuple[U, U]:
+def apply_lag(acting: U, u: U, dt: float, tau: Float[Array, "*axes"] | Command) -> tuple[U, U]:
     """Return the output of a first-order lag for a command over a tick.
 
     Args:
@@ -41,14 +41,14 @@ def lagged(acting: U, u: U, dt: float, tau: Float[Array, "*axes"] | Command) -> 
     taus: Any = tau if isinstance(tau, Command) else jax.tree.map(lambda _: tau, u)
     decay = jax.tree.map(lambda each: jnp.exp(-dt / each), taus)
     # Share of the old command in the mean over the tick.
-    left = jax.tree.map(lambda each, kept: each / dt * (1.0 - kept), taus, decay)
+    left = jax.tree.map(lambda each, decay: each / dt * (1.0 - decay), taus, decay)
     mean, end = (
         jax.tree.map(lambda old, new, share: new + share * (old - new), acting, u, shares) for shares in (left, decay)
     )
     return mean, end
 
 
-def is_followed(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
+def is_unsaturated(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
     """Return whether all parts of a command are away from their limits.
 
     At the limits, vehicles do not follow commands. At the smallest thrust, for example, a mixer adds thrust to reach
@@ -58,12 +58,12 @@ def is_followed(u: Command, limits: tuple[Command, Command]) -> Bool[Array, ""]:
         u: Command.
         limits: Smallest and largest command.
     """
-    low, high, asked = (jnp.concatenate([each.c[None], each.omega]) for each in (*limits, u))
-    inside = jnp.abs(asked - 0.5 * (low + high)) < (0.5 - AT_LIMIT) * (high - low)
+    low, high, command = (jnp.concatenate([each.c[None], each.omega]) for each in (*limits, u))
+    inside = jnp.abs(command - 0.5 * (low + high)) < (0.5 - AT_LIMIT) * (high - low)
     return jnp.all(inside)
 
 
-class RateBiased(AbstractWrapper[X]):
+class RateBiasedModel(AbstractWrapper[X]):
     """A model whose body rates differ from the commanded ones by a constant bias."""
 
     base: AbstractDynamics[X]
@@ -75,7 +75,7 @@ class RateBiased(AbstractWrapper[X]):
         return self.base.step(s, Command(u.c, u.omega + self.bias), a_ext)
 
 
-class Lagged(AbstractDynamics[LagState[X]]):
+class LaggedModel(AbstractDynamics[LagState[X]]):
     """A model whose commands first pass through the response of the actuators and the rate loop."""
 
     base: AbstractDynamics[X]
@@ -122,8 +122,8 @@ def with_response(model: AbstractDynamics[Any], response: ActuatorResponse) -> A
         model: A model, which may be wrapped.
         response: Response of thrust and body rates.
     """
-    if isinstance(model, Lagged):
-        return Lagged(model.base, response)
+    if isinstance(model, LaggedModel):
+        return LaggedModel(model.base, response)
     if isinstance(model, AbstractWrapper):
         return dataclasses.replace(model, base=with_response(model.base, response))
-    return Lagged(model, response)
+    return LaggedModel(model, response)

@@ -73,7 +73,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
         """
         blades = hover_coefficient(vehicle.propeller, vehicle.hover_speed)
         thrust_map = FRAME_FACTOR * blades / (1.0 + thrust_error)
-        return cls(vehicle, Betaflight.suited(vehicle, thrust_map, blades), dt)
+        return cls(vehicle, Betaflight.fit_vehicle(vehicle, thrust_map, blades), dt)
 
     def init(self, x: State) -> BemState:
         """Return the state of a vehicle that hovers at ``x``, with the rotor speeds for u_hover and settled inflow."""
@@ -91,7 +91,7 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     def with_state(self, s: BemState, x: State) -> BemState:
         """Return ``s`` with (p, R, v) replaced."""
         b = s.body
-        return BemState(RotorState(x, b.omega, b.motors, b.integral, b.omega_dot, b.wanted_slow), s.inflow)
+        return BemState(RotorState(x, b.omega, b.motors, b.integral, b.omega_dot, b.slow_setpoint), s.inflow)
 
     @property
     def command_limits(self) -> tuple[Command, Command]:
@@ -105,14 +105,14 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
         """Advance one millisecond under constant loads."""
         vehicle, b = self.vehicle, s.body
-        commanded, integral, wanted_slow = self.loop(vehicle, b, u)
-        motors = commanded + (b.motors - commanded) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
+        speeds, integral, wanted_slow = self.loop(vehicle, b, u)
+        motors = speeds + (b.motors - speeds) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
         blades, inflow = self.rotors(b, motors, s.inflow, effects.wind)
         loads = self.loads(b, motors, blades, effects)
         mass, inertia = vehicle.mass + effects.mass, vehicle.inertia + effects.inertia
         torque = loads.torque - jnp.cross(effects.moment / mass, loads.force)
-        moved = rigid_body(b, motors, integral, loads.force, torque, mass, inertia, effects.push, wanted_slow)
-        return BemState(moved, inflow)
+        body = rigid_body(b, motors, integral, loads.force, torque, mass, inertia, effects.push, wanted_slow)
+        return BemState(body, inflow)
 
     def rotors(
         self,

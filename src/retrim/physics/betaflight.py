@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .rate_tuning import Authority, Gains, authority, is_damped, tuned
+from .rate_tuning import Authority, Gains, authority, is_damped, tune
 from .state import Command
 from .substep import SUBSTEP, RotorState, signs
 from .vehicle import Vehicle
@@ -43,7 +43,7 @@ class Betaflight(eqx.Module):
 
     @classmethod
     @eqx.filter_jit
-    def suited(cls, vehicle: Vehicle, thrust_map: Float[Array, ""], coefficient: Float[Array, ""]) -> "Betaflight":
+    def fit_vehicle(cls, vehicle: Vehicle, thrust_map: Float[Array, ""], coefficient: Float[Array, ""]) -> "Betaflight":
         """Return the settings of :meth:`of` if they damp the vehicle's step response, otherwise tuned settings.
 
         Args:
@@ -53,11 +53,11 @@ class Betaflight(eqx.Module):
         """
         result, power = cls.of(thrust_map), authority(vehicle, coefficient)
         plain = result.gains(power)
-        keep, own = is_damped(plain, power.lead, vehicle.motor_tau), tuned(plain, vehicle.motor_tau)
-        scaled = (own.a / P_SCALE, own.i / I_SCALE, own.b / D_SCALE)
+        keep, own = is_damped(plain, power.lead, vehicle.motor_tau), tune(plain, vehicle.motor_tau)
+        scaling = (own.a / P_SCALE, own.i / I_SCALE, own.b / D_SCALE)
         kp, ki, kd = (
             jnp.where(keep, old, new / power.alpha)
-            for old, new in zip((result.kp, result.ki, result.kd), scaled, strict=True)
+            for old, new in zip((result.kp, result.ki, result.kd), scaling, strict=True)
         )
         return dataclasses.replace(result, kp=kp, ki=ki, kd=kd)
 
@@ -74,15 +74,15 @@ class Betaflight(eqx.Module):
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
         """Return the rotor speeds [rad/s], the integral of the rate error [rad], and the filtered command [rad/s]."""
         low, high = vehicle.command_min, vehicle.command_max
-        wanted = jnp.clip(u.omega, low.omega, high.omega)
-        error = wanted - s.omega
+        setpoint = jnp.clip(u.omega, low.omega, high.omega)
+        error = setpoint - s.omega
         # The integral pauses while the command changes fast, which prevents windup in a turn.
-        relaxed = jnp.maximum(0.0, 1.0 - jnp.abs(wanted - s.wanted_slow) / RELAX_RATE)
-        grown = s.integral + SUBSTEP * error * relaxed
-        integral = jnp.clip(grown, -self.integral_max, self.integral_max)
-        wanted_slow = wanted + (s.wanted_slow - wanted) * jnp.exp(-2.0 * jnp.pi * RELAX_CUTOFF * SUBSTEP)
+        relaxation = jnp.maximum(0.0, 1.0 - jnp.abs(setpoint - s.slow_setpoint) / RELAX_RATE)
+        new_integral = s.integral + SUBSTEP * error * relaxation
+        integral = jnp.clip(new_integral, -self.integral_max, self.integral_max)
+        wanted_slow = setpoint + (s.slow_setpoint - setpoint) * jnp.exp(-2.0 * jnp.pi * RELAX_CUTOFF * SUBSTEP)
         turn = P_SCALE * self.kp * error + I_SCALE * self.ki * integral - D_SCALE * self.kd * s.omega_dot
         thrust = vehicle.mass * jnp.clip(u.c, low.c, high.c)
         throttle = vehicle.esc.throttle(jnp.sqrt(thrust / (4.0 * self.thrust_map)))
-        mixed = jnp.clip(throttle + signs(turn.dtype).T @ turn, vehicle.esc.idle, 1.0)
-        return jnp.clip(vehicle.esc.speed(mixed), vehicle.motor_min, vehicle.motor_max), integral, wanted_slow
+        motor_outputs = jnp.clip(throttle + signs(turn.dtype).T @ turn, vehicle.esc.idle, 1.0)
+        return jnp.clip(vehicle.esc.speed(motor_outputs), vehicle.motor_min, vehicle.motor_max), integral, wanted_slow

@@ -46,9 +46,11 @@ class Payload(eqx.Module):
 
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Return the payload's mass, inertia and first moment while it is attached."""
-        carried = jnp.where((t >= self.picked) & (t < self.dropped), 1.0, 0.0).astype(self.mass.dtype)
-        moment = carried * self.mass * self.ahead * jnp.array([1.0, 0.0, 0.0], dtype=self.mass.dtype)
-        return ExternalEffects.of(x.p.dtype, mass=carried * self.mass, inertia=carried * self.inertia, moment=moment)
+        is_carried = jnp.where((t >= self.picked) & (t < self.dropped), 1.0, 0.0).astype(self.mass.dtype)
+        moment = is_carried * self.mass * self.ahead * jnp.array([1.0, 0.0, 0.0], dtype=self.mass.dtype)
+        return ExternalEffects.of(
+            x.p.dtype, mass=is_carried * self.mass, inertia=is_carried * self.inertia, moment=moment
+        )
 
 
 class BatterySag(eqx.Module):

@@ -20,4 +20,4 @@ class CommandedSpeeds(eqx.Module):
         self, vehicle: Vehicle, s: RotorState, u: Command
     ) -> tuple[Float[Array, "4"], Float[Array, "3"], Float[Array, "3"]]:
         """Return the given speeds and the unchanged memory of the rate controller."""
-        return self.speeds, s.integral, s.wanted_slow
+        return self.speeds, s.integral, s.slow_setpoint

@@ -106,7 +106,7 @@ class Inflow(eqx.Module):
 
     @classmethod
     def above(cls, dtype: jnp.dtype) -> "Inflow":
-        """Return a start above every root, from which Newton's method finds the largest one; see :func:`solved`."""
+        """Return a start above every root, from which Newton's method finds the largest one; see :func:`solve_root`."""
         return cls(jnp.array(40.0, dtype=dtype), jnp.array(40.0, dtype=dtype))
 
 
@@ -140,7 +140,7 @@ def blade_forces(
     )
 
 
-def solved(
+def solve_root(
     prop: Propeller,
     omega: Float[Array, ""],
     v_hor: Float[Array, ""],
@@ -201,8 +201,8 @@ def rotor(
     """
     omega, v_hor = jnp.maximum(omega, OMEGA_FLOOR), jnp.maximum(v_hor, V_HOR_FLOOR)
     result = Inflow(
-        solved(prop, omega, v_hor, v_ver, inflow.v_i, steps=steps),
-        solved(prop, omega, v_hor, jnp.zeros_like(v_ver), inflow.v_h, steps=steps),
+        solve_root(prop, omega, v_hor, v_ver, inflow.v_i, steps=steps),
+        solve_root(prop, omega, v_hor, jnp.zeros_like(v_ver), inflow.v_h, steps=steps),
     )
     return blade_forces(prop, omega, v_hor, v_ver, vortex_ring(result, v_ver)), result
 

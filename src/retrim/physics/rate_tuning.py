@@ -74,7 +74,7 @@ def is_damped(
     return (ratio >= LEAST_DAMPING) & (margin >= least_margin)
 
 
-def tuned(gains: Gains, tau: Float[Array, ""]) -> Gains:
+def tune(gains: Gains, tau: Float[Array, ""]) -> Gains:
     """Return gains from the motor time constant.
 
     The damping is 0.8; the integral does not change the damping.

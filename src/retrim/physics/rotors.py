@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .effects import ExternalEffects
-from .rate_tuning import Gains, is_damped, tuned
+from .rate_tuning import Gains, is_damped, tune
 from .state import Command, State
 from .substep import SUBSTEP, AbstractSubstepDynamics, RotorState, check_tick, rigid_body, signs
 from .vehicle import Vehicle
@@ -36,7 +36,7 @@ def rate_loop(motor_tau: Float[Array, ""]) -> RateLoop:
     """
     plain = Gains(jnp.array([25.0, 25.0, 12.5]), jnp.array([37.0, 37.0, 37.0]), jnp.array([0.05, 0.05, 0.0]))
     keep = is_damped(plain, jnp.zeros(3), motor_tau, least_margin=5.0)
-    kp, ki, kd = (jnp.where(keep, old, new) for old, new in zip(plain, tuned(plain, motor_tau), strict=True))
+    kp, ki, kd = (jnp.where(keep, old, new) for old, new in zip(plain, tune(plain, motor_tau), strict=True))
     return RateLoop(kp=kp, ki=ki, kd=kd, integral_max=jnp.array(0.1))
 
 
@@ -82,7 +82,7 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
 
     def with_state(self, s: RotorState, x: State) -> RotorState:
         """Return ``s`` with (p, R, v) replaced."""
-        return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot, s.wanted_slow)
+        return RotorState(x, s.omega, s.motors, s.integral, s.omega_dot, s.slow_setpoint)
 
     @property
     def command_limits(self) -> tuple[Command, Command]:
@@ -110,8 +110,8 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         low, high = vehicle.command_min, vehicle.command_max
         error = jnp.clip(u.omega, low.omega, high.omega) - s.omega
         integral = jnp.clip(s.integral + SUBSTEP * error, -loop.integral_max, loop.integral_max)
-        wanted = loop.kp * error + loop.ki * integral - loop.kd * s.omega_dot
-        torque = vehicle.inertia * wanted + jnp.cross(s.omega, vehicle.inertia * s.omega)
+        angular_acceleration = loop.kp * error + loop.ki * integral - loop.kd * s.omega_dot
+        torque = vehicle.inertia * angular_acceleration + jnp.cross(s.omega, vehicle.inertia * s.omega)
         thrusts = self.mixed(vehicle.mass * jnp.clip(u.c, low.c, high.c), torque)
         idle = vehicle.thrust_coefficient * vehicle.motor_min**2
         return jnp.sqrt(jnp.clip(thrusts, idle, vehicle.thrust_max / 4.0) / vehicle.thrust_coefficient), integral

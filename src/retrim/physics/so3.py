@@ -24,13 +24,13 @@ def vee(W: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 def exp(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Return the rotation by the rotation vector ``w`` [rad] (Rodrigues' formula)."""
-    squared = jnp.sum(w * w)
-    small = squared < _SMALL
-    safe = jnp.where(small, jnp.ones_like(squared), squared)  # double where: no square root near zero, in either branch
+    square = jnp.sum(w * w)
+    small = square < _SMALL
+    safe = jnp.where(small, jnp.ones_like(square), square)  # double where: no square root near zero, in either branch
     angle = jnp.sqrt(safe)
-    a = jnp.where(small, 1.0 - squared / 6.0, jnp.sin(angle) / angle)
-    b = jnp.where(small, 0.5 - squared / 24.0, (1.0 - jnp.cos(angle)) / safe)
-    cos = 1.0 - b * squared
+    a = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    b = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / safe)
+    cos = 1.0 - b * square
     return cos * jnp.eye(3, dtype=w.dtype) + a * hat(w) + b * jnp.outer(w, w)  # [w]x^2 = w w^T - |w|^2 I
 
 
@@ -53,11 +53,11 @@ def log(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
     The direction is ill-conditioned within about 1e-3 rad of a half turn.
     """
     axis_sin = vee(R)  # axis * sin(angle)
-    squared = jnp.sum(axis_sin * axis_sin)
+    square = jnp.sum(axis_sin * axis_sin)
     cos = 0.5 * (jnp.trace(R) - 1.0)
-    small = (squared < _SMALL) & (cos > 0.0)
-    sin = jnp.sqrt(jnp.where(small, jnp.ones_like(squared), jnp.maximum(squared, 1e-30)))
-    near_zero = 1.0 + squared / 6.0  # angle / sin(angle), as a series in sin(angle)
+    small = (square < _SMALL) & (cos > 0.0)
+    sin = jnp.sqrt(jnp.where(small, jnp.ones_like(square), jnp.maximum(square, 1e-30)))
+    near_zero = 1.0 + square / 6.0  # angle / sin(angle), as a series in sin(angle)
     return jnp.where(small, near_zero, jnp.arctan2(sin, cos) / sin) * axis_sin
 
 

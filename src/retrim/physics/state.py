@@ -102,8 +102,8 @@ class Command(eqx.Module):
 
 def where(condition: Array, yes: T, no: T) -> T:
     """Apply ``jnp.where`` leaf by leaf, for a scalar condition."""
-    chosen: T = jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
-    return chosen
+    result: T = jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+    return result
 
 
 def _has_numbers(leaf: Any, shape: tuple[int, ...]) -> bool:

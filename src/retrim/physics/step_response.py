@@ -35,7 +35,7 @@ def step_responses(vehicle: Vehicle) -> tuple[StepResponse, StepResponse, StepRe
 def _loop(vehicle: Vehicle) -> tuple[Array, Array, Array, Array, Array]:
     """Return P, I and D in units of throttle, the authority, and the lead, per axis."""
     coefficient = vehicle.thrust_coefficient
-    power, loop = authority(vehicle, coefficient), Betaflight.suited(vehicle, coefficient, coefficient)
+    power, loop = authority(vehicle, coefficient), Betaflight.fit_vehicle(vehicle, coefficient, coefficient)
     p, i, d = (gain / power.alpha for gain in loop.gains(power))
     return p, i, d, power.alpha, power.lead
 
@@ -57,8 +57,8 @@ def _response(
         slow = STEP + (slow - STEP) * follow
         turn = p * error + i * integral - d * change
         up, down = room if turn > 0.0 else room[::-1]
-        asked = math.copysign(0.5 * (min(abs(turn), up) + min(abs(turn), down)), turn)
-        new = asked + (acting - asked) * keep
+        step_size = math.copysign(0.5 * (min(abs(turn), up) + min(abs(turn), down)), turn)
+        new = step_size + (acting - step_size) * keep
         change, acting = alpha * (new + lead * (new - acting) / SUBSTEP), new
         rate += SUBSTEP * change
         largest = max(largest, rate)

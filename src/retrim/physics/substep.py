@@ -81,7 +81,7 @@ class RotorState(eqx.Module):
     """Integral of the rate error [rad]."""
     omega_dot: Float[Array, "3"]
     """Body angular acceleration over the last millisecond [rad/s^2], for the derivative term."""
-    wanted_slow: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
+    slow_setpoint: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Low-pass filtered commanded body rates [rad/s], for controllers that use the rate of change of commands."""
 
 
@@ -106,4 +106,4 @@ def rigid_body(
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=s.x.p.dtype)
     a = s.x.R @ force / mass + gravity + push
     x = State(s.x.p + h * s.x.v + 0.5 * h**2 * a, s.x.R @ so3.exp(h * omega), s.x.v + h * a)
-    return RotorState(x, omega, motors, integral, omega_dot, s.wanted_slow if wanted_slow is None else wanted_slow)
+    return RotorState(x, omega, motors, integral, omega_dot, s.slow_setpoint if wanted_slow is None else wanted_slow)

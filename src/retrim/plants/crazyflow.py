@@ -111,7 +111,7 @@ def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffe
     def fly(data: Any, command: jax.Array, effects: ExternalEffects) -> Any:
         inertia = vehicle.J + jnp.diag(effects.inertia)
         gain = effects.gain[jnp.array(ORDER), None]
-        loaded = vehicle.replace(
+        vehicle_with_mass = vehicle.replace(
             mass=vehicle.mass + effects.mass,
             J=inertia,
             J_inv=jnp.linalg.inv(inertia),
@@ -125,11 +125,11 @@ def _simulator(steps: int) -> tuple[Any, Callable[[Any, np.ndarray, ExternalEffe
             data = sim.clip_rotor_vel_cmd(data, lower, upper, dynamics)
             to_world = rotation.from_quat(data.states.quat[0, 0]).as_matrix()
             blown = to_world @ (vehicle.drag_matrix @ (to_world.T @ -effects.wind))
-            force = (blown + loaded.mass * effects.push)[None, None]
+            force = (blown + vehicle_with_mass.mass * effects.push)[None, None]
             return sim.increment_steps(move(data.replace(states=data.states.replace(force=force)))), None
 
         data = functional.body_rate_control(data, command[None, None])
-        after, _ = jax.lax.scan(step, data.replace(params=loaded), length=steps)
+        after, _ = jax.lax.scan(step, data.replace(params=vehicle_with_mass), length=steps)
         return after.replace(params=data.params)
 
     thrusts = sim.load_dynamics_params(dynamics, drone)

@@ -11,7 +11,7 @@ from ..errors import PlantError
 from ..physics.disturbance import Disturbance, effects_at
 from ..physics.effects import ExternalEffects
 from ..physics.state import STANDARD_GRAVITY, Command, State
-from .plant import Measurement, Plant, as_numpy, check_command, limited
+from .plant import Measurement, Plant, as_numpy, check_command, limit_command
 
 HOVER = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
 
@@ -46,7 +46,7 @@ class ExternalPlant(Plant, abc.ABC):
         self._instants = dt * np.arange(instants) / instants
         self._x: State | None = None
         self._v = np.zeros(3)
-        self._held = HOVER
+        self._last_command = HOVER
         self._ticks = 0
 
     @abc.abstractmethod
@@ -67,28 +67,28 @@ class ExternalPlant(Plant, abc.ABC):
         at_rest = jnp.zeros_like(start.p)
         pose = Pose(*(np.asarray(a, dtype=np.float64) for a in (start.p, start.R, start.v, at_rest)))
         self._launch(pose)
-        self._x, self._v, self._held, self._ticks = start, pose.v, HOVER, 0
+        self._x, self._v, self._last_command, self._ticks = start, pose.v, HOVER, 0
         return Measurement(0.0, start, at_rest, at_rest, truth=start)
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
         """Advance the simulator by one tick."""
         name = type(self).__name__
-        wanted = check_command(u, name)
+        command = check_command(u, name)
         if self._x is None:
             raise PlantError(f"{name}: not flying; call reset first")
         times = self._ticks * self.dt + self._instants
         effects = jax.tree.map(np.asarray, effects_at(times, self._x, self._disturbance))
         if np.any(effects.moment != 0.0):
             raise PlantError(f"{name}: cannot carry a load off its centre; the plants bem and simple can")
-        after = self._advance(self._held, effects)
+        after = self._advance(self._last_command, effects)
         dtype = self._x.p.dtype
         acceleration = (after.v - self._v) / self.dt  # in double precision: a difference in single has few digits
         *state, omega, a = (jnp.asarray(value, dtype=dtype) for value in (*after, acceleration))
         self._x, self._v = State(*state), after.v
-        accepted = limited(u, wanted, *self._limits)
-        self._held = as_numpy(accepted).astype(np.float64)
+        accepted_command = limit_command(u, command, *self._limits)
+        self._last_command = as_numpy(accepted_command).astype(np.float64)
         self._ticks += 1
-        return Measurement(self._ticks * self.dt, self._x, omega, a, truth=self._x), accepted
+        return Measurement(self._ticks * self.dt, self._x, omega, a, truth=self._x), accepted_command
 
     def disturb(self, disturbance: Disturbance) -> None:
         """Change the disturbance in flight; new parameters of the same kind do not cause recompilation."""

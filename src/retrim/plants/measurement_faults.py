@@ -77,8 +77,8 @@ class SwappedMarkers(AbstractMeasurementFault):
         """Rotate and shift the last pose in each period of ``every`` ticks."""
         x = _newest(past)
         now = _last_of(tick, self.every).astype(x.p.dtype)
-        turned = so3.mul(x.R, so3.exp(now * self.rotation.astype(x.p.dtype)))
-        return State(x.p + now * self.p.astype(x.p.dtype), turned, x.v)
+        rotation = so3.mul(x.R, so3.exp(now * self.rotation.astype(x.p.dtype)))
+        return State(x.p + now * self.p.astype(x.p.dtype), rotation, x.v)
 
 
 class Late(AbstractMeasurementFault):
@@ -129,9 +129,9 @@ class Repeated(AbstractMeasurementFault):
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
         """Return the newest measurement or the one before it."""
-        lost = random.uniform(key, (), self.probability.dtype) < self.probability
+        is_lost = random.uniform(key, (), self.probability.dtype) < self.probability
         before, now = (jax.tree.map(lambda leaf, row=row: leaf[row], past) for row in (0, 1))
-        result: State = where(lost, before, now)
+        result: State = where(is_lost, before, now)
         return result
 
 

@@ -127,16 +127,16 @@ def check_command(u: Command, plant: str) -> np.ndarray:
     Raises:
         PlantError: The command is not finite; the message contains the plant and the entry.
     """
-    wanted = as_numpy(u)
-    for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), wanted.tolist(), strict=True):
+    command = as_numpy(u)
+    for name, value in zip(("c", "omega[0]", "omega[1]", "omega[2]"), command.tolist(), strict=True):
         if not math.isfinite(value):
             raise PlantError(f"{plant}: command refused, {name} = {value} is not finite")
-    return wanted
+    return command
 
 
-def limited(u: Command, wanted: np.ndarray, low: np.ndarray, high: np.ndarray) -> Command:
-    """Return ``u`` clipped to limits of [c, omega], or ``u`` itself if within them; ``wanted`` is ``u`` as an array."""
-    if (low <= wanted).all() and (wanted <= high).all():
+def limit_command(u: Command, command: np.ndarray, low: np.ndarray, high: np.ndarray) -> Command:
+    """Return ``u`` clipped to limits of [c, omega], or ``u`` itself if within them; ``command`` is ``u`` as array."""
+    if (low <= command).all() and (command <= high).all():
         return u
-    accepted = np.clip(wanted, low, high).astype(wanted.dtype)
-    return Command(jnp.asarray(accepted[0]), jnp.asarray(accepted[1:]))
+    limited_u = np.clip(command, low, high).astype(command.dtype)
+    return Command(jnp.asarray(limited_u[0]), jnp.asarray(limited_u[1:]))

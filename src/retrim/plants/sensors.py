@@ -99,7 +99,7 @@ class SensorModel(eqx.Module):
         """Sample true states, and add the samples to the queue.
 
         Args:
-            queue: The :attr:`held` samples, oldest first.
+            queue: The :attr:`hold_last` samples, oldest first.
             xs: True states, one per period (leading axis).
             key: Seed of the noise and dropouts; consumed.
 
@@ -109,10 +109,10 @@ class SensorModel(eqx.Module):
 
         def one(queue: State, step: tuple[State, Key[Array, ""]]) -> tuple[State, None]:
             x, key = step
-            k_noise, k_lost = random.split(key)
-            lost: Bool[Array, ""] = random.uniform(k_lost, (), self.dropout.dtype) < self.dropout
+            k_noise, k_dropout = random.split(key)
+            is_lost: Bool[Array, ""] = random.uniform(k_dropout, (), self.dropout.dtype) < self.dropout
             last = jax.tree.map(lambda leaf: leaf[-1], queue)
-            new = where(lost, last, self.noisy(x, k_noise))
+            new = where(is_lost, last, self.noisy(x, k_noise))
             return jax.tree.map(lambda old, n: jnp.concatenate([old[1:], n[None]]), queue, new), None
 
         after, _ = lax.scan(one, queue, (xs, random.split(key, xs.p.shape[0])))

@@ -18,7 +18,7 @@ from ..physics.effects import ExternalEffects
 from ..physics.state import Command, State
 from ..physics.substep import SUBSTEP, AbstractSubstepDynamics
 from .measurement_faults import AbstractMeasurementFault
-from .plant import Measurement, Plant, as_numpy, check_command, limited
+from .plant import Measurement, Plant, as_numpy, check_command, limit_command
 from .sensors import SensorModel
 
 FIRST_SAMPLE, INERTIAL, FAULT = 2**31 - 1, 2**31 - 2, 2**31 - 3  # folded into keys; no tick has these numbers
@@ -86,9 +86,9 @@ class Simulation(eqx.Module):
     def launch(self, x0: State) -> SimState:
         """Return the state of a plant that hovers at ``x0``, with queued hover commands and one sample of ``x0``."""
         queue = CommandQueue.of(Command.hover(x0.p.dtype), self.model.dt, longest=self.longest_delay)
-        held = 1 if self.sensors is None else self.sensors.held
+        queue_length = 1 if self.sensors is None else self.sensors.held
         sample = x0 if self.sensors is None else self.sensors.noisy(x0, random.fold_in(self.key, FIRST_SAMPLE))
-        samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (held, *leaf.shape)), sample)
+        samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (queue_length, *leaf.shape)), sample)
         reports = None
         if self.fault is not None:
             rows = self.fault.memory + 1
@@ -119,8 +119,8 @@ class Simulation(eqx.Module):
         if (sensors := self.sensors) is None:
             samples = jax.tree.map(lambda leaf: leaf[-1:], path)
         else:
-            sampled = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
-            samples = sensors.received(s.samples, sampled, random.fold_in(self.key, tick))
+            on_samples = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
+            samples = sensors.received(s.samples, on_samples, random.fold_in(self.key, tick))
         a = (self.model.state(inner).v - self.model.state(s.model).v) / self.model.dt
         return SimState(inner, queue, samples, a, self._reports(s.reports, samples, jnp.asarray(tick) + 1))
 
@@ -225,17 +225,17 @@ class SimPlant(Plant):
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
         """Advance the model by one tick; commands beyond the vehicle's limits are clipped."""
-        wanted = check_command(u, "SimPlant")
+        command = check_command(u, "SimPlant")
         if self._state is None:
             raise PlantError("SimPlant: not flying; call reset first")
-        accepted = u if self._limits is None else limited(u, wanted, *self._limits)
+        accepted_command = u if self._limits is None else limit_command(u, command, *self._limits)
         fault = self.simulation.fault
         while True:
-            self._state = _advance(self.simulation, self._state, accepted, np.int32(self._ticks))
+            self._state = _advance(self.simulation, self._state, accepted_command, np.int32(self._ticks))
             self._ticks += 1
             if fault is None or not fault.is_missing(self._ticks):
                 break  # in a measurement gap, the vehicle continues with the last command
-        return self._measurement(), accepted
+        return self._measurement(), accepted_command
 
     def disturb(self, disturbance: Disturbance) -> None:
         """Change the disturbance in flight; new parameters of the same kind do not cause recompilation."""

@@ -20,13 +20,13 @@ from ..learn.window import Window
 from ..physics.state import Command
 from ..runkit.reporter import Reporter
 from ..runkit.training import model_error
-from .predictors import refitted
+from .predictors import refit
 
 SETTLED = 5  # consecutive refused updates after which no further improvement is expected
 ENOUGH = 0.5  # share of a window that must be valid
 
 
-class Adapted(NamedTuple):
+class AdaptationResult(NamedTuple):
     """Result of adapting to a log."""
 
     state: LearnerState
@@ -41,7 +41,7 @@ class Adapted(NamedTuple):
 
 def adapt_to(
     rows: Targets, setup: Setup, policy: AbstractPolicy, *, method: str, updates: int, seed: int, reporter: Reporter
-) -> Adapted:
+) -> AdaptationResult:
     """Fit the residual to a log, window by window as in flight, and re-train the policy in the corrected model.
 
     The updates start from the task's states, because the positions in a log are not those of the task. The gate admits
@@ -62,36 +62,36 @@ def adapt_to(
     k_init, k_delta, k_starts, k_learn = random.split(random.key(seed), 4)
     learner, prepare = setup.learner, find_method(method).learns
     state = learner.init(policy if prepare is None else prepare(setup, policy, k_delta), k_init)
-    residual, trained, window = _fitted(rows, setup, state.residual), state.policy, _starts(setup, k_starts)
-    admitted = refused = tried = 0
+    residual, policy_state, window = _fit(rows, setup, state.residual), state.policy, _starts(setup, k_starts)
+    admissions = refusals = attempts = 0
     with reporter.progress("re-training") as advance:
         advance(0.0, "compiling")
         for key in random.split(k_learn, updates):
-            candidate, verdict = learner.update_policy(trained, residual, window, key)
-            tried, refused = tried + 1, refused + 1
+            candidate, verdict = learner.update_policy(policy_state, residual, window, key)
+            attempts, refusals = attempts + 1, refusals + 1
             if bool(verdict.admitted):
-                trained, admitted, refused = candidate, admitted + 1, 0
-            advance(tried / updates, verdict.reason())
-            if refused == SETTLED:
+                policy_state, admissions, refusals = candidate, admissions + 1, 0
+            advance(attempts / updates, verdict.reason())
+            if refusals == SETTLED:
                 break
-        advance(1.0, f"{admitted} of {tried} updates were better")
-    known = FittedResidual(learner.residual_model, residual)
-    before, after = (model_error(setup, each.policy.merged(), known) for each in (state.policy, trained))
-    return Adapted(LearnerState(trained, residual), admitted, tried, before, after)
+        advance(1.0, f"{admissions} of {attempts} updates were better")
+    residual_model = FittedResidual(learner.residual_model, residual)
+    before, after = (model_error(setup, each.policy.merged(), residual_model) for each in (state.policy, policy_state))
+    return AdaptationResult(LearnerState(policy_state, residual), admissions, attempts, before, after)
 
 
-def _fitted(rows: Targets, setup: Setup, state: Any) -> Any:
+def _fit(rows: Targets, setup: Setup, state: Any) -> Any:
     """Return the state of the residual model after the last complete window."""
     a, dt = setup.preset.adapt, setup.preset.dt
-    fitted = 0
+    last_fit = 0
     for last in range(a.window, rows.valid.shape[0] + 1, max(1, round(a.fit_every / dt))):
         part: Targets = jax.tree.map(lambda leaf, last=last: leaf[last - a.window : last], rows)
         if float(np.mean(part.valid)) < ENOUGH:
             continue
-        new = refitted(setup.learner.residual_model, state, part)
+        new = refit(setup.learner.residual_model, state, part)
         if bool(all_finite(new)):
-            state, fitted = new, fitted + 1
-    if not fitted:
+            state, last_fit = new, last_fit + 1
+    if not last_fit:
         raise LogError(f"the log has no {a.window * dt:g} s of flight in one piece, which the learner's window takes")
     return state
 

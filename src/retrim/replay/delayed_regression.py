@@ -33,15 +33,15 @@ class Sums(NamedTuple):
     ) -> "Sums":
         """Sum over each block's rows, after averaging ``y`` (n, outputs) and its features over ``pool`` rows."""
 
-        def pooled(rows: np.ndarray) -> np.ndarray:
+        def pool_rows(rows: np.ndarray) -> np.ndarray:
             parts = rows[blocks.reshape(len(blocks), -1, pool)].mean(axis=2)
             return np.asarray(parts.reshape(len(blocks), -1, *parts.shape[3:]))
 
         xx, xy = [], []
-        Y = pooled(y[..., None])[..., 0].reshape(len(blocks), -1)
+        Y = pool_rows(y[..., None])[..., 0].reshape(len(blocks), -1)
         for delay in delays:
             for lag in lags:
-                X = pooled(features(float(delay), float(lag)).reshape(len(y), y.shape[1], -1))
+                X = pool_rows(features(float(delay), float(lag)).reshape(len(y), y.shape[1], -1))
                 X = X.reshape(len(blocks), -1, X.shape[-1])
                 xx.append(np.swapaxes(X, 1, 2) @ X)
                 xy.append((np.swapaxes(X, 1, 2) @ Y[:, :, None])[:, :, 0])
@@ -58,8 +58,8 @@ class Sums(NamedTuple):
         """
         xx, xy = np.einsum("dlbij,b->dlij", self.xx, draw), np.einsum("dlbi,b->dli", self.xy, draw)
         size = np.sqrt(np.einsum("dlii->dli", xx) + 1e-12)
-        scaled = xx / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(xx.shape[-1])
-        theta = np.linalg.solve(scaled, (xy / size)[..., None])[..., 0] / size
+        scaling = xx / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(xx.shape[-1])
+        theta = np.linalg.solve(scaling, (xy / size)[..., None])[..., 0] / size
         left = np.maximum(self.yy @ draw - np.einsum("dli,dli->dl", theta, xy), 1e-12)
         count = self.n @ draw
         return count * np.log(left / count), theta
@@ -98,15 +98,15 @@ class Channel(NamedTuple):
         rest, none = acting(0.0, 0.0), np.zeros(1)
         mean = np.broadcast_to(rest[blocks].mean(axis=(0, 1)), rest.shape)
         for pool in POOLS:
-            made = cls(
+            channel = cls(
                 Sums.of(lambda delay, lag: features(acting(delay, lag)), y, blocks, DELAYS, LAGS, pool),
                 Sums.of(lambda delay, lag: features(mean), y, blocks, none, none, pool),
             )
-            if made.told():
+            if channel.is_significant():
                 break
-        return made
+        return channel
 
-    def told(self) -> bool:
+    def is_significant(self) -> bool:
         """Return whether changes in the command explain the changes in the output.
 
         If a controller reacts to measurement noise, the noise in the next difference of measurements looks like an
@@ -114,8 +114,8 @@ class Channel(NamedTuple):
         above one half.
         """
         before, after = self.still.left(), self.sums.left()
-        won = np.clip(before - after, 0.0, None)
-        pieces = won.sum() ** 2 / max(float(np.sum(won**2)), 1e-12)
+        gain = np.clip(before - after, 0.0, None)
+        pieces = gain.sum() ** 2 / max(float(np.sum(gain**2)), 1e-12)
         return bool(1.0 - after.sum() / max(float(before.sum()), 1e-12) > EXPLAINED and pieces > PIECES)
 
 

@@ -40,7 +40,7 @@ class Estimate(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Identified:
+class IdentifiedVehicle:
     """A vehicle's identified parameters; a parameter is None if the log does not determine it."""
 
     delay: Estimate | None
@@ -74,7 +74,7 @@ class Identified:
         return any(isinstance(value, Estimate) for value in (*vars(self).values(), *self.drag))
 
 
-def identify(log: FlightLog, *, seed: int = 0) -> Identified:
+def identify(log: FlightLog, *, seed: int = 0) -> IdentifiedVehicle:
     """Identify a vehicle from a flight.
 
     Args:
@@ -91,31 +91,33 @@ def identify(log: FlightLog, *, seed: int = 0) -> Identified:
     rates = {} if log.command is None else {
         name: _rates(log, log.command, blocks, axes) for name, axes in (("rates", [0, 1]), ("yaw", [2]))
     }  # fmt: skip
-    told = {name: channel for name, channel in {"thrust": thrust, **rates}.items() if channel.told()}
+    significant = {name: channel for name, channel in {"thrust": thrust, **rates}.items() if channel.is_significant()}
     random = np.random.default_rng(seed)
-    chosen = [random.integers(0, len(blocks), len(blocks)) for _ in range(DRAWS)]
-    draws = [np.ones(len(blocks)), *(np.bincount(draw, minlength=len(blocks)).astype(float) for draw in chosen)]
-    result = [_solved(told, thrust, draw) for draw in draws]
+    samples = [random.integers(0, len(blocks), len(blocks)) for _ in range(DRAWS)]
+    draws = [np.ones(len(blocks)), *(np.bincount(draw, minlength=len(blocks)).astype(float) for draw in samples)]
+    result = [_solve(significant, thrust, draw) for draw in draws]
 
     for each in result:
         each["full"] = each["thrust gain"] * (log.full_thrust or 0.0) + each["offset"]
 
-    def of(name: str, known: bool) -> Estimate | None:
-        values = [each[name] for each in result] if known else []
-        return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], INSIDE))) if known else None
+    def of(name: str, is_known: bool) -> Estimate | None:
+        values = [each[name] for each in result] if is_known else []
+        return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], INSIDE))) if is_known else None
 
-    moved = np.sqrt(np.mean(np.einsum("nji,nj->ni", log.R, log.v)[log.valid] ** 2, axis=0))
-    x, y, z = (of(f"drag {axis}", bool(told) and bool(fast > SLOW)) for axis, fast in zip("xyz", moved, strict=True))
-    lift, turn, yaw = (name in told for name in ("thrust", "rates", "yaw"))
-    found_by_batch = Identified(
-        of("delay", bool(told)), of("thrust gain", lift), of("offset", lift),
+    speeds = np.sqrt(np.mean(np.einsum("nji,nj->ni", log.R, log.v)[log.valid] ** 2, axis=0))
+    x, y, z = (
+        of(f"drag {axis}", bool(significant) and bool(fast > SLOW)) for axis, fast in zip("xyz", speeds, strict=True)
+    )
+    lift, turn, yaw = (name in significant for name in ("thrust", "rates", "yaw"))
+    batch_result = IdentifiedVehicle(
+        of("delay", bool(significant)), of("thrust gain", lift), of("offset", lift),
         of("full", lift and log.full_thrust is not None), of("thrust lag", lift), of("rates lag", turn),
         of("rates gain", turn), of("yaw lag", yaw), of("yaw gain", yaw), (x, y, z), result[0]["left"],
     )  # fmt: skip
-    return _with_path(found_by_batch, path_of_log(log)) if turn else found_by_batch
+    return _with_path(batch_result, path_of_log(log)) if turn else batch_result
 
 
-def _with_path(found: Identified, path: PathEstimate) -> Identified:
+def _with_path(result: IdentifiedVehicle, path: PathEstimate) -> IdentifiedVehicle:
     """Return the identified vehicle, with the in-flight estimator's delay and lags where they are excited.
 
     That estimator models the damping and the noise of differences, but a vehicle file has a first-order lag. The delay
@@ -123,25 +125,25 @@ def _with_path(found: Identified, path: PathEstimate) -> Identified:
     regression, because they must be estimated together with the offset and all three drag coefficients.
     """
     if not (bool(path.delay.excited) and bool(path.rate_lag.excited)):
-        return found
+        return result
     delay, lag = (float(x) for x in path.first_order())
     longer, share = delay - float(path.delay.mean), lag / float(path.rate_lag.mean)
-    yaw, thrust = found.yaw_lag, found.thrust_lag
+    yaw, thrust = result.yaw_lag, result.thrust_lag
     if yaw is not None and bool(path.yaw_lag.excited):
-        yaw = _scaled(path.yaw_lag)
+        yaw = _scale(path.yaw_lag)
     if thrust is not None and bool(path.thrust_lag.excited):
-        thrust = _scaled(path.thrust_lag)
+        thrust = _scale(path.thrust_lag)
     ends = (max(0.0, float(end) + longer) for end in (path.delay.mean, path.delay.low, path.delay.high))
-    return replace(found, delay=Estimate(*ends), rate_lag=_scaled(path.rate_lag, share), yaw_lag=yaw, thrust_lag=thrust)
+    return replace(result, delay=Estimate(*ends), rate_lag=_scale(path.rate_lag, share), yaw_lag=yaw, thrust_lag=thrust)
 
 
-def _scaled(each: PathParameter, scale: float = 1.0) -> Estimate:
+def _scale(each: PathParameter, scale: float = 1.0) -> Estimate:
     return Estimate(*(scale * float(end) for end in (each.mean, each.low, each.high)))
 
 
-def _solved(told: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:
+def _solve(significant: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:
     """Return the common delay, and each channel's lag and parameters, interpolated on the grid."""
-    fits = {name: channel.sums.fit(draw) for name, channel in told.items()}
+    fits = {name: channel.sums.fit(draw) for name, channel in significant.items()}
     late = np.sum([misfit.min(axis=1) for misfit, _ in fits.values()], axis=0) if fits else np.zeros(len(DELAYS))
     d = int(np.argmin(late))
     result = {"delay": lowest(DELAYS, late, d)}
@@ -162,9 +164,9 @@ def _blocks(log: FlightLog) -> np.ndarray:
     """Return the ticks of each complete block: two seconds of flight after a settling time."""
     size, warm = 10 * max(1, round(0.1 * BLOCK / log.dt)), round(WARM / log.dt)
     good = log.valid[:-1] & log.valid[1:]
-    settled = np.convolve(good, np.ones(warm + 1), mode="full")[: len(good)] > warm
+    has_settled = np.convolve(good, np.ones(warm + 1), mode="full")[: len(good)] > warm
     result, run = [], 0
-    for k, fine in enumerate(settled):
+    for k, fine in enumerate(has_settled):
         run = run + 1 if fine else 0
         if run == size:
             result.append(np.arange(k - size + 1, k + 1))
@@ -190,13 +192,13 @@ def _rates(log: FlightLog, command: np.ndarray, blocks: np.ndarray, axes: list[i
     """Return the channel for some axes: omega = k omega_cmd + bias, over each tick; the axes share the lag and gain."""
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
-    turned = Rotation.from_matrix(np.swapaxes(log.R[:-1], 1, 2) @ log.R[1:]).as_rotvec() / log.dt
-    bias = np.broadcast_to(np.eye(len(axes)), (len(turned), len(axes), len(axes)))
+    rotation = Rotation.from_matrix(np.swapaxes(log.R[:-1], 1, 2) @ log.R[1:]).as_rotvec() / log.dt
+    bias = np.broadcast_to(np.eye(len(axes)), (len(rotation), len(axes), len(axes)))
 
-    def features(told: np.ndarray) -> np.ndarray:
-        return np.concatenate([told[:, :, None], bias], axis=2)
+    def features(significant: np.ndarray) -> np.ndarray:
+        return np.concatenate([significant[:, :, None], bias], axis=2)
 
-    chosen = command[:, axes]
+    samples = command[:, axes]
     return Channel.of(
-        features, lambda delay, lag: acting_commands(chosen, log.dt, delay, lag)[:-1], turned[:, axes], blocks
+        features, lambda delay, lag: acting_commands(samples, log.dt, delay, lag)[:-1], rotation[:, axes], blocks
     )

@@ -37,7 +37,7 @@ def _estimate(estimator: PathEstimator, rows: tuple[jax.Array, ...]) -> PathEsti
         return estimator.issued(estimator.measured(s, t, State(p, R, v)), Command(c, omega)), None
 
     def batch(s: PathState, part: tuple[jax.Array, ...]) -> tuple[PathState, None]:
-        return estimator.estimated(jax.lax.scan(tick, s, part)[0]), None
+        return estimator.estimate_path(jax.lax.scan(tick, s, part)[0]), None
 
     first = State(*(row[0, 0] for row in rows[1:4]))
     end: PathState = jax.lax.scan(batch, estimator.init(first), rows)[0]

@@ -80,8 +80,8 @@ def predict_log(
         predictor, squares = begin(), []
         for buffer, ahead in parts:
             valid = np.asarray(ahead.valid)
-            missed = (np.asarray(ahead.a_res) - predictor(buffer)(ahead))[valid]
-            squares.append(np.mean(missed**2, axis=0))
+            errors = (np.asarray(ahead.a_res) - predictor(buffer)(ahead))[valid]
+            squares.append(np.mean(errors**2, axis=0))
         mean = np.mean(squares, axis=0)
         x, y, z = np.sqrt(mean)
         per_window = tuple(float(np.sqrt(square.sum())) for square in squares)

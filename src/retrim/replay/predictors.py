@@ -32,9 +32,9 @@ def zero(rows: Targets) -> Predict:
 
 def mean_of(rows: Targets, ticks: int | None = None) -> Predict:
     """Predict the mean of the last ``ticks``, or of all rows."""
-    chosen = jax.tree.map(lambda leaf: leaf[-ticks:] if ticks else leaf, rows)
-    valid = np.asarray(chosen.valid)
-    mean = np.asarray(chosen.a_res)[valid].mean(axis=0) if valid.any() else np.zeros(3)
+    used_rows = jax.tree.map(lambda leaf: leaf[-ticks:] if ticks else leaf, rows)
+    valid = np.asarray(used_rows.valid)
+    mean = np.asarray(used_rows.a_res)[valid].mean(axis=0) if valid.any() else np.zeros(3)
     return lambda more: np.broadcast_to(mean, more.a_res.shape)
 
 
@@ -63,23 +63,23 @@ class Learnt:
 
     def __call__(self, rows: Targets) -> Predict:
         """Fit to a window, and return its predictor."""
-        state = refitted(self._model, self._state, rows)
+        state = refit(self._model, self._state, rows)
         if bool(all_finite(eqx.filter(state, eqx.is_inexact_array))):  # in flight, a fit that is not finite is refused
             self._state = state
-        kept = self._state
-        return lambda more: np.asarray(_predicted(self._model, kept, more))
+        state_before = self._state
+        return lambda more: np.asarray(_predict(self._model, state_before, more))
 
 
 @eqx.filter_jit
-def refitted(model: ResidualModel, state: Any, rows: Targets) -> Any:
+def refit(model: ResidualModel, state: Any, rows: Targets) -> Any:
     """Return a residual model's state after a fit; models of the same kind share the compiled program."""
     return model.fit(state, rows)[0]
 
 
 @eqx.filter_jit
-def _predicted(model: ResidualModel, state: Any, rows: Targets) -> Float[Array, "n 3"]:
-    predicted: Float[Array, "n 3"] = jax.vmap(lambda x, u: model.predict(state, x, u))(rows.x, rows.u)
-    return predicted
+def _predict(model: ResidualModel, state: Any, rows: Targets) -> Float[Array, "n 3"]:
+    predictions: Float[Array, "n 3"] = jax.vmap(lambda x, u: model.predict(state, x, u))(rows.x, rows.u)
+    return predictions
 
 
 def yardsticks(dt: float) -> dict[str, Callable[[], Predictor]]:
@@ -93,7 +93,7 @@ def yardsticks(dt: float) -> dict[str, Callable[[], Predictor]]:
     }
 
 
-def learnt(name: str, preset: Preset, vehicle: Vehicle, seed: int, **adapt: Any) -> Callable[[], Predictor]:
+def model_factory(name: str, preset: Preset, vehicle: Vehicle, seed: int, **adapt: Any) -> Callable[[], Predictor]:
     """Return a factory for one of a preset's residual models.
 
     Args:

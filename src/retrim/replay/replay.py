@@ -14,7 +14,7 @@ from ..config.setup import Setup
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError, LogError
 from ..io.logs import FlightLog, read_flight_log, read_map
-from ..io.trained import load_policy
+from ..io.policies import load_policy
 from ..learn.residuals.targets import Targets
 from ..runkit.document import Document, TableSection
 from ..runkit.outputs import write_state
@@ -23,12 +23,12 @@ from ..runkit.run import Run
 from .adaptation import adapt_to
 from .identification import identify
 from .prediction import PredictionScore, Protocol, predict_log
-from .predictors import learnt, yardsticks
+from .predictors import model_factory, yardsticks
 from .report import agreement_section, identified_section, picture, prediction_section, residual_section, warning_of
 from .rows import rows_of
 from .vehicle import vehicle_toml
 
-SHOWN = ("regression", "ensemble", "linear")  # residual models to compare with the baselines
+REPORT_MODELS = ("regression", "ensemble", "linear")  # residual models to compare with the baselines
 ENSEMBLE_RATE = 1e-3  # learning rate; with that of hover/paper, an ensemble fits the noise in a real log
 DEFAULT = "hover/retrim"
 SAMPLES = (12, 100_000)  # limits for the number of samples in a fit; the command delay is added to the minimum
@@ -86,12 +86,12 @@ class Replay:
             raise ConfigError(f"--updates {self.updates}: must be 1 to 10000")
 
 
-def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
+def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Document:
     """Report on a log in ``replay.md``, ``replay.json`` and a picture; identify and adapt if requested.
 
     Args:
         path: The log.
-        asked: The options.
+        request: The options.
         run: Run whose folder receives the files.
         reporter: Receives the tables and the progress.
 
@@ -99,59 +99,61 @@ def replay(path: Path, asked: Replay, run: Run, reporter: Reporter) -> Document:
         LogError: The log cannot be used.
         ConfigError: A name does not exist or does not fit.
     """
-    policy, preset = load_policy(asked.policy, trust=asked.trust) if asked.policy else (None, load(DEFAULT))
-    if asked.vehicle is not None:
-        preset = with_vehicle(preset, asked.vehicle)
-    setup = Setup.from_preset(preset if asked.residual is None else changed(preset, adapt={"residual": asked.residual}))
-    log = read_flight_log(path, None if asked.map is None else read_map(asked.map), dt=preset.dt)
+    policy, preset = load_policy(request.policy, trust=request.trust) if request.policy else (None, load(DEFAULT))
+    if request.vehicle is not None:
+        preset = with_vehicle(preset, request.vehicle)
+    setup = Setup.from_preset(
+        preset if request.residual is None else changed(preset, adapt={"residual": request.residual})
+    )
+    log = read_flight_log(path, None if request.map is None else read_map(request.map), dt=preset.dt)
     least, most = setup.preset.plant_delay_ticks + SAMPLES[0], SAMPLES[1]
-    if not least <= round(asked.buffer / log.dt) <= most:
+    if not least <= round(request.buffer / log.dt) <= most:
         raise ConfigError(
-            f"--buffer {asked.buffer:g}: must be {least * log.dt:.2g} to {most * log.dt:.4g} s for a log that has a "
+            f"--buffer {request.buffer:g}: must be {least * log.dt:.2g} to {most * log.dt:.4g} s for a log that has a "
             f"sample every {1000 * log.dt:.3g} ms"
         )
-    rows, protocol = rows_of(log, delay=asked.delay, lag=asked.lag), Protocol(asked.buffer, asked.horizon)
-    late = f" Thrust acts {1000 * asked.delay:g} ms late, with a lag of {1000 * asked.lag:g} ms."
-    intro = "Residual a - (c R e3 - g e3), world frame." + late * bool(asked.delay or asked.lag)
+    rows, protocol = rows_of(log, delay=request.delay, lag=request.lag), Protocol(request.buffer, request.horizon)
+    late = f" Thrust acts {1000 * request.delay:g} ms late, with a lag of {1000 * request.lag:g} ms."
+    intro = "Residual a - (c R e3 - g e3), world frame." + late * bool(request.delay or request.lag)
     intro = f"{warning_of(log)}\n\n{intro}" if log.warnings else intro
     document = Document(run, "replay", f"Replay of {path.name}", intro,
-                        [asked.seed], reporter)  # fmt: skip
+                        [request.seed], reporter)  # fmt: skip
     document.more["agreement"] = dict(log.agreement)
     document.add(agreement_section(log))
     document.add(residual_section(log, rows))
-    result = _foretold(asked, protocol, setup, log, rows, reporter, run)
+    result = _foretold(request, protocol, setup, log, rows, reporter, run)
     if result:
-        drawn = picture(log, rows, result, protocol, run.folder)[0]
-        section = dataclasses.replace(prediction_section(result, protocol), picture=drawn)
+        picture_path = picture(log, rows, result, protocol, run.folder)[0]
+        section = dataclasses.replace(prediction_section(result, protocol), picture=picture_path)
         document.add(section, [dataclasses.asdict(each) for each in result])
-    if asked.identify and not run.interrupted:
+    if request.identify and not run.interrupted:
         with reporter.progress("identifying") as advance:
             advance(0.0, "delays and lags")
-            vehicle = identify(log, seed=asked.seed)
+            vehicle = identify(log, seed=request.seed)
             advance(1.0, "done")
         document.more["identified"] = tree.map(float, dataclasses.asdict(vehicle))
         document.add(identified_section(vehicle))
         if vehicle.known:
             run.write_text("vehicle.toml", vehicle_toml(vehicle, setup, path.name))
     if policy is not None and not run.interrupted:
-        document.add(_adapted(asked, setup, policy, log, rows, run, reporter))
+        document.add(_adapt(request, setup, policy, log, rows, run, reporter))
     document.write()
     return document
 
 
 def _foretold(
-    asked: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets, reporter: Reporter, run: Run
+    request: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets, reporter: Reporter, run: Run
 ) -> list[PredictionScore]:
     result = list[PredictionScore]()
     home = np.mean(log.p[log.valid], axis=0)
     goal = tuple(float(x) for x in home)
     preset = changed(setup.preset, goal=goal, dt=min(max(0.001, round(log.dt, 3)), SLOWEST))
     adapt: dict[str, Any] = {"window": round(protocol.buffer / log.dt), "fit_every": protocol.every}
-    names = dict.fromkeys([*SHOWN, *([asked.residual] if asked.residual else [])])
+    names = dict.fromkeys([*REPORT_MODELS, *([request.residual] if request.residual else [])])
     predictors = yardsticks(log.dt)
     for name in names:
         more = {"fit_learning_rate": ENSEMBLE_RATE} if name == "ensemble" else {}
-        predictors[name] = learnt(name, preset, setup.vehicle, asked.seed, **adapt, **more)
+        predictors[name] = model_factory(name, preset, setup.vehicle, request.seed, **adapt, **more)
     with reporter.progress("foretelling") as advance, run.interruptible():
         advance(0.0, next(iter(predictors)))
         for each in predict_log(rows, log.dt, predictors, protocol):
@@ -160,8 +162,8 @@ def _foretold(
     return result
 
 
-def _adapted(
-    asked: Replay, setup: Setup, policy: AbstractPolicy, log: FlightLog, rows: Targets, run: Run, reporter: Reporter
+def _adapt(
+    request: Replay, setup: Setup, policy: AbstractPolicy, log: FlightLog, rows: Targets, run: Run, reporter: Reporter
 ) -> TableSection:
     preset = setup.preset
     if abs(log.dt - preset.dt) > 0.02 * preset.dt:
@@ -170,7 +172,7 @@ def _adapted(
             f"log states at least that often to adapt to them"
         )
     result = adapt_to(
-        rows, setup, policy, method=asked.adapt, updates=asked.updates, seed=asked.seed, reporter=reporter
+        rows, setup, policy, method=request.adapt, updates=request.updates, seed=request.seed, reporter=reporter
     )
     write_state(result.state, preset, run.folder)
     lines = (("as it was", f"{result.before:.3f}"), ("adapted", f"{result.after:.3f}"))

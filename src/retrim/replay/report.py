@@ -9,7 +9,7 @@ from ..io.logs import FlightLog
 from ..io.logs.plausibility import DOUBTFUL
 from ..learn.residuals.targets import Targets
 from ..runkit.document import TableSection
-from .identification import Estimate, Identified
+from .identification import Estimate, IdentifiedVehicle
 from .prediction import PredictionScore, Protocol
 
 SMOOTH = 0.3  # averaging time of the curves in the picture [s]
@@ -27,8 +27,8 @@ def warning_of(log: FlightLog) -> str:
     """Return the introductory warning for a doubtful log, or an empty string for a consistent one."""
     if not log.warnings:
         return ""
-    said = "; ".join(log.warnings)
-    return f"**Warning: this log agrees badly with itself, and no figure below can be relied on: {said}.**"
+    warnings = "; ".join(log.warnings)
+    return f"**Warning: this log agrees badly with itself, and no figure below can be relied on: {warnings}.**"
 
 
 def agreement_section(log: FlightLog) -> TableSection:
@@ -47,65 +47,67 @@ def agreement_section(log: FlightLog) -> TableSection:
 
 def residual_section(log: FlightLog, rows: Targets) -> TableSection:
     """Return a table of the nominal model's error, axis by axis."""
-    missed = np.asarray(rows.a_res)[log.valid]
+    residuals = np.asarray(rows.a_res)[log.valid]
     slow = np.linalg.norm(log.v[log.valid], axis=1)
-    parts = [("mean", missed.mean(axis=0)), ("standard deviation", missed.std(axis=0)),
-             ("root mean square", np.sqrt(np.mean(missed**2, axis=0)))]  # fmt: skip
+    parts = [("mean", residuals.mean(axis=0)), ("standard deviation", residuals.std(axis=0)),
+             ("root mean square", np.sqrt(np.mean(residuals**2, axis=0)))]  # fmt: skip
     lines = tuple((name, *(f"{x:.2f}" for x in values), f"{np.linalg.norm(values):.2f}") for name, values in parts)
     about = (
         f"{log.seconds:.1f} s of flight, a tick of {1000 * log.dt:.4g} ms; speed {slow.mean():.2f} m/s on average, "
         f"{slow.max():.2f} m/s at most."
     )
-    said = "".join(f" {note[0].upper()}{note[1:]}." for note in log.notes if note not in log.warnings)
-    return TableSection(("residual [m/s^2]", "x", "y", "z", "all"), lines, "What the point mass missed", about + said)
+    warnings = "".join(f" {note[0].upper()}{note[1:]}." for note in log.notes if note not in log.warnings)
+    return TableSection(
+        ("residual [m/s^2]", "x", "y", "z", "all"), lines, "What the point mass missed", about + warnings
+    )
 
 
-def prediction_section(found: Sequence[PredictionScore], protocol: Protocol) -> TableSection:
+def prediction_section(results: Sequence[PredictionScore], protocol: Protocol) -> TableSection:
     """Return a table of the prediction errors over the next few seconds."""
-    least = min(each.rmse for each in found)
-    none = next((each.rmse for each in found if each.name == "zero"), None)
+    least = min(each.rmse for each in results)
+    none = next((each.rmse for each in results if each.name == "zero"), None)
     lines = []
-    for each in found:
+    for each in results:
         error = f"{each.rmse:.3f}"
         share = "" if not none else f"{100 * (1.0 - (each.rmse / none) ** 2):.0f} %"
         lines.append((each.name, f"**{error}**" if each.rmse == least else error, *(f"{x:.2f}" for x in each.per_axis),
                       share))  # fmt: skip
     about = (
         f"Fitted every {protocol.every:g} s to the last {protocol.buffer:g} s, the error over the next "
-        f"{protocol.horizon:g} s; {len(found[0].per_window)} windows. Raw: noise of the derivative of velocity is in "
+        f"{protocol.horizon:g} s; {len(results[0].per_window)} windows. Raw: noise of the derivative of velocity is in "
         f"every figure. `regression` is that of flight, made for the next second."
     )
     title = "How well the next seconds are foretold"
     return TableSection(("predictor", "error [m/s^2]", "x", "y", "z", "explained"), tuple(lines), title, about)
 
 
-def identified_section(found: Identified) -> TableSection:
+def identified_section(results: IdentifiedVehicle) -> TableSection:
     """Return a table of the vehicle's identified parameters."""
 
     def line(name: str, what: Estimate | None, unit: str, scale: float = 1.0) -> tuple[str, str]:
         return name, "the log does not say" if what is None else what.text(unit, scale)
 
     lines = (
-        line("command delay", found.delay, "ms", 1000.0),
-        line("thrust per commanded thrust", found.thrust_gain, ""),
-        line("acceleration upwards without a command", found.thrust_offset, "m/s^2"),
-        *((line("full thrust", found.full_thrust, "m/s^2"),) if found.full_thrust else ()),
-        line("lag of thrust", found.thrust_lag, "ms", 1000.0),
-        line("lag of roll and pitch rates", found.rate_lag, "ms", 1000.0),
-        line("roll and pitch rate per command", found.rate_gain, ""),
-        line("lag of yaw rate", found.yaw_lag, "ms", 1000.0),
-        line("yaw rate per command", found.yaw_gain, ""),
-        *(line(f"linear drag along body {axis}", each, "1/s") for axis, each in zip("xyz", found.drag, strict=True)),
-        ("acceleration left unexplained", f"{found.unexplained:.2f} m/s^2"),
+        line("command delay", results.delay, "ms", 1000.0),
+        line("thrust per commanded thrust", results.thrust_gain, ""),
+        line("acceleration upwards without a command", results.thrust_offset, "m/s^2"),
+        *((line("full thrust", results.full_thrust, "m/s^2"),) if results.full_thrust else ()),
+        line("lag of thrust", results.thrust_lag, "ms", 1000.0),
+        line("lag of roll and pitch rates", results.rate_lag, "ms", 1000.0),
+        line("roll and pitch rate per command", results.rate_gain, ""),
+        line("lag of yaw rate", results.yaw_lag, "ms", 1000.0),
+        line("yaw rate per command", results.yaw_gain, ""),
+        *(line(f"linear drag along body {axis}", each, "1/s") for axis, each in zip("xyz", results.drag, strict=True)),
+        ("acceleration left unexplained", f"{results.unexplained:.2f} m/s^2"),
     )
     about = "Estimates with intervals of 90 %, of a bootstrap over blocks of 2 s of the log."
-    if not found.known:
+    if not results.known:
         about = "The log says nothing of the vehicle, and no vehicle file is written: fly circles and turn the nose."
     return TableSection(("", "estimate"), lines, "What the vehicle is", about)
 
 
 def picture(
-    log: FlightLog, rows: Targets, found: Sequence[PredictionScore], protocol: Protocol, folder: Path
+    log: FlightLog, rows: Targets, results: Sequence[PredictionScore], protocol: Protocol, folder: Path
 ) -> list[Path]:
     """Draw the residual over time, and the prediction errors."""
     from ..viz.panels import Curve, Panel, panel_figure
@@ -113,10 +115,10 @@ def picture(
 
     k = max(1, round(SMOOTH / log.dt))
     kernel = np.ones(k) / k
-    missed = np.where(log.valid[:, None], np.asarray(rows.a_res), np.nan)
-    curves = [Curve(log.t, np.convolve(missed[:, i], kernel, mode="same"), "xyz"[i]) for i in range(3)]
-    shown = [each for each in found if each.name != "zero"]
-    errors = [Curve(np.array(each.times), np.array(each.per_window), each.name) for each in shown]
+    residuals = np.where(log.valid[:, None], np.asarray(rows.a_res), np.nan)
+    curves = [Curve(log.t, np.convolve(residuals[:, i], kernel, mode="same"), "xyz"[i]) for i in range(3)]
+    scores = [each for each in results if each.name != "zero"]
+    errors = [Curve(np.array(each.times), np.array(each.per_window), each.name) for each in scores]
     panels = [
         Panel("what the point mass missed", "time [s]", "residual acceleration [m/s^2]", curves, 3),
         Panel(f"error over the next {protocol.horizon:g} s", "time of the prediction [s]", "[m/s^2]", errors, 2),

@@ -28,13 +28,13 @@ def acting_commands(command: np.ndarray, dt: float, delay: float, lag: float) ->
     from scipy.signal import lfilter  # local, because it takes as long to import as all of retrim
 
     first, second = np.exp(-(1.0 - share) * dt / lag), np.exp(-share * dt / lag)
-    pulled = (1.0 - first) * second * old + (1.0 - second) * new
-    end = lfilter([1.0], [1.0, -first * second], pulled, axis=0, zi=first * second * command[:1])[0]
+    weighted_mean = (1.0 - first) * second * old + (1.0 - second) * new
+    end = lfilter([1.0], [1.0, -first * second], weighted_mean, axis=0, zi=first * second * command[:1])[0]
     begin = np.concatenate([command[:1], end[:-1]])
     between = old + (begin - old) * first
-    flown = (1.0 - share) * old + share * new
+    lagged_command = (1.0 - share) * old + share * new
     left = (begin - old) * (1.0 - first) + (between - new) * (1.0 - second)
-    return np.asarray(flown + left * lag / dt)
+    return np.asarray(lagged_command + left * lag / dt)
 
 
 def rows_of(log: FlightLog, *, delay: float = 0.0, lag: float = 0.0) -> Targets:
@@ -49,8 +49,8 @@ def rows_of(log: FlightLog, *, delay: float = 0.0, lag: float = 0.0) -> Targets:
         One row per tick.
     """
     c = acting_commands(log.c, log.dt, delay, lag)
-    told = log.rates if log.command is None else log.command
-    missed = log.a + UP - c[:, None] * log.R[:, :, 2]
+    rate_command = log.rates if log.command is None else log.command
+    errors = log.a + UP - c[:, None] * log.R[:, :, 2]
     x = jax.vmap(State)(jnp.asarray(log.p), jnp.asarray(log.R), jnp.asarray(log.v))
-    u = jax.vmap(Command)(jnp.asarray(c), jnp.asarray(told))
-    return Targets(x, u, jnp.asarray(missed), jnp.asarray(log.rates), jnp.asarray(log.valid))
+    u = jax.vmap(Command)(jnp.asarray(c), jnp.asarray(rate_command))
+    return Targets(x, u, jnp.asarray(errors), jnp.asarray(log.rates), jnp.asarray(log.valid))

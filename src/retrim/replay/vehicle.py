@@ -7,7 +7,7 @@ from ..config.names import plain_from
 from ..config.setup import Setup
 from ..config.vehicle_file import VehicleSpec
 from ..config.vehicles import name_of
-from .identification import Estimate, Identified
+from .identification import Estimate, IdentifiedVehicle
 
 SHORTEST, LONGEST = 0.002, 0.5  # limits for a lag in a vehicle file [s]
 SUFFIX = "-identified"
@@ -15,11 +15,11 @@ MOST = 0.2  # longest delay in a vehicle file [s]
 DAMPINGS = (0.1, 10.0)  # limits for a damping ratio in a vehicle file
 
 
-def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
+def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str) -> str:
     """Return a vehicle file with the identified values; all other values come from the preset's vehicle.
 
     Args:
-        found: The identified parameters.
+        identification: The identified parameters.
         setup: The preset's set-up.
         log: Name of the log.
     """
@@ -29,43 +29,51 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
     lines = [
         f"# Identified from {plain_from(log)}; what no line says so of is that of {plain_from(name_of(spec))!r}.",
         "# Intervals hold 90 %.",
-        *([] if found.thrust_gain is None else [f"# Thrust per commanded thrust: {found.thrust_gain.text('')}."]),
-        *(f"# Linear drag along body {a}: {d.text('1/s')}." for a, d in zip("xyz", found.drag, strict=True) if d),
+        *(
+            []
+            if identification.thrust_gain is None
+            else [f"# Thrust per commanded thrust: {identification.thrust_gain.text('')}."]
+        ),
+        *(
+            f"# Linear drag along body {a}: {d.text('1/s')}."
+            for a, d in zip("xyz", identification.drag, strict=True)
+            if d
+        ),
         f'name = "{plain_from(name_of(spec))[: LONGEST_NAME - len(SUFFIX)]}{SUFFIX}"',
         f"mass = {mass:.6g}  # [kg]",
         f"inertia = {_row(base.inertia.tolist())}  # [kg m^2]",
         f"arm = {_row(base.arm.tolist())}  # [m]",
     ]
-    if found.full_thrust is None:
+    if identification.full_thrust is None:
         lines.append(f"thrust_max = {float(base.thrust_max):.6g}  # [N]")
     else:
-        newton = Estimate(*(mass * x for x in found.full_thrust))
+        newton = Estimate(*(mass * x for x in identification.full_thrust))
         lines.append(f"thrust_max = {newton.value:.6g}  # [N], identified: {newton.text('N')}")
     lines.append(f"rates_max = {_row(base.omega_max.tolist())}  # [rad/s]")
-    if found.thrust_lag is None:
+    if identification.thrust_lag is None:
         lines.append(f"motor_tau = {float(base.motor_tau):.6g}  # [s]")
     else:
-        lag = found.thrust_lag
-        lines.append(f"motor_tau = {_bounded(lag.value):.4g}  # [s], identified: {lag.text('ms', 1000.0)}")
-    known = None if base.rate_lag is None else base.rate_lag.tolist()
-    if (level := found.rate_lag) is not None:
-        yaw = found.yaw_lag
-        said = (
+        lag = identification.thrust_lag
+        lines.append(f"motor_tau = {_limit(lag.value):.4g}  # [s], identified: {lag.text('ms', 1000.0)}")
+    base_lag = None if base.rate_lag is None else base.rate_lag.tolist()
+    if (level := identification.rate_lag) is not None:
+        yaw = identification.yaw_lag
+        remarks = (
             f"roll and pitch {level.text('ms', 1000.0)}, yaw {yaw.text('ms', 1000.0) if yaw else 'taken for the same'}"
         )
-        lags = [_bounded(each.value) for each in (level, level, yaw or level)]
-        lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {said}")
-        if (damping := found.rate_damping) is not None:
+        lags = [_limit(each.value) for each in (level, level, yaw or level)]
+        lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {remarks}")
+        if (damping := identification.rate_damping) is not None:
             least, most = DAMPINGS
             ratio = min(max(damping.value, least), most)
             lines.append(f"rate_damping = {_row([ratio] * 3)}  # identified: {damping.text('')}")
-    elif known is not None:
-        lines.append(f"rate_lag = {_row(known)}  # [s]")
+    elif base_lag is not None:
+        lines.append(f"rate_lag = {_row(base_lag)}  # [s]")
         if base.rate_damping is not None:  # an identified lag describes a first-order loop, which has no damping
             lines.append(f"rate_damping = {_row(base.rate_damping.tolist())}")
-    if (delay := found.delay) is not None:
-        said = delay.text("ms", 1000.0)
-        lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {said}")
+    if (delay := identification.delay) is not None:
+        remarks = delay.text("ms", 1000.0)
+        lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {remarks}")
     elif keep is not None and keep.command_delay is not None:
         lines.append(f"command_delay = {keep.command_delay:.6g}  # [s]")
     if keep is not None:
@@ -77,7 +85,7 @@ def vehicle_toml(found: Identified, setup: Setup, log: str) -> str:
     return text
 
 
-def _bounded(lag: float) -> float:
+def _limit(lag: float) -> float:
     return min(max(lag, SHORTEST), LONGEST)
 
 

@@ -18,7 +18,7 @@ from ..control.policy import AbstractPolicy
 from ..errors import CheckpointError
 from ..io.digests import file_digest, text_digest
 from ..io.files import write_whole
-from ..io.trained import load_policy, save_policy
+from ..io.policies import load_policy, save_policy
 from ..transport import wire
 from .document import TableSection
 from .store import Codec

@@ -30,7 +30,7 @@ class TableSection:
     def markdown(self) -> list[str]:
         """Return the section as lines of Markdown."""
         lines = [f"## {as_text(self.title)}", ""] if self.title else []
-        lines += [_escaped(self.about), ""] if self.about else []
+        lines += [_escape(self.about), ""] if self.about else []
         if self.rows:
             lines += ["| " + " | ".join(map(_cell, self.columns)) + " |", "|---" * len(self.columns) + "|"]
             lines += ["| " + " | ".join(map(_cell, row)) + " |" for row in self.rows] + [""]
@@ -41,10 +41,10 @@ class TableSection:
 
 def as_text(text: str) -> str:
     """Return a text on one line, escaped so that untrusted text cannot contain Markdown links or HTML."""
-    return _escaped(one_line(text, MOST))
+    return _escape(one_line(text, MOST))
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(")
 
 
@@ -105,9 +105,9 @@ class Document:
 
     def _provenance(self) -> str:
         """Return the commit, the machine, the seeds, the command and the run times."""
-        trained = f"; training seeds {', '.join(map(str, self.seeds))}" if self.seeds else ""
+        seed_note = f"; training seeds {', '.join(map(str, self.seeds))}" if self.seeds else ""
         command = as_text(command_line(sys.argv[1:])).replace("`", "'")
-        text = f"{describe_code()}; {describe_hardware()}{trained}. Command: `{command}`. {self.run.watch.sentence()}"
+        text = f"{describe_code()}; {describe_hardware()}{seed_note}. Command: `{command}`. {self.run.watch.sentence()}"
         if self.run.interrupted:
             text += " Interrupted: incomplete."
         if self.run.reused:

@@ -56,9 +56,9 @@ def _digest(specs: Sequence[FlightSpec]) -> str:
 
 
 def _flight(parts: dict[str, np.ndarray], spec: FlightSpec, about: dict[str, Any]) -> Flight:
-    true, measured = (States(*(parts[f"{name}.{part}"] for part in States._fields)) for name in ("true", "measured"))
+    true, measurement = (States(*(parts[f"{name}.{part}"] for part in States._fields)) for name in ("true", "measured"))
     events = tuple(Event(*event) for event in about["events"])
     cross, target, age = parts.get("cross"), parts.get("target"), parts["age"]
     log_age = age if age.ndim else float(age)
-    log = Log(parts["t"], true, measured, parts["u"], about["dt"], about["terminated"], events, log_age)
+    log = Log(parts["t"], true, measurement, parts["u"], about["dt"], about["terminated"], events, log_age)
     return Flight(spec, log=log, error=parts["error"], cross=cross, target=target, **about["flight"])

@@ -94,7 +94,7 @@ class FlightMemory:
         Raises:
             OSError: The file cannot be written.
         """
-        state = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
+        state = next((f.learner_state for f in flights if f.learner_state is not None and not f.log.terminated), None)
         if state is None:
             return []
         about = {"vehicle": self.vehicle, "residual": setup.preset.adapt.residual, "version": this_release()}

@@ -60,7 +60,7 @@ class Flight:
     """Length of the scored interval at the end of the flight [s]."""
     cross: np.ndarray | None = None
     """Distance from the nearest point on the reference in each row [m], if the task has a reference."""
-    learnt: LearnerState | None = None
+    learner_state: LearnerState | None = None
     """Learner state at the end of an adapting flight."""
     target: np.ndarray | None = None
     """The vehicle's target position in each row, in the world frame [m]."""

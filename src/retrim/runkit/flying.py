@@ -37,7 +37,7 @@ def plant_of(setup: Setup, spec: FlightSpec) -> Plant:
     """
     preset = setup.preset
     plant = spec.scenario.make(preset.vehicle, dt=preset.dt, seed=spec.plant_seed)
-    return find_method(spec.method).fitted(setup, plant)
+    return find_method(spec.method).modify_plant(setup, plant)
 
 
 def fly_one(
@@ -80,7 +80,7 @@ def fly_one(
         plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, observers=observers, stop=stop,
         progress=no_progress,
     )  # fmt: skip
-    return scored(setup, spec, log, learnt_by(pilot))
+    return score_flight(setup, spec, log, learner_state_of(pilot))
 
 
 def program_of(setup: Setup, policy: Any, specs: Sequence[FlightSpec]) -> Hashable:
@@ -136,34 +136,41 @@ def fly_batch(
     if not can_fly_together(plants, pilots):  # the first two are alike, but a later one differs
         each = zip(policies, specs, starts, strict=True)
         return [fly_one(setup, policy, spec, x0, seconds, state=state, stop=stop) for policy, spec, x0 in each]
-    simulated = [plant for plant in plants if isinstance(plant, SimPlant)]
+    sim_plants = [plant for plant in plants if isinstance(plant, SimPlant)]
     ticks = round(seconds / preset.dt)
-    logs = fly_together(simulated, pilots, starts, ticks=ticks, progress=progress, stop=stop, cold=cold)
+    logs = fly_together(sim_plants, pilots, starts, ticks=ticks, progress=progress, stop=stop, cold=cold)
     return [
-        scored(setup, spec, until_terminated(setup.flight_task, log), learnt_by(pilot))
+        score_flight(setup, spec, cut_at_termination(setup.flight_task, log), learner_state_of(pilot))
         for spec, log, pilot in zip(specs, logs, pilots, strict=True)
     ]
 
 
-def until_terminated(task: AbstractTask, log: Log) -> Log:
+def cut_at_termination(task: AbstractTask, log: Log) -> Log:
     """Cut a log where the vehicle left the task's bounds; a batch does not stop there."""
     left = np.flatnonzero(np.asarray(_all_terminated(task, log.t, log.true.as_state()))[1:])
     if not len(left):
         return log
     rows = int(left[0]) + 2
-    true, measured = (States(*(part[:rows] for part in states)) for states in (log.true, log.measured))
+    true, measurement = (States(*(part[:rows] for part in states)) for states in (log.true, log.measured))
     events = tuple(event for event in log.events if event.t < log.t[rows - 1])
     return Log(
-        log.t[:rows], true, measured, log.u[:rows], log.dt, True, events, np.broadcast_to(log.age, log.t.shape)[:rows]
+        log.t[:rows],
+        true,
+        measurement,
+        log.u[:rows],
+        log.dt,
+        True,
+        events,
+        np.broadcast_to(log.age, log.t.shape)[:rows],
     )
 
 
-def learnt_by(pilot: Pilot) -> LearnerState | None:
+def learner_state_of(pilot: Pilot) -> LearnerState | None:
     """Return a pilot's learner state; None if the pilot does not learn."""
     return pilot.state if isinstance(pilot, AdaptivePilot) else None
 
 
-def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None = None) -> Flight:
+def score_flight(setup: Setup, spec: FlightSpec, log: Log, learner_state: LearnerState | None = None) -> Flight:
     """Return a flight with its errors and, if it was terminated, the reason."""
     task = setup.flight_task
     error, cross, target = _errors(task, log.t, log.true.as_state())
@@ -178,7 +185,7 @@ def scored(setup: Setup, spec: FlightSpec, log: Log, learnt: LearnerState | None
         task.metric,
         task.steady_seconds,
         None if cross is None else np.asarray(cross),
-        learnt,
+        learner_state,
         np.asarray(target),
     )
 

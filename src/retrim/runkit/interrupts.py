@@ -4,7 +4,7 @@ import contextlib
 import threading
 from collections.abc import Iterator
 
-from ..signals import handled_by
+from ..signals import handle_signals
 
 
 @contextlib.contextmanager
@@ -13,5 +13,5 @@ def interrupts_only_set(stop: threading.Event) -> Iterator[None]:
 
     Only the main thread receives signals; in other threads this has no effect.
     """
-    with handled_by(lambda *_: stop.set()):
+    with handle_signals(lambda *_: stop.set()):
         yield

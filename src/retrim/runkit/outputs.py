@@ -16,13 +16,13 @@ from ..io.checkpoint import save_delta
 from ..io.files import write_whole
 from ..io.logs.recording import Recording, write_npz
 from ..io.logs.viewers import can_record, record
-from ..io.trained import save_learner_state, save_policy
+from ..io.policies import save_learner_state, save_policy
 from .flights import Flight
 from .interrupts import interrupts_only_set
 from .run import Run
 
 
-def write_trained(
+def write_trained_policy(
     run: Run, setup: Setup, policy: AbstractPolicy, losses: Sequence[float], *, seed: int, error_m: float | None = None
 ) -> Path:
     """Write ``policy.safetensors`` and its ``results.json``; Ctrl-C takes effect after both are written.
@@ -102,12 +102,12 @@ def write_logs(flights: Sequence[Flight], folder: Path) -> None:
 def recording_of(flight: Flight) -> Recording:
     """Return a flight's recording."""
     log = flight.log
-    measured, true = (np.concatenate([x.p, x.R.reshape(-1, 9), x.v], axis=1) for x in (log.measured, log.true))
+    measurement, true = (np.concatenate([x.p, x.R.reshape(-1, 9), x.v], axis=1) for x in (log.measured, log.true))
     follows = np.concatenate([log.u[1:], log.u[-1:]])  # a log's row contains the command of the tick that it ends
     age = np.broadcast_to(log.age, log.t.shape)
     return Recording(
         log.t,
-        measured,
+        measurement,
         true,
         age,
         follows,
@@ -124,15 +124,17 @@ def write_learner_state(flights: Sequence[Flight], preset: Preset, folder: Path)
     The files are ``learner_state.safetensors``, to resume from, and ``adapted.safetensors`` (a policy) or
     ``delta.safetensors`` (for a low-rank policy).
     """
-    learnt = next((f.learnt for f in flights if f.learnt is not None and not f.log.terminated), None)
-    if learnt is not None:
-        write_state(learnt, preset, folder)
+    learner_state = next(
+        (f.learner_state for f in flights if f.learner_state is not None and not f.log.terminated), None
+    )
+    if learner_state is not None:
+        write_state(learner_state, preset, folder)
 
 
-def write_state(learnt: LearnerState, preset: Preset, folder: Path) -> None:
+def write_state(learner_state: LearnerState, preset: Preset, folder: Path) -> None:
     """Write a learner state to resume from, and its policy or low-rank delta."""
-    save_learner_state(folder / "learner_state.safetensors", learnt, preset)
-    policy = learnt.policy.policy
+    save_learner_state(folder / "learner_state.safetensors", learner_state, preset)
+    policy = learner_state.policy.policy
     if isinstance(policy, LoraPolicy):
         save_delta(folder / "delta.safetensors", policy)
     else:

@@ -106,13 +106,13 @@ def cores() -> int:
 
 def command_line(words: Sequence[str]) -> str:
     """Return the command with ``--out`` removed and absolute paths reduced to file names."""
-    kept, words = list[str](), list(words)
+    shown_words, words = list[str](), list(words)
     while words:
         option, sign, value = words.pop(0).partition("=")
         if option == "--out":
             words = words if sign else words[1:]
         elif sign:
-            kept.append(f"{option}={Path(value).name if Path(value).is_absolute() else value}")
+            shown_words.append(f"{option}={Path(value).name if Path(value).is_absolute() else value}")
         else:
-            kept.append(Path(option).name if Path(option).is_absolute() else option)
-    return " ".join(["retrim", *kept])
+            shown_words.append(Path(option).name if Path(option).is_absolute() else option)
+    return " ".join(["retrim", *shown_words])

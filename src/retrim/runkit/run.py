@@ -35,7 +35,7 @@ class Run:
         *,
         stop: threading.Event | None = None,
         remark: str = "",
-        trained: Path | None = None,
+        policy_folder: Path | None = None,
         executor: Executor | None = None,
     ) -> None:
         """Choose the folder and check that it can be written.
@@ -45,7 +45,7 @@ class Run:
             out: The folder.
             stop: Set when the run should end early.
             remark: Remark in the documents on how they were made.
-            trained: Folder for trained networks, which several runs may share; by default the run's own folder.
+            policy_folder: Folder for trained networks, which several runs may share; by default the run's own folder.
             executor: Executor with other processes for training and flights; by default this process does both.
 
         Raises:
@@ -53,7 +53,7 @@ class Run:
         """
         self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
         self.remark = remark
-        self.trained = trained or self.folder
+        self.policy_folder = policy_folder or self.folder
         self.executor, self.failed = executor, False
         self.pages: list[Path] = []  # pages that its documents have written
         self.watch = Stopwatch()

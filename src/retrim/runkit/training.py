@@ -22,7 +22,7 @@ from ..learn.rollout import rollout
 from .reporter import Reporter, Silent
 
 
-class Trained(NamedTuple):
+class TrainingResult(NamedTuple):
     """Result of pretraining; after an interruption, the last state of training."""
 
     policy: AbstractPolicy
@@ -32,7 +32,7 @@ class Trained(NamedTuple):
 
 def train(
     setup: Setup, seed: int = 0, *, reporter: Reporter | None = None, stop: threading.Event | None = None
-) -> Trained:
+) -> TrainingResult:
     """Pretrain a policy.
 
     Args:
@@ -49,18 +49,18 @@ def train(
     with (reporter or Silent()).progress(title) as advance:
         advance(0.0, first)
         try:
-            for trained, latest in setup.pretraining(seed):
-                policy = trained
+            for state, latest in setup.pretraining(seed):
+                policy = state
                 losses += [float(loss) for loss in latest]
                 advance(len(losses) / p.num_updates, f"loss {losses[-1]:.3f}")
                 if stop.is_set():
                     break
         except KeyboardInterrupt:
             stop.set()
-    return Trained(policy, losses)
+    return TrainingResult(policy, losses)
 
 
-def trained_elsewhere(
+def train_elsewhere(
     preset: Preset,
     seeds: Sequence[int],
     executor: Executor,
@@ -86,7 +86,7 @@ def trained_elsewhere(
         JobError: A job failed; raised after the others are completed.
     """
     jobs = {executor.submit(train_job, dump(preset), seed): seed for seed in seeds}
-    result, failed, waiting = dict[int, AbstractPolicy](), list[str](), set(jobs)
+    result, failures, waiting = dict[int, AbstractPolicy](), list[str](), set(jobs)
     try:
         with reporter.progress(f"pretraining {preset.name} elsewhere") as advance:
             while waiting and not stop.is_set():
@@ -94,7 +94,7 @@ def trained_elsewhere(
                 for job in wait(waiting, 1.0, FIRST_COMPLETED).done:
                     waiting.remove(job)
                     if (error := job.exception()) is not None:
-                        failed.append(f"seed {jobs[job]}: {' '.join(str(error).split())}")
+                        failures.append(f"seed {jobs[job]}: {' '.join(str(error).split())}")
                         continue
                     result[jobs[job]] = job.result()
                     on_result(jobs[job], result[jobs[job]])
@@ -104,8 +104,8 @@ def trained_elsewhere(
     finally:
         for job in waiting:
             job.cancel()
-    if failed:
-        raise JobError(f"{len(failed)} of {len(jobs)} trainings of {preset.name} failed: {failed[0]}")
+    if failures:
+        raise JobError(f"{len(failures)} of {len(jobs)} trainings of {preset.name} failed: {failures[0]}")
     return {seed: result[seed] for seed in seeds if seed in result}
 
 
@@ -116,7 +116,7 @@ def train_job(preset: str, seed: int) -> AbstractPolicy:
 
 def ground_warning(setup: Setup) -> str | None:
     """Return a line if the goal or the reference of the flight is below the ground; None if it is not."""
-    home, followed = setup.flight_task.home(), setup.followed
+    home, followed = setup.flight_task.home(), setup.flight_reference
     lowest = float(home[2]) if followed is None else float(followed.rows[:, 2].min())
     if lowest >= 0.0:
         return None
@@ -147,15 +147,15 @@ def _long(setup: Setup) -> Setup:
 
 
 def _mean_error(setup: Setup, env: Env, policy: AbstractPolicy, n: int, seed: int) -> float:
-    return float(_settled(policy, env, random.key(seed), n, round(0.5 / setup.preset.dt)))
+    return float(_settle(policy, env, random.key(seed), n, round(0.5 / setup.preset.dt)))
 
 
 @eqx.filter_jit
-def _settled(policy: AbstractPolicy, env: Env, key: Key[Array, ""], n: int, ticks: int) -> Array:
+def _settle(policy: AbstractPolicy, env: Env, key: Key[Array, ""], n: int, ticks: int) -> Array:
     def error(k: Key[Array, ""]) -> Array:
         start = env.task.reset(k)
-        flown = rollout(env, policy, start)
-        last = jax.tree.map(lambda leaf: leaf[-ticks:], flown.x)
+        trajectory = rollout(env, policy, start)
+        last = jax.tree.map(lambda leaf: leaf[-ticks:], trajectory.x)
         horizon = env.task.horizon
         times = start.t + env.task.dt * jnp.arange(horizon - ticks, horizon, dtype=start.t.dtype)
         return jnp.mean(jax.vmap(env.task.error)(times, last))

@@ -1,7 +1,7 @@
 """Flights: pilots, the flight loop, its record, and learners on a clock."""
 
 from .adaptive import AdaptivePilot as AdaptivePilot
-from .adaptive import Scheduled as Scheduled
+from .adaptive import ScheduledLearner as ScheduledLearner
 from .batch import batch_flight as batch_flight
 from .events import Event as Event
 from .events import JsonlObserver as JsonlObserver

@@ -14,7 +14,7 @@ from .learner import Learner
 from .pilot import ControllerPilot, Pilot
 
 
-class Scheduled(NamedTuple):
+class ScheduledLearner(NamedTuple):
     """A learner, and the interval at which it is offered windows."""
 
     learner: Learner
@@ -29,7 +29,7 @@ class AdaptivePilot(Pilot):
         self,
         controller: Callable[[LearnerState], AbstractController[Any]],
         state: LearnerState,
-        learners: Sequence[Scheduled],
+        learners: Sequence[ScheduledLearner],
         *,
         dt: float,
         window: int,
@@ -121,8 +121,8 @@ class AdaptivePilot(Pilot):
 
     def _publish(self, update: Update) -> None:
         if isinstance(update, ResidualUpdate | PolicyUpdate):
-            fitted = isinstance(update, ResidualUpdate)
-            policy, residual = (self.state.policy, update.state) if fitted else (update.state, self.state.residual)
+            is_fit = isinstance(update, ResidualUpdate)
+            policy, residual = (self.state.policy, update.state) if is_fit else (update.state, self.state.residual)
             self.state = LearnerState(policy, residual)
             self._pilot.controller = self.controller_of(self.state)
         for learner, _ in self.learners:

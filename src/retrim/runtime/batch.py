@@ -48,15 +48,15 @@ def take_off(simulation: Simulation, controller: AbstractController[Any], x0: St
     return in_flight(controller, sim, simulation.measured(sim))
 
 
-def in_flight(controller: AbstractController[Any], sim: SimState, measured: State) -> InFlight:
+def in_flight(controller: AbstractController[Any], sim: SimState, measurement: State) -> InFlight:
     """Return a flight in a simulation that has already been launched.
 
     Args:
         controller: The controller.
         sim: State of the simulation.
-        measured: Measured state of the vehicle.
+        measurement: Measured state of the vehicle.
     """
-    return InFlight(sim, controller.init(measured), jnp.array(0))
+    return InFlight(sim, controller.init(measurement), jnp.array(0))
 
 
 def fly_ticks(
@@ -87,16 +87,16 @@ def fly_ticks(
 
     def tick(flight: InFlight) -> tuple[InFlight, Ticks]:
         s, k = flight.sim, flight.tick
-        sensed = simulation.inertial(s, k)
-        now = controller if sensed is None else controller.with_inertial(*sensed)
-        issued, memory = now(flight.memory, simulation.time(k, s.a.dtype), simulation.measured(s))
-        accepted = simulation.within_limits(issued)
-        limited = jnp.any(accepted.vector() != issued.vector())
-        memory = where(limited, controller.accepted(memory, accepted), memory)
-        s, condition = simulation.advance(s, accepted, k), controller.condition(memory)
+        inertial = simulation.inertial(s, k)
+        now = controller if inertial is None else controller.with_inertial(*inertial)
+        command, memory = now(flight.memory, simulation.time(k, s.a.dtype), simulation.measured(s))
+        accepted_command = simulation.within_limits(command)
+        is_limited = jnp.any(accepted_command.vector() != command.vector())
+        memory = where(is_limited, controller.accepted(memory, accepted_command), memory)
+        s, condition = simulation.advance(s, accepted_command, k), controller.condition(memory)
         vehicle = controller.vehicle(memory)
         return InFlight(s, memory, k + 1), Ticks(
-            simulation.true(s), simulation.measured(s), issued, accepted, condition, vehicle
+            simulation.true(s), simulation.measured(s), command, accepted_command, condition, vehicle
         )
 
     def step(i: Array, carry: tuple[InFlight, Ticks]) -> tuple[InFlight, Ticks]:
@@ -107,8 +107,8 @@ def fly_ticks(
     u = Command.hover(x.p.dtype)
     row = Ticks(x, x, u, u, controller.condition(flight.memory), controller.vehicle(flight.memory))
     blank = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), row)
-    flown: tuple[InFlight, Ticks] = lax.fori_loop(0, ticks, step, (flight, blank))
-    return flown
+    result: tuple[InFlight, Ticks] = lax.fori_loop(0, ticks, step, (flight, blank))
+    return result
 
 
 def batch_flight(simulation: Simulation, controller: AbstractController[Any], x0: State, *, ticks: int) -> Ticks:

@@ -42,8 +42,8 @@ class Batch:
         # Without disturbances, plants of one kind have the same structure, so one program launches all of them.
         self._on_the_ground = stack([simulation.undisturbed() for simulation in simulations])
         self._flights: InFlight | None = None
-        self._flown = 0
-        self._measured: Any = None  # from the start on
+        self._tick_count = 0
+        self._measurement: Any = None  # from the start on
         self._rows: Any = None
 
     def fly_to(self, tick: int) -> None:
@@ -52,19 +52,19 @@ class Batch:
         Raises:
             FlightStopped: The flights were aborted.
         """
-        while self._flown < tick:
+        while self._tick_count < tick:
             if self._stop is not None and self._stop.is_set():
                 raise FlightStopped("the flights were given up")
             if self._flights is None:
                 sims, first = _launch(self._on_the_ground, self._starts)
                 self._flights = _begin(self.controllers, sims, first)
-                self._measured = _recorded(None, first, 0, self.ticks + 1, rows=1)
-            n = min(ROOM, tick - self._flown)
+                self._measurement = _record(None, first, 0, self.ticks + 1, rows=1)
+            n = min(ROOM, tick - self._tick_count)
             self._flights, rows = _fly_on(self._simulations, self.controllers, self._flights, jnp.asarray(n))
-            self._measured = _recorded(self._measured, rows.measured, self._flown + 1, self.ticks + 1, rows=n)
-            self._rows = _recorded(self._rows, rows, self._flown, self.ticks, rows=n)
-            self._flown += n
-            self._progress(self._flown / self.ticks)
+            self._measurement = _record(self._measurement, rows.measured, self._tick_count + 1, self.ticks + 1, rows=n)
+            self._rows = _record(self._rows, rows, self._tick_count, self.ticks, rows=n)
+            self._tick_count += n
+            self._progress(self._tick_count / self.ticks)
 
     def blank_window(self, size: int) -> Window:
         """Return windows shaped like those of a flight, for vehicles that hover at their starts."""
@@ -78,27 +78,30 @@ class Batch:
 
     def window(self, tick: int, size: int) -> Window:
         """Return the windows that learners are offered at ``tick``, which the flights must have passed."""
-        wanted = np.arange(tick - size + 1, tick + 1)
-        at = np.maximum(wanted, 0)
-        x = jax.tree.map(lambda leaf: jax.device_put(leaf[:, at]), self._measured)
+        window_ticks = np.arange(tick - size + 1, tick + 1)
+        at = np.maximum(window_ticks, 0)
+        x = jax.tree.map(lambda leaf: jax.device_put(leaf[:, at]), self._measurement)
         # The plant has not accepted the newest command yet.
         newest = lambda old, new: jax.device_put(np.concatenate([old[:, at[:-1]], new[:, at[-1:]]], axis=1))  # noqa: E731
         u = jax.tree.map(newest, self._rows.accepted, self._rows.issued)
         n = x.p.shape[0]
         t = jnp.asarray(np.broadcast_to(at * self.dt, (n, size)), dtype=x.p.dtype)
-        valid, age = jax.device_put(np.broadcast_to(wanted >= 0, (n, size))), jnp.full_like(t, self._simulations.age)
+        valid, age = (
+            jax.device_put(np.broadcast_to(window_ticks >= 0, (n, size))),
+            jnp.full_like(t, self._simulations.age),
+        )
         windows: Window = shard(jax.vmap(Window)(t, x, u, valid, age))
         return windows
 
     def log(self, i: int, events: Sequence[Event]) -> Log:
         """Return the log of one flight."""
-        first, rows, measured = jax.tree.map(
-            lambda leaf: np.asarray(leaf)[i], (self._starts, self._rows, self._measured)
+        first, rows, measurement = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[i], (self._starts, self._rows, self._measurement)
         )
-        accepted = rows.accepted
+        accepted_commands = rows.accepted
         names = ("p", "R", "v")
         true = (np.concatenate([getattr(first, name)[None], getattr(rows.true, name)]) for name in names)
-        u = np.concatenate([accepted.c[:, None], accepted.omega], axis=1)
+        u = np.concatenate([accepted_commands.c[:, None], accepted_commands.omega], axis=1)
         hover = np.asarray(Command.hover().vector(), dtype=u.dtype)[None]
         t = np.arange(self.ticks + 1) * self.dt
         own = [*stage_events(rows.condition, t[:-1]), *vehicle_events(rows.vehicle, t[:-1])]
@@ -106,7 +109,7 @@ class Batch:
         return Log(
             t,
             States(*true),
-            States(*(getattr(measured, name) for name in names)),
+            States(*(getattr(measurement, name) for name in names)),
             np.concatenate([hover, u]),
             self.dt,
             False,
@@ -115,16 +118,16 @@ class Batch:
         )
 
 
-def _recorded(record: Any, flown: Any, at: int, size: int, *, rows: int) -> Any:
-    """Write the first rows of ``flown`` into a record of the flight, from tick ``at`` on; the second axis is time."""
+def _record(record: Any, new: Any, at: int, size: int, *, rows: int) -> Any:
+    """Write the first rows of ``new`` into a record of the flight, from tick ``at`` on; the second axis is time."""
     if record is None:
-        record = jax.tree.map(lambda leaf: np.empty((leaf.shape[0], size, *leaf.shape[2:]), leaf.dtype), flown)
+        record = jax.tree.map(lambda leaf: np.empty((leaf.shape[0], size, *leaf.shape[2:]), leaf.dtype), new)
 
     def write(whole: np.ndarray, part: Any) -> np.ndarray:
         whole[:, at : at + rows] = np.asarray(part)[:, :rows]
         return whole
 
-    return jax.tree.map(write, record, flown)
+    return jax.tree.map(write, record, new)
 
 
 @eqx.filter_jit
@@ -133,20 +136,20 @@ def _launch(simulations: Simulation, starts: State) -> tuple[SimState, State]:
         sim = simulation.launch(x0)
         return sim, jax.tree.map(lambda leaf: leaf[None], simulation.measured(sim))
 
-    launched: tuple[SimState, State] = eqx.filter_vmap(launch)(simulations, starts)
-    return launched
+    start: tuple[SimState, State] = eqx.filter_vmap(launch)(simulations, starts)
+    return start
 
 
 @eqx.filter_jit
-def _begin(controllers: Any, sims: SimState, measured: State) -> InFlight:
-    first = jax.tree.map(lambda leaf: leaf[:, 0], measured)
+def _begin(controllers: Any, sims: SimState, measurement: State) -> InFlight:
+    first = jax.tree.map(lambda leaf: leaf[:, 0], measurement)
     flights: InFlight = eqx.filter_vmap(in_flight)(controllers, sims, first)
     return flights
 
 
 @eqx.filter_jit
 def _fly_on(simulations: Simulation, controllers: Any, flights: InFlight, ticks: Array) -> tuple[InFlight, Ticks]:
-    flown: tuple[InFlight, Ticks] = eqx.filter_vmap(lambda s, c, f: fly_ticks(s, c, f, ticks, room=ROOM))(
+    result: tuple[InFlight, Ticks] = eqx.filter_vmap(lambda s, c, f: fly_ticks(s, c, f, ticks, room=ROOM))(
         simulations, controllers, flights
     )
-    return flown
+    return result

@@ -99,9 +99,9 @@ def fly_and_learn(
     batch.controllers = _controllers(plan, state)
     if cold:
         with ThreadPoolExecutor(1) as beside:
-            compiled = beside.submit(_compile, batch, plans, state)
+            program = beside.submit(_compile, batch, plans, state)
             batch.fly_to(1)
-            compiled.result()
+            program.result()
     pending = dict[int, BatchUpdate]()
     events = [list[Event]() for _ in plans]
     for instant in _instants(plan, batch.ticks):

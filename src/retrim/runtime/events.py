@@ -44,8 +44,8 @@ def stage_events(conditions: Condition | None, t: Float[np.ndarray, " n"]) -> li
     if conditions is None:
         return []
     stages, causes = np.asarray(conditions.stage), np.asarray(conditions.cause)
-    changed = np.flatnonzero(np.diff(stages, prepend=0))
-    return [Event(float(t[k]), "stage", describe_condition(int(stages[k]), int(causes[k]))) for k in changed]
+    changes = np.flatnonzero(np.diff(stages, prepend=0))
+    return [Event(float(t[k]), "stage", describe_condition(int(stages[k]), int(causes[k]))) for k in changes]
 
 
 def vehicle_events(vehicles: VehicleReport | None, t: Float[np.ndarray, " n"]) -> list[Event]:

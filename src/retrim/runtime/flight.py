@@ -153,10 +153,10 @@ class Recorder:
 
     def log(self, dt: float, *, terminated: bool) -> Log:
         """Return the recorded flight."""
-        times, true, measured, commands, ages = zip(*self._rows, strict=True)
+        times, true, measurement, commands, ages = zip(*self._rows, strict=True)
         t = np.array(times)
         u = np.stack([as_numpy(command) for command in commands])
-        return Log(t - t[0], _stacked(true), _stacked(measured), u, dt, terminated, tuple(self._events), np.array(ages))
+        return Log(t - t[0], _stack(true), _stack(measurement), u, dt, terminated, tuple(self._events), np.array(ages))
 
 
 def fly(
@@ -195,7 +195,7 @@ def fly(
         raise ConfigError(
             f"the pilot was made for ticks of {pilot.dt:g} s, the plant has {plant.dt:g} s; pass dt to it"
         )
-    recorder, ended = Recorder(), False
+    recorder, is_over = Recorder(), False
     everyone: tuple[Observer, ...] = (recorder, *observers)
     with plant, progress("flying") as advance:
         advance(0.0, "compiling")
@@ -203,18 +203,18 @@ def fly(
         start = measurement.t
         pilot.reset(measurement)
         _tell(everyone, measurement, Command.hover(), [])
-        while round((measurement.t - start) / plant.dt) < ticks and not ended:
+        while round((measurement.t - start) / plant.dt) < ticks and not is_over:
             if stop is not None and stop.is_set():
                 raise FlightStopped("the flight was given up")
             u = pilot.act(measurement)
-            measurement, accepted = plant.step(u)
-            if accepted is not u:
-                pilot.accepted(accepted)
-            _tell(everyone, measurement, accepted, pilot.take_events())
+            measurement, accepted_command = plant.step(u)
+            if accepted_command is not u:
+                pilot.accepted(accepted_command)
+            _tell(everyone, measurement, accepted_command, pilot.take_events())
             t = measurement.t - start
-            ended = terminated(t, measurement.true_state)
+            is_over = terminated(t, measurement.true_state)
             advance(min(1.0, t / (ticks * plant.dt)), f"{t:.1f} of {ticks * plant.dt:g} s")
-    return recorder.log(plant.dt, terminated=ended)
+    return recorder.log(plant.dt, terminated=is_over)
 
 
 def _tell(observers: Sequence[Observer], measurement: Measurement, u: Command, events: Sequence[Event]) -> None:
@@ -224,7 +224,7 @@ def _tell(observers: Sequence[Observer], measurement: Measurement, u: Command, e
         observer.measurement(measurement, u)
 
 
-def _stacked(states: Sequence[State]) -> States:
+def _stack(states: Sequence[State]) -> States:
     return States(*(np.stack([np.asarray(getattr(x, name)) for x in states]) for name in ("p", "R", "v")))
 
 

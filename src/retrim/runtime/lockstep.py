@@ -26,7 +26,7 @@ class LockstepLearner(Learner):
         """
         self.worker, self.latency_s, self._dt = worker, latency_s, dt
         self._ready: tuple[int, Update] | None = None
-        self._skipped: list[Update] = []
+        self._skips: list[Update] = []
 
     @property
     def batchable(self) -> tuple[Worker, int] | None:
@@ -38,7 +38,7 @@ class LockstepLearner(Learner):
     def submit(self, window: Window, tick: int) -> None:
         """Learn from ``window`` now; record a skip if the last update is not visible yet."""
         if self._ready is not None:
-            self._skipped.append(Skip(float(window.t[-1]), self.worker.layer))
+            self._skips.append(Skip(float(window.t[-1]), self.worker.layer))
             return
         began = time.perf_counter()
         update = self.worker.learn(window)
@@ -51,7 +51,7 @@ class LockstepLearner(Learner):
 
     def poll(self, tick: int) -> list[Update]:
         """Return the updates that are visible at this tick."""
-        result, self._skipped = self._skipped, []
+        result, self._skips = self._skips, []
         if self._ready is not None and self._ready[0] <= tick:
             result, self._ready = [*result, self._ready[1]], None
         return result
@@ -62,4 +62,4 @@ class LockstepLearner(Learner):
 
     def reset(self) -> None:
         """Drop the pending update."""
-        self._ready, self._skipped = None, []
+        self._ready, self._skips = None, []

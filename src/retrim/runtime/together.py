@@ -25,8 +25,8 @@ def can_fly_together(plants: Sequence[Plant], pilots: Sequence[Pilot]) -> bool:
     Such pilots have controllers of the same structure, or share one learner on the virtual clock with fixed latencies.
     """
     simulations = [plant.simulation for plant in plants if type(plant) is SimPlant]
-    interrupted = any(each.fault is not None and each.fault.interrupts for each in simulations)
-    if len(simulations) < len(plants) or interrupted or not _alike(simulations):
+    has_dropouts = any(each.fault is not None and each.fault.interrupts for each in simulations)
+    if len(simulations) < len(plants) or has_dropouts or not _alike(simulations):
         return False
     controllers = [pilot.controller for pilot in pilots if type(pilot) is ControllerPilot]
     if controllers:

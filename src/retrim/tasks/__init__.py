@@ -14,7 +14,7 @@ from .observation import StateObs as StateObs
 from .occluded import OccludedKeypoints as OccludedKeypoints
 from .preview import Preview as Preview
 from .reference import Reference as Reference
-from .reference import joined as joined
+from .reference import join_references as join_references
 from .shapes import REFERENCES as REFERENCES
 from .shapes import smooth_start as smooth_start
 from .state_estimate import StateEstimate as StateEstimate
@@ -28,6 +28,6 @@ from .track import Track as Track
 from .tracking_error import RelativeObs as RelativeObs
 from .tracking_error import StateAndErrorObs as StateAndErrorObs
 from .trajectory_csv import from_csv as from_csv
-from .transition import Spliced as Spliced
-from .transition import spliced as spliced
+from .transition import SplicedReference as SplicedReference
+from .transition import splice as splice
 from .transition import transition_between as transition_between

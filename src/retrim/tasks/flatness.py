@@ -53,14 +53,14 @@ def flat_rows(path: Path3, times: np.ndarray, last: float) -> np.ndarray:
     (R_before, before), (R, now), (R_after, after) = frames
     turn = np.swapaxes(R, 1, 2) @ (R_after - R_before) / (2.0 * h)
     thrust = np.linalg.norm(accelerations[1] + UP, axis=1)
-    flown = np.stack([thrust, turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+    inputs = np.stack([thrust, turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
     hover = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
-    defined = (before & now & after & ~jumps)[:, None]
-    u = np.where(defined, flown, hover)
+    is_defined = (before & now & after & ~jumps)[:, None]
+    u = np.where(is_defined, inputs, hover)
     jerk = (accelerations[2] - accelerations[0]) / (2.0 * h)
-    turned = (around[3] - around[1])[:, 3:]
-    heading_rate = (turned - FULL_TURN * np.round(turned / FULL_TURN)) / (2.0 * h)
-    moving = np.where(defined, np.concatenate([accelerations[1], jerk, heading_rate], axis=1), 0.0)
+    heading_change = (around[3] - around[1])[:, 3:]
+    heading_rate = (heading_change - FULL_TURN * np.round(heading_change / FULL_TURN)) / (2.0 * h)
+    moving = np.where(is_defined, np.concatenate([accelerations[1], jerk, heading_rate], axis=1), 0.0)
     # Tables are interpolated, so the heading between two rows that differ by a turn would be arbitrary.
     return np.concatenate([here[:, :3], v, u, np.unwrap(here[:, 3:], axis=0), moving], axis=1)
 

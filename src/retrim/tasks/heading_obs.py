@@ -30,18 +30,18 @@ class HeadingObs(AbstractWrappedObservation[M]):
 
     def init(self, x: State) -> M:
         """Return the memory of the inner observation."""
-        return self.inner.init(self._turned(x))
+        return self.inner.init(self._turn(x))
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
         """Return the observation of the turned state."""
-        return self.inner(memory, t, self._turned(x), last)
+        return self.inner(memory, t, self._turn(x), last)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "HeadingObs[M]":
         """Return the observation about the vertical of ``frame``."""
-        turned: AbstractObservation[Any] = self.inner.in_frame(frame)
-        return dataclasses.replace(self, inner=turned, origin=frame.vector(self.origin))
+        inner_in_frame: AbstractObservation[Any] = self.inner.in_frame(frame)
+        return dataclasses.replace(self, inner=inner_in_frame, origin=frame.vector(self.origin))
 
-    def _turned(self, x: State) -> State:
+    def _turn(self, x: State) -> State:
         cosine, sine = x.R[0, 0] + x.R[1, 1], x.R[1, 0] - x.R[0, 1]
         length = jnp.sqrt(cosine**2 + sine**2 + SMALLEST**2)
         c, s, zero = cosine / length, sine / length, jnp.zeros_like(length)

@@ -101,7 +101,7 @@ class Hover(AbstractHover):
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return r_pos + r_vel + r_act of the paper; the rate term penalises the commanded body rates."""
-        return _printed(self.target(t), x, u)
+        return _paper_reward(self.target(t), x, u)
 
 
 class CustomHover(AbstractHover):
@@ -121,7 +121,7 @@ class L2Hover(AbstractHover):
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return the paper's reward minus 3 (sqrt(|p - goal|^2 + (1 cm)^2) - 1 cm)."""
         tip = jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2) + 0.01**2) - 0.01
-        return _printed(self.target(t), x, u) - 3.0 * tip
+        return _paper_reward(self.target(t), x, u) - 3.0 * tip
 
 
 class StiffHover(AbstractHover):
@@ -139,7 +139,7 @@ class StiffHover(AbstractHover):
         return r_pos + r_vel - 0.05 * huber(u.vector() - Command.hover().vector())
 
 
-def _printed(goal: Float[Array, "3"], x: State, u: Command) -> Float[Array, ""]:
+def _paper_reward(goal: Float[Array, "3"], x: State, u: Command) -> Float[Array, ""]:
     """Return the paper's reward."""
     r_pos = -1.0 * huber(5.0 * (x.p - goal))
     r_vel = -0.1 * huber(x.v) - 0.1 * huber(u.omega)

@@ -125,14 +125,14 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         """Return the five frames of the observation, newest first."""
         return frames[:: -self.stride].reshape(-1)
 
-    def features(self, stacked: Float[Array, "70"]) -> Float[Array, "70"]:
+    def features(self, frames: Float[Array, "70"]) -> Float[Array, "70"]:
         """Return the whitened frames, clipped where they do not fit any motion, such as when points come into sight."""
-        return jnp.clip(self.whiten @ (stacked - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
+        return jnp.clip(self.whiten @ (frames - self.mean), -FEATURE_LIMIT, FEATURE_LIMIT)
 
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
         """Return the projections of the points, clipped far outside the image, and whether each is visible."""
-        seen = jax.vmap(self.camera.project)(in_camera(x, self.ground()))
-        return jnp.clip(seen.pixel, -FAR, FAR), seen.visible
+        projections = jax.vmap(self.camera.project)(in_camera(x, self.ground()))
+        return jnp.clip(projections.pixel, -FAR, FAR), projections.visible
 
     def ground(self) -> Float[Array, "7 3"]:
         """Return the keypoints on the ground in the world frame [m]."""
@@ -174,8 +174,8 @@ class Keypoints(AbstractObservation[KeypointMemory]):
         """Return the observation after one more frame."""
         key, k_noise, _ = random.split(memory.key, 3)  # three keys, for the same noise as OccludedKeypoints
         true, visible = self.pixels(x)
-        shown = true + lax.stop_gradient(self.deviation(k_noise, true.dtype))
-        frames = jnp.concatenate([memory.frames, shown.reshape(1, 14)])[1:]
+        pixels_with_noise = true + lax.stop_gradient(self.deviation(k_noise, true.dtype))
+        frames = jnp.concatenate([memory.frames, pixels_with_noise.reshape(1, 14)])[1:]
         commands = jnp.concatenate([memory.commands, self.scaled(last)[None]])[1:]
         o = jnp.concatenate([self.features(self.stacked(frames)), visible.astype(true.dtype), commands.reshape(-1)])
         return o, KeypointMemory(frames, commands, key)

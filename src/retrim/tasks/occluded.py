@@ -98,38 +98,40 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         if frame is not None:  # the camera is in the world
             x, last = frame.world_state(x), frame.world_command(last)
         x, last, memory = lax.stop_gradient((x, last, memory))
-        acted = last if self.delay_ticks == 0 else full.command(memory.commands[-self.delay_ticks])
+        command = last if self.delay_ticks == 0 else full.command(memory.commands[-self.delay_ticks])
         key, k_noise, k_drop = random.split(memory.key, 3)
         true, inside = full.pixels(x)
-        seen = inside & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
+        is_visible = inside & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
         sharpness = 2.0 * jnp.maximum(full.noise, LEAST_NOISE) / full.camera.size
-        prior = memory.pose.predicted(acted, full.dt, self.lag)
-        pose = prior.corrected(full.camera, full.ground(), true + full.deviation(k_noise, true.dtype), seen, sharpness)
-        poses = self._corrected(memory.poses, prior.x, pose.x)
+        prior = memory.pose.predict(command, full.dt, self.lag)
+        pose = prior.correct(
+            full.camera, full.ground(), true + full.deviation(k_noise, true.dtype), is_visible, sharpness
+        )
+        poses = self._correct(memory.poses, prior.x, pose.x)
         commands = jnp.concatenate([memory.commands, full.scaled(last)[None]])[1:]
-        o = self._shown(poses, commands)
+        o = self._observe(poses, commands)
         return o, OccludedMemory(commands, pose, poses, key)
 
-    def _shown(self, poses: State, commands: Float[Array, "3 4"]) -> Float[Array, " o"]:
+    def _observe(self, poses: State, commands: Float[Array, "3 4"]) -> Float[Array, " o"]:
         """Return the observation for these poses and commands, in the frame."""
-        shown, frame = self.full, self.frame
-        there = jax.tree.map(lambda leaf: leaf[:: -shown.stride], poses)  # newest first
+        full, frame = self.full, self.frame
+        there = jax.tree.map(lambda leaf: leaf[:: -full.stride], poses)  # newest first
         if frame is not None:
-            shown = shown.in_frame(frame)
+            full = full.in_frame(frame)
             there = jax.vmap(frame.state)(there)
-            commands = jax.vmap(lambda row: shown.scaled(frame.command(shown.command(row))))(commands)
-        pixels, visible = jax.vmap(shown.pixels)(there)
-        features = shown.features(pixels.reshape(-1))
+            commands = jax.vmap(lambda row: full.scaled(frame.command(full.command(row))))(commands)
+        pixels, visible = jax.vmap(full.pixels)(there)
+        features = full.features(pixels.reshape(-1))
         return jnp.concatenate([features, visible[0].astype(features.dtype), commands.reshape(-1)])
 
-    def _corrected(self, poses: State, prior: State, new: State) -> State:
+    def _correct(self, poses: State, prior: State, new: State) -> State:
         """Return the past poses, moved by the correction from ``prior`` to ``new``, followed by ``new``."""
         turn, dp, dv = new.R @ prior.R.T, new.p - prior.p, new.v - prior.v
 
-        def moved(x: State, ago: Float[Array, ""]) -> State:
+        def move(x: State, ago: Float[Array, ""]) -> State:
             return State(x.p + dp - ago * dv, turn @ x.R, x.v + dv)
 
-        before: State = jax.vmap(moved)(poses, self._ago(new) + self.full.dt)
+        before: State = jax.vmap(move)(poses, self._ago(new) + self.full.dt)
         poses = jax.tree.map(lambda old, now: jnp.concatenate([old, now[None]])[1:], before, new)
         return poses
 

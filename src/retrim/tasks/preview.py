@@ -42,13 +42,13 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
         """Return the reference relative to the vehicle, in world axes, with attitude, velocity and commands."""
-        scaled = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
-        memory = jnp.concatenate([memory, scaled[None]])[1:]
+        scaling = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
+        memory = jnp.concatenate([memory, scaling[None]])[1:]
         # Evaluate all instants at once, since each separate evaluation of a reference would be compiled again.
         first, second = len(POSITIONS), len(POSITIONS) + len(VELOCITIES)
         ahead = jax.vmap(self.reference)(t + jnp.array((*POSITIONS, *VELOCITIES, *self.accelerations), dtype=t.dtype))
         heading = ahead.heading[0]
-        seen = [
+        parts = [
             (ahead.p[:first] - x.p[None]).reshape(-1),
             (ahead.v[first:second] - x.v[None]).reshape(-1) / VELOCITY_SCALE,
             x.R.reshape(9),
@@ -58,7 +58,7 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
             (ahead.a[second:] / ACCELERATION_SCALE).reshape(-1),
             (ahead.jerk[second:] / JERK_SCALE).reshape(-1),
         ]
-        return jnp.concatenate(seen), memory
+        return jnp.concatenate(parts), memory
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "Preview":
         """Return the observation of the reference in ``frame``."""

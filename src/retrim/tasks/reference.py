@@ -70,8 +70,8 @@ class Reference(AbstractReference):
         """Return the reference at time ``t`` [s], linearly interpolated between rows, or hover once the end is held."""
         start, end = self.lap[0], self.lap[1]
         length = end - start
-        folded = start + (t - start) % jnp.where(length > 0, length, 1.0)
-        t = jnp.where(t < end, t, jnp.where(length > 0, folded, end))
+        lap_time = start + (t - start) % jnp.where(length > 0, length, 1.0)
+        t = jnp.where(t < end, t, jnp.where(length > 0, lap_time, end))
         where = jnp.clip((t - self.since) / self.every, 0.0, self.rows.shape[0] - 1.0)
         i = jnp.clip(jnp.floor(where), 0, self.rows.shape[0] - 2).astype(jnp.int32)
         part = (where - i.astype(where.dtype)).astype(self.rows.dtype)
@@ -117,7 +117,9 @@ class Reference(AbstractReference):
         return "; ".join(unflyable(np.asarray(self.rows, dtype=float), float(self.every), lap, vehicle)) or None
 
 
-def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, every: float = 0.02) -> Reference:
+def join_references(
+    references: Sequence[AbstractReference], *, seconds: float = 20.0, every: float = 0.02
+) -> Reference:
     """Join a family of references end to end into one table for training.
 
     Args:
@@ -136,14 +138,14 @@ def joined(references: Sequence[AbstractReference], *, seconds: float = 20.0, ev
     times = every * jnp.arange(round(seconds / every), dtype=float)
     rows = []
     for reference in references:
-        rows.append(_sampled(reference, times))
+        rows.append(_sample(reference, times))
     joins = [(k * seconds, (k + 1) * seconds - 5.0) for k in range(len(references))]
     end = len(references) * seconds
     return Reference(jnp.concatenate(rows), jnp.asarray(every, float), jnp.array([end, end]), jnp.array(joins))
 
 
 @eqx.filter_jit
-def _sampled(reference: AbstractReference, times: Float[Array, " n"]) -> Float[Array, "n 18"]:
+def _sample(reference: AbstractReference, times: Float[Array, " n"]) -> Float[Array, "n 18"]:
     points = jax.vmap(reference)(times)
     points = points._replace(heading=jnp.unwrap(points.heading))  # it may jump by whole turns between laps
     return jnp.concatenate([leaf.reshape(times.shape[0], -1) for leaf in points], axis=1)

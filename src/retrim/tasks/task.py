@@ -212,7 +212,7 @@ def huber(y: Float[Array, " n"]) -> Float[Array, ""]:
     The paper uses "the Huber loss" of a vector and leaves open whether it applies to the norm or to each component.
     The norm is used here because it does not depend on the choice of axes. The value and gradient are exact at zero.
     """
-    squared = jnp.sum(y * y)
-    inside = squared <= 1.0
-    norm = jnp.sqrt(jnp.where(inside, jnp.ones_like(squared), squared))
-    return jnp.where(inside, 0.5 * squared, norm - 0.5)
+    square = jnp.sum(y * y)
+    inside = square <= 1.0
+    norm = jnp.sqrt(jnp.where(inside, jnp.ones_like(square), square))
+    return jnp.where(inside, 0.5 * square, norm - 0.5)

@@ -74,8 +74,8 @@ class StateAndErrorObs(AbstractObservation[Float[Array, "history 4"]]):
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
         """Return the scaled state, the commands and the scaled error, in world axes."""
         here = self.reference(t)
-        seen, memory = self.state(memory, t, x, last)
-        return jnp.concatenate([seen, (x.p - here.p) / POSITION_SCALE, (x.v - here.v) / VELOCITY_SCALE]), memory
+        state_part, memory = self.state(memory, t, x, last)
+        return jnp.concatenate([state_part, (x.p - here.p) / POSITION_SCALE, (x.v - here.v) / VELOCITY_SCALE]), memory
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "StateAndErrorObs":
         """Return the observation of the reference in ``frame``."""

@@ -47,7 +47,7 @@ def from_csv(file: Path, laps: bool | None = None) -> Reference:
     table = read_table(Path(file))
     start = None if laps is False else _lap_start(table)
     if start is not None:
-        return _repeated(table, start)
+        return _repeat(table, start)
     if laps:
         raise ConfigError(f"{file}: {_why_no_lap(table)}; a lap ends with the point that it starts with")
     return _once(table)
@@ -59,7 +59,7 @@ def _once(table: np.ndarray) -> Reference:
     return Reference.of(spline, seconds=seconds, points=_points(seconds))
 
 
-def _repeated(table: np.ndarray, start: float) -> Reference:
+def _repeat(table: np.ndarray, start: float) -> Reference:
     """Return a reference that follows the whole table once, and then repeats the part from ``start`` [s] on."""
     period = float(table[-1, 0]) - start
     spline, winding = _lap_spline(table, start)

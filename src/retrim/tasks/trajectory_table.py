@@ -98,8 +98,8 @@ def read_table(file: Path) -> np.ndarray:
 
 def _repeats(point: list[float], last: list[float]) -> bool:
     """Return whether a point has the same time, position and heading as the last one."""
-    turned = math.remainder(point[4] - last[4], 2.0 * math.pi) if len(point) > 4 else 0.0
-    near = math.dist(point[1:4], last[1:4]) <= SAME_PLACE and abs(turned) <= SAME_YAW
+    heading_change = math.remainder(point[4] - last[4], 2.0 * math.pi) if len(point) > 4 else 0.0
+    near = math.dist(point[1:4], last[1:4]) <= SAME_PLACE and abs(heading_change) <= SAME_YAW
     return near and abs(point[0] - last[0]) <= SAME_TIME
 
 
@@ -175,18 +175,18 @@ def _point(words: list[str], columns: list[str]) -> list[float]:
     Raises:
         ConfigError: The number of words is wrong, or a word is not a plausible number.
     """
-    shown = ", ".join(words) if len(words) <= 6 else ", ".join(words[:6]) + ", ..."
+    excerpt = ", ".join(words) if len(words) <= 6 else ", ".join(words[:6]) + ", ..."
     if len(words) != len(columns):
-        raise ConfigError(f"'{shown}' has {len(words)} columns; {', '.join(columns)} are expected: {EXPECTED}")
+        raise ConfigError(f"'{excerpt}' has {len(words)} columns; {', '.join(columns)} are expected: {EXPECTED}")
     values = dict[str, float]()
     for name, word in zip(columns, words, strict=True):
         if name not in COLUMNS:
             continue
         value = _number(word)
         if value is None:
-            raise ConfigError(f"{name} = {word!r} in '{shown}' is not a number; {EXPECTED} are expected")
+            raise ConfigError(f"{name} = {word!r} in '{excerpt}' is not a number; {EXPECTED} are expected")
         if not math.isfinite(value):
-            raise ConfigError(f"{name} = {word!r} in '{shown}' is not finite")
+            raise ConfigError(f"{name} = {word!r} in '{excerpt}' is not finite")
         values[name] = value
     if far := [name for name in "xyz" if abs(values[name]) > FARTHEST]:
         raise ConfigError(f"{far[0]} = {values[far[0]]:g} m is beyond {FARTHEST:g} m; are the positions in m?")

@@ -43,8 +43,8 @@ def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehic
     return table
 
 
-class Spliced(AbstractReference):
-    """A flight's successive references, combined into one; see :func:`spliced`."""
+class SplicedReference(AbstractReference):
+    """A flight's successive references, combined into one; see :func:`splice`."""
 
     pieces: Reference
     """Tables of equal size; every leaf has a leading axis."""
@@ -76,7 +76,7 @@ class Spliced(AbstractReference):
         return TurnedReference(self, frame)
 
 
-def spliced(pieces: Sequence[tuple[float, Reference]]) -> Spliced:
+def splice(pieces: Sequence[tuple[float, Reference]]) -> SplicedReference:
     """Combine a flight's successive references into one reference.
 
     Args:
@@ -84,7 +84,7 @@ def spliced(pieces: Sequence[tuple[float, Reference]]) -> Spliced:
     """
     began, tables = zip(*pieces, strict=True)
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
-    return Spliced(together, jnp.asarray(began, together.every.dtype))
+    return SplicedReference(together, jnp.asarray(began, together.every.dtype))
 
 
 def _table(old: Reference, new: Reference, at: float, lasting: float) -> Reference:
@@ -98,7 +98,7 @@ def _table(old: Reference, new: Reference, at: float, lasting: float) -> Referen
     times = np.linspace(since, lap[1], old.rows.shape[0])
     join = lap if lap[0] < lap[1] else (since, lap[1])
     dtype = old.every.dtype
-    rows = _mixed(old, new, *(jnp.asarray(value, dtype) for value in (times, at, lasting)))
+    rows = _mix(old, new, *(jnp.asarray(value, dtype) for value in (times, at, lasting)))
     return Reference(
         rows,
         jnp.asarray(times[1] - times[0], dtype),
@@ -109,7 +109,7 @@ def _table(old: Reference, new: Reference, at: float, lasting: float) -> Referen
 
 
 @eqx.filter_jit
-def _mixed(
+def _mix(
     old: Reference, new: Reference, times: Float[Array, " n"], at: Float[Array, ""], lasting: Float[Array, ""]
 ) -> Float[Array, "n 18"]:
     first, last = jax.vmap(old)(times), jax.vmap(new)(jnp.maximum(times - at, 0.0))
@@ -127,7 +127,7 @@ def _mixed(
         jerk = before.jerk + s * (after.jerk - before.jerk) + 3.0 * s1 * a + 3.0 * s2 * v + s3 * p
         heading, heading_rate = before.heading + s * turn, before.heading_rate + s * rate + s1 * turn
         up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=moving_a.dtype)
-        mixed = Point(
+        point = Point(
             before.p + s * p,
             before.v + s * v + s1 * p,
             flat_command(moving_a + up, jerk, heading, heading_rate),
@@ -136,7 +136,7 @@ def _mixed(
             jerk,
             heading_rate,
         )
-        return jnp.concatenate([leaf.reshape(-1) for leaf in mixed])
+        return jnp.concatenate([leaf.reshape(-1) for leaf in point])
 
     return jax.vmap(row)(times, first, last)
 

@@ -56,11 +56,11 @@ class VehicleObs(AbstractWrappedObservation[M]):
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
         """Return the task observation with the scaled actuators and belief."""
-        seen, memory = self.inner(memory, t, x, last)
+        inner_observation, memory = self.inner(memory, t, x, last)
         acting, slope = self.actuators.command, self.actuators.slope
         thrust = (acting.c / STANDARD_GRAVITY - 1.0)[None]
-        scaled = (thrust, acting.omega / self.omega_max, slope / self.omega_max, self.belief.vector())
-        return jnp.concatenate([seen, *(each.astype(seen.dtype) for each in scaled)]), memory
+        scaling = (thrust, acting.omega / self.omega_max, slope / self.omega_max, self.belief.vector())
+        return jnp.concatenate([inner_observation, *(each.astype(inner_observation.dtype) for each in scaling)]), memory
 
     def with_belief(self, belief: PathBelief) -> "VehicleObs[M]":
         """Return the same observation with a different belief."""
@@ -78,5 +78,5 @@ class VehicleObs(AbstractWrappedObservation[M]):
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "VehicleObs[M]":
         """Return the observation in ``frame``; the actuators must also be in that frame."""
-        turned: AbstractObservation[Any] = self.inner.in_frame(frame)
-        return dataclasses.replace(self, inner=turned)
+        inner_in_frame: AbstractObservation[Any] = self.inner.in_frame(frame)
+        return dataclasses.replace(self, inner=inner_in_frame)

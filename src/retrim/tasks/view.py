@@ -19,7 +19,7 @@ class ViewHover(L2Hover):
 
     def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
         """Return the reward of :class:`L2Hover` minus 10 times the mean distance by which points leave the image."""
-        seen: Keypoints = self.observation  # type: ignore[assignment]  # a field of the base class
-        pixels = jax.vmap(seen.camera.project)(in_camera(x, seen.ground())).pixel
+        observation: Keypoints = self.observation  # type: ignore[assignment]  # a field of the base class
+        pixels = jax.vmap(observation.camera.project)(in_camera(x, observation.ground())).pixel
         outside = jax.nn.relu(jnp.abs(jnp.clip(pixels, -FARTHEST, FARTHEST)) - EDGE)
         return super().reward(t, x, u) - WEIGHT * jnp.mean(jnp.sum(outside, axis=1))

@@ -18,7 +18,7 @@ from ..config.scenario import Scenario
 from ..errors import MessageError
 from ..plants.bridges import crtp
 from ..plants.bridges.crtp import Packet
-from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
+from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupt
 
 VERSION = 12  # protocol version
 LEVELS_S, STOPS_S = 0.5, 2.0  # [s]: time without a setpoint until the vehicle levels, and until the motors stop
@@ -51,7 +51,7 @@ class CrazyfliePeer:
         self._yaw = 0.0
         self._lands = False
         self._setpoint: np.ndarray | None = None
-        self._told = -math.inf
+        self._last_command_time = -math.inf
         self._thrust = 0.0
         self._blocks: dict[int, list[str]] = {}
         self._periods: dict[int, int] = {}
@@ -65,7 +65,7 @@ class CrazyfliePeer:
     def step(self) -> None:
         """Read packets, advance by a tick, and send the log."""
         self._read()
-        vehicle, u = self.vehicle, self._commanded()
+        vehicle, u = self.vehicle, self._command()
         self._thrust = 0.0 if u is None else float(u[0]) / vehicle.thrust_max * FULL
         if vehicle.flies:
             vehicle.step(np.zeros(4) if u is None else u)
@@ -87,9 +87,9 @@ class CrazyfliePeer:
         self.vehicle.close()
         self._socket.close()
 
-    def _commanded(self) -> np.ndarray | None:
+    def _command(self) -> np.ndarray | None:
         """Return the command that acts on the vehicle; None if the motors are off."""
-        since = time.monotonic() - self._told
+        since = time.monotonic() - self._last_command_time
         if not self.armed or self.locked:
             return None
         if self._setpoint is not None:
@@ -118,8 +118,8 @@ class CrazyfliePeer:
             offset = struct.calcsize("<" + "".join(list(crtp.STATE_LOG.values())[: list(crtp.STATE_LOG).index(name)]))
             kind = struct.calcsize("<" + crtp.STATE_LOG[name])
             return crtp.state_values(x.p, x.R, x.v, x.omega)[offset : offset + kind]
-        known = {"thrust": self._thrust, "info": self._info(), "vbat": 3.9, "x": float(x.p[0]), "y": float(x.p[1])}
-        return struct.pack("<" + VARIABLES[name], known[of])
+        variables = {"thrust": self._thrust, "info": self._info(), "vbat": 3.9, "x": float(x.p[0]), "y": float(x.p[1])}
+        return struct.pack("<" + VARIABLES[name], variables[of])
 
     def _read(self) -> None:
         while True:
@@ -131,7 +131,7 @@ class CrazyfliePeer:
                 continue
             self._client = sender
             try:
-                self._take(crtp.unpacked(data))
+                self._take(crtp.unpack(data))
             except (MessageError, struct.error, IndexError, ValueError):
                 continue
 
@@ -166,7 +166,7 @@ class CrazyfliePeer:
         if rate == 1:
             c = thrust / FULL * self.vehicle.thrust_max
             self._setpoint = np.array([c, *np.radians([roll, -pitch, yaw])])
-            self._told = time.monotonic()
+            self._last_command_time = time.monotonic()
 
     def _plan(self, body: bytes) -> None:
         kind, x = body[0], self.vehicle
@@ -188,12 +188,12 @@ class CrazyfliePeer:
         elif channel == crtp.TOC and body[0] == crtp.ITEM:
             (number,) = struct.unpack("<H", body[1:3])
             name, kind = list(VARIABLES.items())[number]
-            listed = body[:3] + bytes([crtp.LOG_TYPES[kind]]) + name.encode().replace(b".", b"\0") + b"\0"
-            self._send(packet._replace(body=listed))
+            reply = body[:3] + bytes([crtp.LOG_TYPES[kind]]) + name.encode().replace(b".", b"\0") + b"\0"
+            self._send(packet._replace(body=reply))
         elif channel == crtp.CONTROL:
-            self._send(packet._replace(body=body[:2].ljust(2, b"\0") + bytes([self._ordered(body)])))
+            self._send(packet._replace(body=body[:2].ljust(2, b"\0") + bytes([self._execute(body)])))
 
-    def _ordered(self, body: bytes) -> int:
+    def _execute(self, body: bytes) -> int:
         """Execute a request about a log block; return the error code, which is 0 on success."""
         if body[0] == crtp.RESET:
             self._blocks, self._periods = {}, {}
@@ -225,18 +225,18 @@ def main() -> None:
     parser.add_argument("--plant", default="bem", help="as for `retrim fly`")
     parser.add_argument("--port", type=int, default=19850, help="where it listens, on this machine")
     parser.add_argument("--cut", type=float, nargs=2, help="seconds by rates until the link is cut, and for how long")
-    chosen = parser.parse_args()
-    peer = CrazyfliePeer(Scenario(chosen.disturbance, chosen.plant), port=chosen.port)
-    engaged = math.inf
+    options = parser.parse_args()
+    peer = CrazyfliePeer(Scenario(options.disturbance, options.plant), port=options.port)
+    engage_time = math.inf
 
     def step() -> None:
-        nonlocal engaged
+        nonlocal engage_time
         if peer.by_rates:
-            engaged = min(engaged, time.monotonic())
-        peer.cut = chosen.cut is not None and chosen.cut[0] <= time.monotonic() - engaged < sum(chosen.cut)
+            engage_time = min(engage_time, time.monotonic())
+        peer.cut = options.cut is not None and options.cut[0] <= time.monotonic() - engage_time < sum(options.cut)
         peer.step()
 
-    fly_until_interrupted(step, f"it listens at udp:127.0.0.1:{chosen.port}")
+    fly_until_interrupt(step, f"it listens at udp:127.0.0.1:{options.port}")
     peer.close()
 
 

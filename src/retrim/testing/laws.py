@@ -18,8 +18,8 @@ def require(holds: bool, law: str) -> None:
         raise AssertionError(f"broken law: {law}")
 
 
-def close(found: Any, expected: Any, tolerance: float, law: str) -> None:
+def close(value: Any, expected: Any, tolerance: float, law: str) -> None:
     """Raise ``AssertionError`` with the law as its message if an error is NaN or larger than the tolerance."""
-    away = float(np.max(np.abs(np.asarray(found) - np.asarray(expected))))
+    away = float(np.max(np.abs(np.asarray(value) - np.asarray(expected))))
     if not away <= tolerance:
-        raise AssertionError(f"broken law: {law}; found {np.asarray(found)}, expected {np.asarray(expected)}")
+        raise AssertionError(f"broken law: {law}; found {np.asarray(value)}, expected {np.asarray(expected)}")

@@ -17,7 +17,7 @@ import numpy as np
 from ..config.scenario import Scenario
 from ..plants.bridges import frames
 from ..plants.extras import import_extra
-from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupted
+from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupt
 
 OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)
 FAILSAFE_S = 1.0  # [s]: time without a setpoint until the failsafe
@@ -47,7 +47,7 @@ class MavlinkPeer:
         """Whether the link is cut in both directions."""
         self._rates: np.ndarray | None = None
         self._place, self._yaw = np.zeros(3), math.pi / 2
-        self._told, self._tick, self._thrust = -math.inf, 0, 0.0
+        self._last_command_time, self._tick, self._thrust = -math.inf, 0, 0.0
         self.failsafes = 0
         """Number of times that setpoints have stopped arriving in offboard mode."""
         self._takes: dict[str, Callable[[Any], None]] = {
@@ -60,7 +60,7 @@ class MavlinkPeer:
         self._read()
         vehicle = self.vehicle
         if vehicle.flies:
-            u = self._commanded()
+            u = self._command()
             self._thrust = float(u[0]) / vehicle.thrust_max
             vehicle.step(u)
             if vehicle.p[2] < GROUND and self.mode == LAND:
@@ -80,9 +80,9 @@ class MavlinkPeer:
         self.vehicle.close()
         self._socket.close()
 
-    def _commanded(self) -> np.ndarray:
+    def _command(self) -> np.ndarray:
         """Return the command that acts on the vehicle: the setpoint, or the output of the autopilot's controller."""
-        stale = time.monotonic() - self._told > FAILSAFE_S
+        stale = time.monotonic() - self._last_command_time > FAILSAFE_S
         if self.mode == OFFBOARD and stale:
             self.mode, self.failsafes, self._place, self._rates = HOLD, self.failsafes + 1, self.vehicle.p.copy(), None
             self.vehicle.forget()
@@ -116,12 +116,12 @@ class MavlinkPeer:
         self._setpoint(None)
 
     def _setpoint(self, rates: np.ndarray | None) -> None:
-        self._rates, self._told = rates, time.monotonic()
+        self._rates, self._last_command_time = rates, time.monotonic()
         if self.failsafes and self.mode == HOLD and self.armed:
             self.mode = OFFBOARD  # PX4 also returns to offboard mode automatically
 
     def _take_command(self, m: Any) -> None:
-        fresh = time.monotonic() - self._told < FAILSAFE_S
+        fresh = time.monotonic() - self._last_command_time < FAILSAFE_S
         if m.command == 176 and (int(m.param2), int(m.param3)) in (OFFBOARD, LAND) and (m.param2 != 6 or fresh):
             self.mode = (int(m.param2), int(m.param3))
             self._place = self._place if self.mode == OFFBOARD else self.vehicle.p.copy()
@@ -171,21 +171,21 @@ def main() -> None:
         "--cut", type=float, nargs=2, help="seconds in offboard mode by rates until the link is cut, and for how long"
     )
     parser.add_argument("--takes-over", type=float, default=math.inf, help="seconds by rates until a pilot takes over")
-    chosen = parser.parse_args()
-    peer = MavlinkPeer(Scenario(chosen.disturbance, chosen.plant), port=chosen.port)
-    engaged = math.inf
+    options = parser.parse_args()
+    peer = MavlinkPeer(Scenario(options.disturbance, options.plant), port=options.port)
+    engage_time = math.inf
 
     def step() -> None:
-        nonlocal engaged
+        nonlocal engage_time
         now = time.monotonic()
         if peer.by_rates:
-            engaged = min(engaged, now)
-        if peer.by_rates and now - engaged > chosen.takes_over:
+            engage_time = min(engage_time, now)
+        if peer.by_rates and now - engage_time > options.takes_over:
             peer.mode = HOLD
-        peer.cut = chosen.cut is not None and chosen.cut[0] <= now - engaged < sum(chosen.cut)
+        peer.cut = options.cut is not None and options.cut[0] <= now - engage_time < sum(options.cut)
         peer.step()
 
-    fly_until_interrupted(step, f"it sends to udp:127.0.0.1:{chosen.port}")
+    fly_until_interrupt(step, f"it sends to udp:127.0.0.1:{options.port}")
     peer.close()
 
 

@@ -69,8 +69,8 @@ class PeerVehicle:
         """Apply a command [c, omega] for one tick."""
         x = self._step_plant(u)
         before, after = self.R, np.asarray(x.R, dtype=float)
-        turned = (before.T @ after - after.T @ before) / (2 * DT)
-        self.omega = np.array([turned[2, 1], turned[0, 2], turned[1, 0]])
+        rotation = (before.T @ after - after.T @ before) / (2 * DT)
+        self.omega = np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]])
         self.x = np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)])
 
     def stand(self) -> None:
@@ -108,7 +108,7 @@ def _standing(x: float, y: float, yaw: float) -> np.ndarray:
     return np.concatenate([[x, y, 0.0], R.ravel(), np.zeros(3)])
 
 
-def fly_until_interrupted(step: Callable[[], None], address: str) -> None:
+def fly_until_interrupt(step: Callable[[], None], address: str) -> None:
     """Call a step function every 0.01 s until Ctrl-C.
 
     Args:

@@ -32,9 +32,14 @@ def check_plant(make: Callable[[], Plant], *, x0: State | None = None, settle_s:
     first = plant.reset(start)
     close(first.true_state.p, start.p, 1e-4, "reset puts it where it is told")
     for k in range(1, 4):
-        measurement, accepted = plant.step(Command.hover())
+        measurement, accepted_command = plant.step(Command.hover())
         close(measurement.t - first.t, k * plant.dt, 1e-6, "a tick takes dt by the plant's clock")
-        close(as_numpy(accepted), as_numpy(Command.hover()), 1e-6, "a command within the limits is accepted as it is")
+        close(
+            as_numpy(accepted_command),
+            as_numpy(Command.hover()),
+            1e-6,
+            "a command within the limits is accepted as it is",
+        )
         x = measurement.x
         close(x.R @ x.R.T, np.eye(3), 1e-3, "the attitude is a rotation")
         require(all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(x)), "measured states are finite")
@@ -48,14 +53,16 @@ def check_plant(make: Callable[[], Plant], *, x0: State | None = None, settle_s:
     after, _ = plant.step(Command.hover())
     close(after.t - first.t, 4 * plant.dt, 1e-6, "a refused command costs no tick")
 
-    hovered = _after(plant, start, Command.hover(), ticks)
-    require(float(jnp.linalg.norm(hovered.p - start.p)) < 0.3, "hover thrust hovers, within 0.3 m")
+    hover_state = _after(plant, start, Command.hover(), ticks)
+    require(float(jnp.linalg.norm(hover_state.p - start.p)) < 0.3, "hover thrust hovers, within 0.3 m")
     higher = _after(plant, start, Command(jnp.array(STANDARD_GRAVITY + 3.0), jnp.zeros(3)), ticks)
-    require(float(higher.v[2] - hovered.v[2]) > 0.3 * 3.0 * settle_s, "more thrust accelerates it upwards, per mass")
+    require(
+        float(higher.v[2] - hover_state.v[2]) > 0.3 * 3.0 * settle_s, "more thrust accelerates it upwards, per mass"
+    )
     for axis, name in enumerate("xyz"):
         turning = Command(jnp.array(STANDARD_GRAVITY), jnp.zeros(3).at[axis].set(1.0))
-        turned = _after(plant, start, turning, ticks)
-        angle = so3.log(start.R.T @ turned.R)
+        turn_state = _after(plant, start, turning, ticks)
+        angle = so3.log(start.R.T @ turn_state.R)
         require(0.3 * settle_s < float(angle[axis]) < 1.2 * settle_s, f"a body rate about {name} turns it about {name}")
         others = float(jnp.linalg.norm(jnp.delete(angle, axis, assume_unique_indices=True)))
         require(others < 0.3 * float(angle[axis]), f"a body rate about {name} turns it about no other axis")

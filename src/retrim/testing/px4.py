@@ -19,7 +19,7 @@ from ..plants.bridges.mavlink_link import MavlinkLink
 
 GROUND_STATION = 14550  # port to which PX4 sends, in addition to the port for a companion computer
 PAYLOAD = 14030  # a further port to which PX4 sends
-SEEN = 50.0  # [Hz]: rate of the motion capture
+CAPTURE_RATE = 50.0  # [Hz]: rate of the motion capture
 MOCAP = {
     "EKF2_EV_CTRL": 15, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3, "EKF2_EV_DELAY": 8, "EKF2_EV_NOISE_MD": 1,
     "EKF2_EVP_NOISE": 0.02, "EKF2_EVV_NOISE": 0.05, "EKF2_EVA_NOISE": 0.05,
@@ -51,7 +51,7 @@ class Px4Simulation:
     def __enter__(self) -> "Px4Simulation":
         """Start the process."""
         parameters = {f"PX4_PARAM_{name}": str(value) for name, value in self._parameters.items()}
-        simulated = {
+        variables = {
             "PX4_SIM_MODEL": "sihsim_quadx",
             "PX4_SIMULATOR": "sihsim",
             "PX4_PARAM_SDLOG_BACKEND": "0",
@@ -60,7 +60,7 @@ class Px4Simulation:
             self._process = subprocess.Popen(
                 [self._package / "bin/px4", "-d", "-s", "etc/init.d-posix/rcS", "-w", self._run, self._package / "etc"],
                 cwd=self._run,
-                env=os.environ | simulated | parameters,
+                env=os.environ | variables | parameters,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -80,7 +80,7 @@ class Px4Simulation:
             self._process.wait()
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether the process has ended by itself."""
         return self._process.poll() is not None
 
@@ -91,19 +91,19 @@ class MotionCapture:
     def __init__(self, port: int = GROUND_STATION) -> None:
         """Listen on the port to which PX4 sends for ground stations."""
         self.link = MavlinkLink(UdpEndpoint("127.0.0.1", port))
-        self._seen = self._asked = 0.0
+        self._last_truth = self._last_request = 0.0
 
     def step(self, until: float) -> None:
         """Send states until a time on the monotonic clock [s]."""
         while time.monotonic() < until:
             self.link.pump(time.monotonic() + 2e-3)
             truth = self.link.truth
-            if truth is not None and truth.stamp > self._seen:
-                self._seen = truth.stamp
+            if truth is not None and truth.stamp > self._last_truth:
+                self._last_truth = truth.stamp
                 self.link.see(truth)
-            elif self.link.system is not None and time.monotonic() - max(self._asked, self._seen) > 1.0:
-                self._asked = time.monotonic()
-                self.link.stream("HIL_STATE_QUATERNION", SEEN)
+            elif self.link.system is not None and time.monotonic() - max(self._last_request, self._last_truth) > 1.0:
+                self._last_request = time.monotonic()
+                self.link.stream("HIL_STATE_QUATERNION", CAPTURE_RATE)
 
 
 def main() -> None:
@@ -115,7 +115,7 @@ def main() -> None:
         try:
             cameras = MotionCapture()
             print("PX4 flies at udp:127.0.0.1:14540; Ctrl-C ends it", flush=True)
-            while not px4.ended:
+            while not px4.has_ended:
                 cameras.step(time.monotonic() + 0.5)
         except KeyboardInterrupt:
             return

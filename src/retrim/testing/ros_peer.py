@@ -16,7 +16,7 @@ from ..config.scenario import Scenario
 from ..plants.bridges.ros import NAMESPACE
 from ..plants.bridges.ros_link import ODOMETRY, POSE, TARGET, attitude_target
 from ..rospy_node import join, system_module
-from .peer_vehicle import PeerVehicle, fly_until_interrupted
+from .peer_vehicle import PeerVehicle, fly_until_interrupt
 
 FRESH_S = 0.3  # [s]: time for which a target is valid
 
@@ -40,15 +40,15 @@ class RosPeer:
         self._publisher = rospy.Publisher(
             f"{NAMESPACE}/{POSE if poses else ODOMETRY}", self._kind, queue_size=1, tcp_nodelay=True
         )
-        rospy.Subscriber(f"{NAMESPACE}/{TARGET}", attitude_target(), self._heard, queue_size=1, tcp_nodelay=True)
+        rospy.Subscriber(f"{NAMESPACE}/{TARGET}", attitude_target(), self._hear, queue_size=1, tcp_nodelay=True)
         self.vehicle = PeerVehicle(scenario, heading=0.0)
         self._place, self._yaw = place, yaw
-        self._told, self._u, self._by_rates = -math.inf, np.zeros(4), False
+        self._last_command_time, self._u, self._by_rates = -math.inf, np.zeros(4), False
         self.vehicle.lift_off()
 
     def step(self) -> None:
         """Advance by a tick, and publish the state."""
-        fresh = time.monotonic() - self._told < FRESH_S
+        fresh = time.monotonic() - self._last_command_time < FRESH_S
         if self._by_rates and not fresh:
             self._place = self.vehicle.p.copy()
             self.vehicle.forget()
@@ -56,10 +56,10 @@ class RosPeer:
         self.vehicle.step(self._u if fresh else self.vehicle.towards(self._place, self._yaw))
         self._say()
 
-    def _heard(self, target: Any) -> None:
+    def _hear(self, target: Any) -> None:
         rate = target.body_rate
         self._u = np.array([target.thrust * self.vehicle.thrust_max, rate.x, rate.y, rate.z])
-        self._told = time.monotonic()
+        self._last_command_time = time.monotonic()
 
     def _say(self) -> None:
         from scipy.spatial.transform import Rotation  # local, because this import takes as long as that of retrim
@@ -88,10 +88,10 @@ def main() -> None:
     parser.add_argument("--place", type=float, nargs=3, default=(0.0, 0.0, 1.0), help="where it waits [m]")
     parser.add_argument("--yaw", type=float, default=0.0, help="its heading there [rad]")
     parser.add_argument("--poses", action="store_true", help="poses alone, no odometry")
-    chosen = parser.parse_args()
-    scenario = Scenario(chosen.disturbance, chosen.plant)
-    peer = RosPeer(chosen.master, scenario, place=np.array(chosen.place), yaw=chosen.yaw, poses=chosen.poses)
-    fly_until_interrupted(peer.step, f"it is at {chosen.master}")
+    options = parser.parse_args()
+    scenario = Scenario(options.disturbance, options.plant)
+    peer = RosPeer(options.master, scenario, place=np.array(options.place), yaw=options.yaw, poses=options.poses)
+    fly_until_interrupt(peer.step, f"it is at {options.master}")
 
 
 if __name__ == "__main__":

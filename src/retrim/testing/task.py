@@ -39,8 +39,8 @@ def check_task(task: AbstractTask, *, starts: int = 16) -> None:
         all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((reward, slopes))), "reward and gradient are finite"
     )
     require(any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(slopes)), "the reward has a gradient")
-    broken = State(jnp.full(3, jnp.nan), one.x.R, one.x.v)
-    require(bool(task.terminated(one.t, broken)), "a state that is not finite is terminated")
+    bad_state = State(jnp.full(3, jnp.nan), one.x.R, one.x.v)
+    require(bool(task.terminated(one.t, bad_state)), "a state that is not finite is terminated")
     away = State(one.x.p + 1e6, one.x.R, one.x.v)
     require(bool(task.terminated(one.t, away)), "a vehicle 1000 km away is terminated")
     require(float(task.error(one.t, one.x)) >= 0.0, "the error is not negative")
@@ -49,7 +49,7 @@ def check_task(task: AbstractTask, *, starts: int = 16) -> None:
     off = float(task.error(one.t, State.at(task.target(one.t))))
     require(abs(off) < 1e-3, "the error at the target is zero")
     for observation, name in ((task.observation, "training"), (task.observation_in_flight, "flight")):
-        memory, (o, later) = _observed(observation, one.t, one.x, u)
+        memory, (o, later) = _observe(observation, one.t, one.x, u)
         require(o.shape == (observation.size,), f"the observation of {name} has its stated size")
         require(bool(np.isfinite(o).all()), f"the observation of {name} is finite")
         require(shapes(memory) == shapes(later), f"the memory of the observation of {name} keeps its shapes")
@@ -64,6 +64,6 @@ def _slopes(task: AbstractTask, t: Any, x: State, u: Command) -> Any:
 
 
 @eqx.filter_jit
-def _observed(observation: AbstractObservation[Any], t: Any, x: State, u: Command) -> Any:
+def _observe(observation: AbstractObservation[Any], t: Any, x: State, u: Command) -> Any:
     memory = observation.init(x)
     return memory, observation(memory, t, x, u)

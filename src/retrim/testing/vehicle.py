@@ -37,17 +37,17 @@ def check_vehicle(
     plant = make()
     require(isinstance(plant, VehiclePlant), "it is a VehiclePlant")
     for early, call in (("read", plant.read), ("step", lambda: plant.step(Command.hover()))):
-        _refused(call, f"{early} before reset is refused with PlantError")
+        _check_refusal(call, f"{early} before reset is refused with PlantError")
     plant.stop()
-    _refused(lambda: plant.connect(lambda: False), "a flight that is given up ends in PlantError")
+    _check_refusal(lambda: plant.connect(lambda: False), "a flight that is given up ends in PlantError")
     plant.stop()
 
     start = State(jnp.array(place), so3.exp(jnp.array([0.0, 0.0, HEADING])), jnp.zeros(3))
     with plant:
         _check_flight(plant, plant.reset(start), start, hover_s)
     plant.stop()
-    _refused(lambda: plant.step(Command.hover()), "a stopped plant refuses commands with PlantError")
-    _refused(plant.read, "a stopped plant has no state: PlantError")
+    _check_refusal(lambda: plant.step(Command.hover()), "a stopped plant refuses commands with PlantError")
+    _check_refusal(plant.read, "a stopped plant has no state: PlantError")
 
 
 def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s: float) -> None:
@@ -61,18 +61,18 @@ def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s
     hover, target = GeometricHover(limits, plant.dt), np.asarray(start.p, dtype=float)
     began, last, ages = time.monotonic(), first, []
 
-    def held(seconds: float) -> None:
+    def hold_hover(seconds: float) -> None:
         """Hover with thrust and body-rate commands."""
         nonlocal last
         until = last.t + seconds
         while last.t < until:
             x = np.asarray(last.x.vector(), dtype=float)
             u = Command.of(jnp.asarray(hover.command(x, target), last.x.p.dtype))
-            last, accepted = plant.step(u)
-            close(as_numpy(accepted), as_numpy(u), 1e-3, "a command within the limits is accepted as it is")
+            last, accepted_command = plant.step(u)
+            close(as_numpy(accepted_command), as_numpy(u), 1e-3, "a command within the limits is accepted as it is")
             ages.append(plant.read().age)  # age of the last received state, because measurements are extrapolated
 
-    held(hover_s)
+    hold_hover(hover_s)
     # The tolerance of 0.5 s allows for other load on the machine.
     close(time.monotonic() - began, last.t - first.t, 0.5, "the time of a measurement is that of the flight")
     close(last.x.p, start.p, 0.5, "thrust and body rates hover it")
@@ -80,16 +80,16 @@ def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s
     require(min(ages) >= 0.0, "no state is from the future")
 
     for bad in (Command(jnp.array(jnp.nan), jnp.zeros(3)), Command(jnp.array(9.81), jnp.array([0.0, jnp.inf, 0.0]))):
-        _refused(functools.partial(plant.step, bad), "a command that is not finite is refused with PlantError")
-    last, accepted = plant.step(Command(jnp.array(1e3), jnp.zeros(3)))
-    require(float(accepted.c) <= float(plant.high[0]), "a command beyond the limits is limited, and it says so")
-    held(1.5)
+        _check_refusal(functools.partial(plant.step, bad), "a command that is not finite is refused with PlantError")
+    last, accepted_command = plant.step(Command(jnp.array(1e3), jnp.zeros(3)))
+    require(float(accepted_command.c) <= float(plant.high[0]), "a command beyond the limits is limited, and it says so")
+    hold_hover(1.5)
 
     before = last
     for _ in range(round(PUSHED_S / plant.dt)):
         last, _ = plant.step(Command(jnp.array(STANDARD_GRAVITY + 2.0), jnp.zeros(3)))
     require(float(last.x.v[2] - before.x.v[2]) > 0.3 * 2.0 * PUSHED_S, "more thrust accelerates it upwards, per mass")
-    held(2.0)
+    hold_hover(2.0)
     for axis, name in enumerate("xyz"):
         before = last
         for _ in range(round(TURNED_S / plant.dt)):
@@ -100,10 +100,10 @@ def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s
         )
         assert last.omega is not None
         require(float(last.omega[axis]) > 0.1, f"a body rate about {name} is measured")
-        held(1.5)
+        hold_hover(1.5)
 
 
-def _refused(call: Callable[[], object], law: str) -> None:
+def _check_refusal(call: Callable[[], object], law: str) -> None:
     try:
         call()
     except PlantError:

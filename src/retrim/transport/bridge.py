@@ -20,7 +20,7 @@ class Bridge:
         out: Iterable[str],
         into: Iterable[str],
         slowly: Iterable[str] = (),
-        known: Mapping[str, int] | None = None,
+        versions: Mapping[str, int] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Build a bridge.
@@ -32,32 +32,32 @@ class Bridge:
             into: Topics carried from ``there`` to ``here``.
             slowly: Topics that are published more often than necessary; at most one message per ``EVERY`` seconds is
                 carried.
-            known: Version of each topic up to which messages are not carried; None to carry every message.
+            versions: Version of each topic up to which messages are not carried; None to carry every message.
             clock: Monotonic clock [s].
         """
         self._routes = [(here, there, topic) for topic in out] + [(there, here, topic) for topic in into]
         self._slowly, self._clock = frozenset(slowly), clock
-        self.known = {topic: 0 for _, _, topic in self._routes} | dict(known or {})
+        self.versions = {topic: 0 for _, _, topic in self._routes} | dict(versions or {})
         """Version of each topic up to which messages have been carried."""
-        self._carried = dict.fromkeys(self._slowly, float("-inf"))
-        self.refused = 0
+        self._last_times = dict.fromkeys(self._slowly, float("-inf"))
+        self.refusals = 0
         """Number of messages that the other bus rejected."""
 
     def step(self) -> int:
         """Carry new messages; return their number."""
-        carried = 0
+        count = 0
         for source, target, topic in self._routes:
-            if topic in self._slowly and self._clock() - self._carried[topic] < EVERY:
+            if topic in self._slowly and self._clock() - self._last_times[topic] < EVERY:
                 continue
-            message = source.latest(topic, self.known[topic])
+            message = source.latest(topic, self.versions[topic])
             if message is None:
                 continue
-            self.known[topic] = message.version
-            self._carried[topic] = self._clock()
+            self.versions[topic] = message.version
+            self._last_times[topic] = self._clock()
             try:
                 target.publish(topic, message.data)
             except MessageError:
-                self.refused += 1
+                self.refusals += 1
             else:
-                carried += 1
-        return carried
+                count += 1
+        return count

@@ -16,7 +16,7 @@ class Bus(abc.ABC):
     """Topics with one writer each and any number of readers; writers and readers never wait for each other."""
 
     @property
-    def refused(self) -> int:
+    def refusals(self) -> int:
         """Number of rejected messages from outside."""
         return 0
 

@@ -18,10 +18,10 @@ def begin(folder: Path) -> int:
 
     The lock file appears only once the lock is held.
     """
-    made = folder / f"{LOCK}.new"
-    descriptor = os.open(made, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    new_path = folder / f"{LOCK}.new"
+    descriptor = os.open(new_path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
     fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    made.rename(folder / LOCK)
+    new_path.rename(folder / LOCK)
     return descriptor
 
 
@@ -48,7 +48,7 @@ def clear(base: Path, prefix: str) -> list[Path]:
         prefix: Prefix of the folder names. A folder without a lock is not removed: it has a different owner, or is just
             being created.
     """
-    cleared = []
+    clear_paths = []
     for folder in base.glob(f"{prefix}*"):
         with contextlib.suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
@@ -57,7 +57,7 @@ def clear(base: Path, prefix: str) -> list[Path]:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while a live process holds the lock
                 shutil.rmtree(folder, ignore_errors=True)
-                cleared.append(folder)
+                clear_paths.append(folder)
             finally:
                 os.close(descriptor)
-    return cleared
+    return clear_paths

@@ -97,15 +97,17 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
             raise MessageError(f"{source}: tensor {name!r} is missing")
         if name not in expected:
             raise MessageError(f"{source}: unexpected tensor {name!r}; expected {', '.join(sorted(expected))}")
-        there, wanted = tensors[name], expected[name]
-        if there.shape != wanted.shape:
-            raise MessageError(f"{source}: tensor {name!r} has shape {there.shape}, expected {tuple(wanted.shape)}")
-        real = np.dtype(wanted.dtype).kind == "f"
+        there, expectation = tensors[name], expected[name]
+        if there.shape != expectation.shape:
+            raise MessageError(
+                f"{source}: tensor {name!r} has shape {there.shape}, expected {tuple(expectation.shape)}"
+            )
+        real = np.dtype(expectation.dtype).kind == "f"
         if there.dtype.kind not in ("f" if real else "iu"):
             expects = "floating point" if real else "integers"
             raise MessageError(f"{source}: tensor {name!r} has type {there.dtype}, expected {expects}")
         with np.errstate(over="ignore"):
-            result[name] = there.astype(wanted.dtype)
+            result[name] = there.astype(expectation.dtype)
         if not (finite := np.isfinite(result[name])).all():
             wrong = finite.size - np.count_nonzero(finite)
             raise MessageError(f"{source}: tensor {name!r} has {wrong} weights that are not finite")

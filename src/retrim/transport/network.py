@@ -35,12 +35,12 @@ class NetworkBus(Bus):
             capacities: Maximum length of a message, by topic [bytes].
             session: Signs messages and decides which are accepted; None to accept all.
         """
-        self._refused, self._fault, self._talk = 0, "", session
+        self._refusals, self._fault, self._talk = 0, "", session
         self._answering: threading.Thread | None = None
         self._over = False
         self._capacities, self._lock = dict(capacities), threading.Lock()
         self._last = dict.fromkeys(capacities, Message(0, b""))
-        self._heard = dict.fromkeys(capacities, (0, 0))  # writer and its version
+        self._versions = dict.fromkeys(capacities, (0, 0))  # writer and its version
         self._me = secrets.randbits(63) + 1
 
     @abc.abstractmethod
@@ -48,9 +48,9 @@ class NetworkBus(Bus):
         """Send a message to the network. This may block, so a process with deadlines must not use such a bus."""
 
     @property
-    def refused(self) -> int:
+    def refusals(self) -> int:
         """Number of messages from outside that were malformed or not signed with the key."""
-        return self._refused + (0 if self._talk is None else self._talk.refused)
+        return self._refusals + (0 if self._talk is None else self._talk.refusals)
 
     @property
     def fault(self) -> str:
@@ -62,7 +62,7 @@ class NetworkBus(Bus):
         check_fits(topic, data, self._capacities)
         with self._lock:
             message = Message(self._last[topic].version + 1, bytes(data))
-            self._last[topic], self._heard[topic] = message, (self._me, message.version)
+            self._last[topic], self._versions[topic] = message, (self._me, message.version)
         self._transmit(topic, message)
 
     def latest(self, topic: str, after: int = 0) -> Message | None:
@@ -72,30 +72,30 @@ class NetworkBus(Bus):
             result = self._last[topic]
         return result if result.version > after else None
 
-    def _received(self, topic: str, frame: bytes) -> None:
+    def _receive(self, topic: str, frame: bytes) -> None:
         """Receive a message from the network, in any thread."""
         head = (HEAD if self._talk is None else SEAL).size
         if self._talk is None and frame.startswith(MARK):
-            self._refused, self._fault = self._refused + 1, MISSING
+            self._refusals, self._fault = self._refusals + 1, MISSING
         elif len(frame) > head + self._capacities[topic]:
-            self._refused += 1
+            self._refusals += 1
         elif self._talk is not None:
             if (result := self._talk.open(topic, frame)) is not None:
                 count, data = result
                 self._take(topic, OTHER, count, data)
         elif len(frame) < head:
-            self._refused += 1
+            self._refusals += 1
         else:
             writer, version = HEAD.unpack_from(frame)
-            before, known = self._heard[topic]
-            if writer != self._me and (writer != before or version > known):
+            before, last_version = self._versions[topic]
+            if writer != self._me and (writer != before or version > last_version):
                 self._take(topic, writer, version, frame[HEAD.size :])
 
     def _take(self, topic: str, writer: int, version: int, data: bytes) -> None:
         if version >= 2**62:
             return
         with self._lock:
-            self._heard[topic] = writer, version
+            self._versions[topic] = writer, version
             self._last[topic] = Message(max(version, self._last[topic].version + 1), data)
 
     def _transmit(self, topic: str, message: Message) -> None:
@@ -131,6 +131,6 @@ class NetworkBus(Bus):
             self._send(self._talk.greeting, due.greeting)
         if due.again:
             with self._lock:
-                mine = [topic for topic, (writer, _) in self._heard.items() if writer == self._me]
+                mine = [topic for topic, (writer, _) in self._versions.items() if writer == self._me]
             for topic in mine:
                 self._transmit(topic, self._last[topic])

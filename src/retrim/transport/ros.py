@@ -65,7 +65,7 @@ class RosBus(NetworkBus):
         )
 
     def _listener(self, topic: str) -> Any:
-        return lambda message: self._received(topic, bytes(message.data))
+        return lambda message: self._receive(topic, bytes(message.data))
 
     def _name(self, topic: str) -> str:
         return f"{self._prefix}/{topic.replace('.', '/')}"

@@ -51,7 +51,7 @@ class Session:
         self.greeting = greeting
         self.fault = ""
         """Reason why messages are refused until the other end is accepted; empty afterwards."""
-        self.refused = 0
+        self.refusals = 0
         """Number of refused messages: forged or repeated."""
         self.pending = threading.Event()
         """Set while a message is due."""
@@ -59,14 +59,14 @@ class Session:
         self._key, self._vehicle, self._me = key, vehicle.encode(), secrets.token_bytes(16)
         self._peer, self._former = NOBODY, set[bytes]()
         self._greet: bytes | None = NOBODY
-        self._greeted: bytes | None = None
+        self._greeting: bytes | None = None
         self._again, self._greetings = False, 0
         self._newest = dict[str, int]()
         self._lock = threading.RLock()
 
     def seal(self, topic: str, count: int, data: bytes) -> bytes:
         """Return a signed message for the other end; the counts of a topic must increase."""
-        return self._sealed(topic, self._peer, count, data)
+        return self._seal(topic, self._peer, count, data)
 
     def open(self, topic: str, frame: bytes) -> tuple[int, bytes] | None:
         """Return the count and payload of a message if it is new, from the other end, and addressed to this end."""
@@ -85,7 +85,7 @@ class Session:
                 self._refuse("")
                 return None
             if receiver != self._me:  # it may be an old message, so its sender must prove that it is running
-                if self._greeted != sender:
+                if self._greeting != sender:
                     self._greet = sender
                     self.pending.set()
                 return None
@@ -105,8 +105,8 @@ class Session:
             self.pending.clear()
             if greet is None:
                 return Due(None, again)
-            self._greeted, self._greetings = greet, self._greetings + 1
-            return Due(self._sealed(self.greeting, greet, self._greetings, b""), again)
+            self._greeting, self._greetings = greet, self._greetings + 1
+            return Due(self._seal(self.greeting, greet, self._greetings, b""), again)
 
     def _meet(self, sender: bytes) -> None:
         """Accept an end that has sent this end's number: it is running, and replaces the previous one."""
@@ -114,16 +114,16 @@ class Session:
             self._former.add(self._peer)
         self._peer, self._newest, self.fault = sender, {}, ""
         self._again = True
-        if self._greeted != sender:
+        if self._greeting != sender:
             self._greet = sender
         self.pending.set()
 
     def _refuse(self, why: str) -> None:
-        self.refused += 1
+        self.refusals += 1
         if self._peer == NOBODY:
             self.fault = why or self.fault
 
-    def _sealed(self, topic: str, receiver: bytes, count: int, data: bytes) -> bytes:
+    def _seal(self, topic: str, receiver: bytes, count: int, data: bytes) -> bytes:
         code = self._code(topic, self._me, receiver, count, data)
         return HEAD.pack(MARK, self._me, receiver, count, code) + data
 

@@ -41,8 +41,8 @@ def read_key(file: Path | None) -> SharedKey | None:
     if file is not None:
         source = f"--key {str(file)[:80]!r}"
         try:
-            with file.open("rb") as opened:
-                secret = opened.read(LONGEST + 2).strip()
+            with file.open("rb") as stream:
+                secret = stream.read(LONGEST + 2).strip()
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or "no such file"
             raise ConfigError(f"{source}: the key cannot be read ({reason}); {MAKING}") from error

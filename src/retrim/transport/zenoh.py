@@ -97,4 +97,4 @@ class ZenohBus(NetworkBus):
         self._publishers[topic].put(frame)
 
     def _listener(self, topic: str) -> Any:
-        return lambda sample: self._received(topic, bytes(sample.payload))
+        return lambda sample: self._receive(topic, bytes(sample.payload))

@@ -120,9 +120,9 @@ def bars(title: str, groups: dict[str, dict[str, list[float]]]) -> "matplotlib.f
             axes.bar(places, means, 0.9 * width, color=color, alpha=0.5, label=method)
             for place, group, result in zip(places, groups.values(), finite, strict=True):
                 axes.plot(np.full(len(result), place), result, "o", color=color, markersize=4)
-                if crashed := len(group.get(method, [])) - len(result):
+                if crashes := len(group.get(method, [])) - len(result):
                     axes.annotate(
-                        f"{crashed} crashed", (place, 0.0), color=color, rotation=90, ha="center", va="bottom"
+                        f"{crashes} crashed", (place, 0.0), color=color, rotation=90, ha="center", va="bottom"
                     )
         axes.set_xticks(np.arange(len(groups)), list(groups), rotation=20 if len(groups) > 4 else 0, ha="center")
         axes.set(ylabel="error [m]")

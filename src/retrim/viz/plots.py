@@ -100,7 +100,7 @@ def save(figure: "matplotlib.figure.Figure", folder: Path, name: str) -> list[Pa
     return paths
 
 
-def _coloured(groups: Sequence[Group[T]]) -> Iterator[tuple[Sequence[T], str, str]]:
+def _colour_groups(groups: Sequence[Group[T]]) -> Iterator[tuple[Sequence[T], str, str]]:
     """Yield the tracks, the colour and the name of each group."""
     for group in groups:
         yield group.tracks, GROUPS[group.colour % len(GROUPS)], group.name
@@ -125,13 +125,13 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
             label=None if i else "new policy takes over",
         )  # fmt: skip
     _marks(axes, sorted({mark for track in every for mark in track.marks}), top)
-    for tracks, color, name in _coloured(groups):
+    for tracks, color, name in _colour_groups(groups):
         for i, track in enumerate(tracks):
             label = f"{name}: single flights" if len(tracks) > 1 and i == 0 else None
             axes.plot(track.t, track.error, color=color, alpha=0.35, linewidth=0.8, label=label)
             if track.crashed:
-                known = np.flatnonzero(np.isfinite(track.error))
-                end = track.t[-1], track.error[known[-1]] if len(known) else 0.0
+                finite_points = np.flatnonzero(np.isfinite(track.error))
+                end = track.t[-1], track.error[finite_points[-1]] if len(finite_points) else 0.0
                 axes.plot(*end, "x", color=color, markersize=10, clip_on=False)
                 axes.annotate("crashed", end, color=color, fontsize=9, ha="right")
         whole = [track for track in tracks if not track.crashed]
@@ -139,8 +139,8 @@ def _errors(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], spans:
             mean, first = np.mean([track.error for track in whole], axis=0), whole[0]
             late = first.t > first.t[-1] - first.last_s
             centimetres = 100 * mean[late].mean()
-            shown = f"{centimetres:.1f}" if centimetres >= 0.05 else "below 0.1"
-            final = f"{shown} cm over the last {first.last_s:g} s"
+            number = f"{centimetres:.1f}" if centimetres >= 0.05 else "below 0.1"
+            final = f"{number} cm over the last {first.last_s:g} s"
             axes.plot(first.t, mean, color=color, linewidth=2.4, label=f"{name}: {final}")
     axes.set(xlabel="time [s]", ylabel="distance from where it should be [m]", ylim=(0, top))
     axes.margins(x=0)
@@ -157,7 +157,7 @@ def _marks(axes: "matplotlib.axes.Axes", marks: Sequence[tuple[float, str]], top
 
 def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tuple[float, float, float]) -> None:
     """Draw the paths to the goal, seen from above."""
-    for tracks, color, name in _coloured(groups):
+    for tracks, color, name in _colour_groups(groups):
         for i, track in enumerate(tracks):
             axes.plot(track.p[:, 0], track.p[:, 1], color=color, alpha=0.35, linewidth=0.9)
             axes.plot(
@@ -180,7 +180,7 @@ def paths(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], goal: tu
 def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.ndarray) -> None:
     """Draw the paths of the last ten seconds over the lap (points x 3), seen from above."""
     axes.plot(lap[:, 0], lap[:, 1], color="#BBBBBB", linewidth=5, label="reference", zorder=1)
-    for tracks, color, name in _coloured(groups):
+    for tracks, color, name in _colour_groups(groups):
         for i, track in enumerate(track for track in tracks if not track.crashed):
             last = track.t >= track.t[-1] - LAPS_S
             axes.plot(
@@ -191,22 +191,22 @@ def laps(axes: "matplotlib.axes.Axes", groups: Sequence[Group[Track]], lap: np.n
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], wanted: np.ndarray) -> None:
-    """Draw image points in the first flight of each group; ``wanted`` (points x 2): those at the goal."""
-    for sightings, color, name in _coloured(groups):
+def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], goal: np.ndarray) -> None:
+    """Draw image points in the first flight of each group; ``goal`` (points x 2): those at the goal."""
+    for sightings, color, name in _colour_groups(groups):
         for sighting in sightings[:1]:
-            seen = np.where(sighting.visible[:, :, None], sighting.pixel, np.nan)
-            for i in range(seen.shape[1]):
-                axes.plot(seen[:, i, 0], seen[:, i, 1], color=color, alpha=0.5, linewidth=0.9)
+            dots = np.where(sighting.visible[:, :, None], sighting.pixel, np.nan)
+            for i in range(dots.shape[1]):
+                axes.plot(dots[:, i, 0], dots[:, i, 1], color=color, alpha=0.5, linewidth=0.9)
                 axes.plot(
-                    seen[-1, i, 0], seen[-1, i, 1], "o", color=color, markersize=7, markeredgecolor="white",
+                    dots[-1, i, 0], dots[-1, i, 1], "o", color=color, markersize=7, markeredgecolor="white",
                     label=None if i else f"{name}, at the end",
                 )  # fmt: skip
-            first = seen[0][sighting.visible[0]]
+            first = dots[0][sighting.visible[0]]
             axes.plot(
                 first[:, 0], first[:, 1], ".", color="#999999", label="at the start" if name == groups[0].name else None
             )
-    axes.plot(wanted[:, 0], wanted[:, 1], "+", color=INK, markersize=14, markeredgewidth=1.6, label="at the target")
+    axes.plot(goal[:, 0], goal[:, 1], "+", color=INK, markersize=14, markeredgewidth=1.6, label="at the target")
     axes.set(xlabel="image, across", ylabel="image, down", title="what the camera saw of the points")
     ticks = (-1.0, -0.5, 0.0, 0.5, 1.0)
     axes.set(xlim=(-1, 1), ylim=(1, -1), xticks=ticks, yticks=ticks, aspect=ASPECT)

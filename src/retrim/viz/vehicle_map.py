@@ -34,20 +34,20 @@ def vehicle_map(
     with sheet((2.9 * across + 0.8, 2.9 * down + 0.6), 9.0, boxed=True) as figure:
         grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
         figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)
-        shown = None
+        image = None
         for axes, (name, values) in zip(grid.flat, errors.items(), strict=False):
-            lost = ~np.isfinite(values)
-            shown = axes.scatter(
-                1000 * lag[~lost],
-                1000 * delay[~lost],
-                c=np.clip(values[~lost], SMALLEST, LARGEST),
+            missing = ~np.isfinite(values)
+            image = axes.scatter(
+                1000 * lag[~missing],
+                1000 * delay[~missing],
+                c=np.clip(values[~missing], SMALLEST, LARGEST),
                 norm=LogNorm(SMALLEST, LARGEST),
                 cmap="viridis_r",
                 s=16,
                 linewidths=0,
             )
-            axes.scatter(1000 * lag[lost], 1000 * delay[lost], color=LOST, marker="x", s=22, linewidths=1.2)
-            axes.set_title(f"{name}: {int(lost.sum())} of {len(values)} lost", fontsize=9, color=INK)
+            axes.scatter(1000 * lag[missing], 1000 * delay[missing], color=LOST, marker="x", s=22, linewidths=1.2)
+            axes.set_title(f"{name}: {int(missing.sum())} of {len(values)} lost", fontsize=9, color=INK)
             axes.set_xscale("log")
             axes.set_xticks([15, 30, 60, 100, 150], ["15", "30", "60", "100", "150"])
             axes.minorticks_off()
@@ -58,7 +58,7 @@ def vehicle_map(
             axes.set_ylabel("delay of commands [ms]")
         for axes in grid.flat[len(errors) :]:
             axes.set_visible(False)
-        if shown is not None:
-            bar = figure.colorbar(shown, ax=grid, shrink=0.8, label=colour)
+        if image is not None:
+            bar = figure.colorbar(image, ax=grid, shrink=0.8, label=colour)
             bar.set_ticks([1e-3, 1e-2, 1e-1, 1.0], labels=["0.001", "0.01", "0.1", "1"])
     return figure

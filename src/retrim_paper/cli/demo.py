@@ -6,7 +6,7 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-from retrim.cli.console import RichReporter, console, show_paths, show_table, started
+from retrim.cli.console import RichReporter, console, report_start, show_paths, show_table
 from retrim.runkit.run import INTERRUPTED, Run
 
 from ..demo import demonstrate
@@ -33,17 +33,17 @@ def demo(
         out: Folder for the policy, results.json and the pictures; by default a new folder under runs/.
     """
 
-    def ordered(stop: threading.Event) -> int:
-        run = started(Run("demo", out, stop=stop))
-        shown = demonstrate(preset, plant, run, RichReporter(), seconds=seconds, starts=starts, seed=seed, slow=slow)
-        if shown is None:
+    def execute(stop: threading.Event) -> int:
+        run = report_start(Run("demo", out, stop=stop))
+        paths = demonstrate(preset, plant, run, RichReporter(), seconds=seconds, starts=starts, seed=seed, slow=slow)
+        if paths is None:
             return INTERRUPTED
-        for table in shown.tables:
+        for table in paths.tables:
             show_table(table)
         console.print(run.watch.sentence())
-        show_paths(shown.pictures)
-        if shown.best in shown.pictures and sys.stdout.isatty():
-            webbrowser.open(shown.best.resolve().as_uri())
+        show_paths(paths.pictures)
+        if paths.best in paths.pictures and sys.stdout.isatty():
+            webbrowser.open(paths.best.resolve().as_uri())
         return run.exit_code
 
-    return ordered
+    return execute

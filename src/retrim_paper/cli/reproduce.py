@@ -7,17 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from retrim.cli.console import RichReporter, show_paths, started
-from retrim.evaluation.cluster import joined
+from retrim.cli.console import RichReporter, report_start, show_paths
+from retrim.evaluation.cluster import join_cluster
 from retrim.runkit.run import Run
 
 from .. import tables
-from ..tables.quick import folder_of, help_of, looked, options_of
+from ..tables.quick import folder_of, help_of, options_of, quick_options
 
-Ordered = Callable[[threading.Event], int]
+Order = Callable[[threading.Event], int]
 
 
-def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable[..., Ordered]:
+def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable[..., Order]:
     """Return a command with a table's options, and with ``out`` and ``on``.
 
     Args:
@@ -26,17 +26,17 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     """
     name, options = make.__name__, options_of(make)
 
-    def command(*, out: Path | None = None, on: str | None = None, **chosen: Any) -> Ordered:
-        def ordered(stop: threading.Event) -> int:
-            (asked, remark), reporter = looked(make, chosen, sys.argv[1:]), RichReporter()
-            folder = out or folder_of(make, quick=bool(chosen.get("quick")))
-            with joined(on, reporter) as executor:
-                run = started(Run(called, folder, stop=stop, remark=remark, executor=executor))
-                make(run, reporter, **asked)
+    def command(*, out: Path | None = None, on: str | None = None, **options: Any) -> Order:
+        def execute(stop: threading.Event) -> int:
+            (request, remark), reporter = quick_options(make, options, sys.argv[1:]), RichReporter()
+            folder = out or folder_of(make, quick=bool(options.get("quick")))
+            with join_cluster(on, reporter) as executor:
+                run = report_start(Run(called, folder, stop=stop, remark=remark, executor=executor))
+                make(run, reporter, **request)
             show_paths(run.pages)
             return run.exit_code
 
-        return ordered
+        return execute
 
     command.__name__ = name
     command.__doc__ = help_of(make)
@@ -45,6 +45,6 @@ def command_of(make: Callable[..., None], called: str = "reproduce") -> Callable
     return command
 
 
-COMMANDS: dict[str, Callable[..., Ordered]] = {make.__name__: command_of(make) for make in tables.MADE} | {
+COMMANDS: dict[str, Callable[..., Order]] = {make.__name__: command_of(make) for make in tables.TABLES} | {
     "all": command_of(tables.everything)
 }

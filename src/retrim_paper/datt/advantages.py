@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from retrim.learn.problem import Outcome
 
 
-class Seen(NamedTuple):
+class Experience(NamedTuple):
     """Samples, with leading axes for steps and environments."""
 
     o: Float[Array, "... o"]
@@ -20,16 +20,18 @@ class Seen(NamedTuple):
     """Outcomes. The reward is scaled by 1 - gamma and includes the expected future reward of a truncated episode."""
 
 
-def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: float) -> Float[Array, "steps envs"]:
+def advantages(
+    experience: Experience, last: Float[Array, " envs"], discount: float, trace: float
+) -> Float[Array, "steps envs"]:
     """Return the generalised advantage estimates (Schulman et al. 2016, Eq. 16).
 
     Args:
-        seen: Samples; an episode that ends at a step does not continue at the next one.
+        experience: Samples; an episode that ends at a step does not continue at the next one.
         last: Values of the states after the last step.
         discount: The discount gamma.
         trace: The parameter lambda.
     """
-    over = seen.outcome.terminated | seen.outcome.truncated
+    over = experience.outcome.terminated | experience.outcome.truncated
 
     def back(carry: Any, row: Any) -> tuple[Any, Array]:
         later, value_later = carry
@@ -38,6 +40,6 @@ def advantages(seen: Seen, last: Float[Array, " envs"], discount: float, trace: 
         advantage = reward + goes_on * value_later - value + goes_on * trace * later
         return (advantage, value), advantage
 
-    rows = (seen.outcome.reward, over, seen.value)
+    rows = (experience.outcome.reward, over, experience.value)
     result: Array = lax.scan(back, (jnp.zeros_like(last), last), rows, reverse=True)[1]
     return result

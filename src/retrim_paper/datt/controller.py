@@ -41,8 +41,8 @@ class DattNet(eqx.Module):
     def of(cls, *, key: Key[Array, ""], width: int = 64) -> "DattNet":
         """Return a fresh network; its mean action is nearly zero, which is hover."""
         k_first, k_second, k_actor, k_critic = random.split(key, 4)
-        seen = OWN + 8 * (AHEAD - 4)
-        actor = eqx.nn.MLP(seen, 4, width, 3, key=k_actor)
+        features = OWN + 8 * (AHEAD - 4)
+        actor = eqx.nn.MLP(features, 4, width, 3, key=k_actor)
         actor = eqx.tree_at(lambda m: m.layers[-1].weight, actor, 0.01 * actor.layers[-1].weight)
         actor = eqx.tree_at(lambda m: m.layers[-1].bias, actor, jnp.zeros(4))
         return cls(
@@ -51,15 +51,15 @@ class DattNet(eqx.Module):
             random.normal(k_second, (3, 8, 8)) / 24.0**0.5,
             jnp.zeros(8),
             actor,
-            eqx.nn.MLP(seen, "scalar", width, 3, key=k_critic),
+            eqx.nn.MLP(features, "scalar", width, 3, key=k_critic),
             jnp.full(4, -0.5, dtype=actor.layers[-1].bias.dtype),  # a weak type would compile the first update twice
         )
 
     def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, "4"], Float[Array, ""]]:
         """Return the mean action and the value for an observation from :func:`datt_observation`."""
         ahead = jax.nn.relu(_along(o[OWN:].reshape(AHEAD, 3), self.first, self.first_bias))
-        seen = jnp.concatenate([o[:OWN], _along(ahead, self.second, self.second_bias).reshape(-1)])
-        return self.actor(seen), self.critic(seen)
+        features = jnp.concatenate([o[:OWN], _along(ahead, self.second, self.second_bias).reshape(-1)])
+        return self.actor(features), self.critic(features)
 
 
 def _along(points: Float[Array, "n i"], kernel: Float[Array, "k i c"], bias: Float[Array, " c"]) -> Float[Array, "m c"]:
@@ -67,10 +67,10 @@ def _along(points: Float[Array, "n i"], kernel: Float[Array, "k i c"], bias: Flo
     n, i = points.shape
     k, _, c = kernel.shape
     m = n - k + 1
-    banded = jnp.zeros((n, i, m, c), dtype=kernel.dtype)
+    bands = jnp.zeros((n, i, m, c), dtype=kernel.dtype)
     for at in range(m):
-        banded = banded.at[at : at + k, :, at].set(kernel)
-    return (points.reshape(-1) @ banded.reshape(n * i, m * c)).reshape(m, c) + bias[None]
+        bands = bands.at[at : at + k, :, at].set(kernel)
+    return (points.reshape(-1) @ bands.reshape(n * i, m * c)).reshape(m, c) + bias[None]
 
 
 def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Float[Array, "n 3"]) -> Float[Array, " o"]:
@@ -82,16 +82,16 @@ def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Flo
         d: Disturbance, world frame [m/s^2].
         ahead: Reference positions now and at the times ahead, world frame [m].
     """
-    seen = (x.p[None] - ahead) @ x.R
+    features = (x.p[None] - ahead) @ x.R
     acts = (acting.vector() - Command.hover().vector().astype(x.p.dtype)) / jnp.array(SCALE, dtype=x.p.dtype)
-    return jnp.concatenate([seen[0], x.v @ x.R, x.R.reshape(9), d @ x.R, acts, seen.reshape(-1)])
+    return jnp.concatenate([features[0], x.v @ x.R, x.R.reshape(9), d @ x.R, acts, features.reshape(-1)])
 
 
 def datt_command(action: Float[Array, "4"], low: Command, high: Command) -> Command:
     """Return the command for an action, clipped to the limits; a zero action is hover."""
     hover = jnp.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0], dtype=action.dtype)
-    wanted = hover + jnp.array(SCALE, dtype=action.dtype) * action
-    return Command.of(wanted).within(low, high)
+    command = hover + jnp.array(SCALE, dtype=action.dtype) * action
+    return Command.of(command).within(low, high)
 
 
 class DattState(eqx.Module):

@@ -11,7 +11,7 @@ from retrim.estimation.l1 import L1Estimator
 from retrim.runtime.pilot import ControllerPilot, Pilot
 
 from .controller import DattController, DattNet
-from .problem import KNOWN
+from .problem import MAX_DISTURBANCE
 
 ESTIMATOR = 0.5  # [s], time constant of the filter; the DATT authors use 2 s
 
@@ -25,7 +25,7 @@ def datt_of(setup: Setup, net: DattNet) -> DattController:
         setup.flight_task,
         prediction_of(setup),
         estimator,
-        jnp.array(KNOWN),
+        jnp.array(MAX_DISTURBANCE),
         vehicle.command_min,
         vehicle.command_max,
     )

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from retrim.learn.problem import Problem
 
-from .advantages import Seen, advantages
+from .advantages import Experience, advantages
 
 
 @runtime_checkable
@@ -124,9 +124,9 @@ def update(
 ) -> tuple[PpoState, dict[str, Float[Array, ""]]]:
     """Step the environments and make one update from the samples."""
     k_next, k_roll, k_epochs = random.split(state.key, 3)
-    envs, seen, last, reward = _rolled(problem, state.net, state.envs, k_roll, settings)
-    advantage = advantages(seen, last, settings.discount, settings.trace)
-    samples = (seen, advantage, advantage + seen.value)
+    envs, experience, last, reward = _roll_out(problem, state.net, state.envs, k_roll, settings)
+    advantage = advantages(experience, last, settings.discount, settings.trace)
+    samples = (experience, advantage, advantage + experience.value)
     size = settings.envs * settings.steps
     flat = jax.tree.map(lambda leaf: leaf.reshape(size, *leaf.shape[2:]), samples)
     arrays, fixed = eqx.partition(state.net, eqx.is_inexact_array)
@@ -151,16 +151,16 @@ def update(
 
 def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Float[Array, " a"]) -> Float[Array, ""]:
     """Return the log-density of an action that is normally distributed around ``mean``."""
-    scaled = (action - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * scaled * scaled - log_std) - 0.5 * action.shape[0] * jnp.log(2.0 * jnp.pi)
+    scaling = (action - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * scaling * scaling - log_std) - 0.5 * action.shape[0] * jnp.log(2.0 * jnp.pi)
 
 
-def _rolled(
+def _roll_out(
     problem: Problem[Any], net: Any, envs: Any, key: Key[Array, ""], settings: PpoSettings
-) -> tuple[Any, Seen, Float[Array, " envs"], Float[Array, ""]]:
+) -> tuple[Any, Experience, Float[Array, " envs"], Float[Array, ""]]:
     """Step all environments; when an episode ends, its environment begins a new one."""
 
-    def one(s: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Seen, Array]]:
+    def one(s: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Experience, Array]]:
         k_see, k_act, k_step, k_new, k_after = random.split(key, 5)
         o = problem.observe(s, k_see)
         mean, value = net(o)
@@ -171,28 +171,28 @@ def _rolled(
         reward = (1.0 - settings.discount) * outcome.reward + jnp.where(cut, beyond, 0.0)
         over, fresh = outcome.terminated | outcome.truncated, problem.reset(k_new)
         s = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after)
-        seen = Seen(o, action, log_prob(action, mean, net.log_std), value, outcome._replace(reward=reward))
-        return s, (seen, outcome.reward)
+        experience = Experience(o, action, log_prob(action, mean, net.log_std), value, outcome._replace(reward=reward))
+        return s, (experience, outcome.reward)
 
-    def step(envs: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Seen, Array]]:
+    def step(envs: Any, key: Key[Array, ""]) -> tuple[Any, tuple[Experience, Array]]:
         return jax.vmap(one)(envs, random.split(key, settings.envs))
 
     k_steps, k_last = random.split(key)
-    envs, (seen, rewards) = lax.scan(step, envs, random.split(k_steps, settings.steps))
+    envs, (experience, rewards) = lax.scan(step, envs, random.split(k_steps, settings.steps))
     last = jax.vmap(lambda s, k: net(problem.observe(s, k))[1])(envs, random.split(k_last, settings.envs))
-    return envs, seen, last, jnp.mean(rewards)
+    return envs, experience, last, jnp.mean(rewards)
 
 
 def _loss(arrays: Any, fixed: Any, batch: Any, settings: PpoSettings) -> tuple[Array, dict[str, Array]]:
     """Return the loss, which contains the negative clipped objective, and statistics."""
-    net, (seen, advantage, target) = eqx.combine(arrays, fixed), batch
+    net, (experience, advantage, target) = eqx.combine(arrays, fixed), batch
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-    mean, value = jax.vmap(net)(seen.o)
-    now = jax.vmap(log_prob, in_axes=(0, 0, None))(seen.action, mean, net.log_std)
-    ratio = jnp.exp(now - seen.log_prob)
-    kept = jnp.clip(ratio, 1.0 - settings.clip, 1.0 + settings.clip)
-    gain = jnp.mean(jnp.minimum(ratio * advantage, kept * advantage))
-    missed = jnp.mean((value - target) ** 2)
+    mean, value = jax.vmap(net)(experience.o)
+    now = jax.vmap(log_prob, in_axes=(0, 0, None))(experience.action, mean, net.log_std)
+    ratio = jnp.exp(now - experience.log_prob)
+    clipped_ratio = jnp.clip(ratio, 1.0 - settings.clip, 1.0 + settings.clip)
+    gain = jnp.mean(jnp.minimum(ratio * advantage, clipped_ratio * advantage))
+    value_error = jnp.mean((value - target) ** 2)
     entropy = jnp.sum(net.log_std)
-    loss = -gain + settings.value_cost * missed - settings.entropy_gain * entropy
-    return loss, {"loss": loss, "clipped": jnp.mean(jnp.abs(ratio - 1.0) > settings.clip), "missed": missed}
+    loss = -gain + settings.value_cost * value_error - settings.entropy_gain * entropy
+    return loss, {"loss": loss, "clipped": jnp.mean(jnp.abs(ratio - 1.0) > settings.clip), "missed": value_error}

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from retrim.learn.problem import Outcome
 from retrim.physics import so3
-from retrim.physics.actuators import lagged
+from retrim.physics.actuators import apply_lag
 from retrim.physics.dynamics import PointMass
 from retrim.physics.state import Command, State
 
@@ -20,7 +20,7 @@ EPISODE = 10.0  # [s]
 TICK = 0.02  # [s], tick for WALK and DISCOUNT; for a different tick they are scaled to the same effect per second
 WALK = 0.02  # [m/s^2], standard deviation of a disturbance step, per axis
 DISCOUNT = 0.99
-KNOWN = 1.0  # [m/s^2], largest disturbance per axis
+MAX_DISTURBANCE = 1.0  # [m/s^2], largest disturbance per axis
 
 
 class DattEnv(NamedTuple):
@@ -55,7 +55,7 @@ class DattProblem(eqx.Module):
         tilt = jnp.append(0.3 * random.uniform(k_a, (2,), minval=-1.0, maxval=1.0), 0.0)
         R = so3.rotz(0.5 * random.normal(k_yaw, ())) @ so3.exp(tilt)
         x = State(p, R, 0.3 * random.normal(k_v, (3,)))
-        d = random.uniform(k_d, (3,), minval=-KNOWN, maxval=KNOWN)
+        d = random.uniform(k_d, (3,), minval=-MAX_DISTURBANCE, maxval=MAX_DISTURBANCE)
         return DattEnv(x, Command.hover(p.dtype), d, number, jnp.array(0))
 
     def observe(self, s: DattEnv, key: Key[Array, ""]) -> Float[Array, " o"]:
@@ -67,18 +67,20 @@ class DattProblem(eqx.Module):
 
     def step(self, s: DattEnv, action: Float[Array, "4"], key: Key[Array, ""]) -> tuple[DattEnv, Outcome]:
         """Fly one tick; as in DATT, the reward is -(distance + half the heading + a tenth of the speed)."""
-        mean, acting = lagged(s.acting, datt_command(action, self.low, self.high), self.dt, self.tau)
+        mean, acting = apply_lag(s.acting, datt_command(action, self.low, self.high), self.dt, self.tau)
         x = PointMass(self.dt).step(s.x, mean, s.d)
         walk = WALK * (self.dt / TICK) ** 0.5
-        d = jnp.clip(s.d + walk * random.normal(key, (3,), s.d.dtype), -KNOWN, KNOWN)
+        d = jnp.clip(s.d + walk * random.normal(key, (3,), s.d.dtype), -MAX_DISTURBANCE, MAX_DISTURBANCE)
         after = DattEnv(x, acting, d, s.reference, s.tick + 1)
         away = jnp.sqrt(jnp.sum((x.p - self.bank[s.reference, s.tick + 1]) ** 2) + 1e-12)
         heading = jnp.arctan2(x.R[1, 0], x.R[0, 0])
         speed = jnp.sqrt(jnp.sum(x.v * x.v) + 1e-12)
         reward = -(jnp.minimum(away, 5.0) + 0.5 * jnp.abs(heading) + 0.1 * jnp.minimum(speed, 1.0))
-        lost = away > 5.0
-        reward = jnp.where(lost, reward / (1.0 - discount(self.dt)), reward)  # as if the vehicle stayed there for ever
-        return after, Outcome(reward, lost, after.tick >= ticks_of(self.dt))
+        is_lost = away > 5.0
+        reward = jnp.where(
+            is_lost, reward / (1.0 - discount(self.dt)), reward
+        )  # as if the vehicle stayed there for ever
+        return after, Outcome(reward, is_lost, after.tick >= ticks_of(self.dt))
 
 
 def discount(dt: float) -> float:
@@ -139,6 +141,6 @@ def _lissajous(draw: np.random.Generator, t: np.ndarray) -> np.ndarray:
     period, phase = draw.uniform(2.5, 6.0), draw.uniform(0.0, 2.0 * np.pi, 3)
     size = draw.uniform(0.2, 1.0, 3) * np.array([1.5, 1.5, 0.3])
     beats = np.array([1.0, draw.integers(1, 3), 1.0])
-    eased = np.where(t < 2.0, t**2 / 4.0, t - 1.0)
-    path: np.ndarray = size * (np.sin(2.0 * np.pi * np.outer(eased, beats) / period + phase) - np.sin(phase))
+    clock = np.where(t < 2.0, t**2 / 4.0, t - 1.0)
+    path: np.ndarray = size * (np.sin(2.0 * np.pi * np.outer(clock, beats) / period + phase) - np.sin(phase))
     return path

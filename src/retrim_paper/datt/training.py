@@ -75,7 +75,7 @@ def train_datt(
         steps: Number of training steps.
     """
     setup, nets = Setup.from_preset(preset), dict[int, DattNet]()
-    store = Store(run.trained, reporter=reporter, stop=run.stop)
+    store = Store(run.policy_folder, reporter=reporter, stop=run.stop)
     tau = float(prediction_of(setup).path.response.rate_lag[0])
     about = {"steps": str(steps), "dt": str(preset.dt), "tau": f"{tau:.4f}", "vehicle": str(preset.vehicle)}
     name = section_key(datt=about, precision=str(setup.vehicle.mass.dtype))
@@ -86,11 +86,11 @@ def train_datt(
         k_net, k_learn = random.split(random.fold_in(random.key(seed), DATT_TAG))
         net: DattNet = eqx.filter_jit(DattNet.of)(key=k_net)
         make = partial(_train, setup, net, k_learn, seed, steps, store, f"{key}_state", run, reporter)
-        trained = store.get_or_make(key, make, tree_codec(net, "datt", about))
-        if trained is None:
+        trained_policy = store.get_or_make(key, make, tree_codec(net, "datt", about))
+        if trained_policy is None:
             break
         store.remove(f"{key}_state", tree_codec(net, "ppo"))
-        nets[seed] = trained
+        nets[seed] = trained_policy
     return nets
 
 
@@ -120,20 +120,20 @@ def _train(
         state = stored
         reporter.say(f"{title}: goes on after {int(state.made)} of {updates} updates")
     with run.interruptible(), reporter.progress(f"{title}, {steps:,} steps") as advance:
-        written = time.monotonic()
-        for after, told in ppo(problem, state, settings, steps=steps):
+        last_write = time.monotonic()
+        for after, figures in ppo(problem, state, settings, steps=steps):
             state = after
-            advance(int(state.made) / updates, f"reward {told['reward']:.3f}")
+            advance(int(state.made) / updates, f"reward {figures['reward']:.3f}")
             if run.interrupted:
                 break
-            if time.monotonic() - written > STATE_EVERY:
+            if time.monotonic() - last_write > STATE_EVERY:
                 store.put(key, state, codec)
-                written = time.monotonic()
+                last_write = time.monotonic()
     if run.interrupted:
         store.put(key, state, codec)
         return None
-    trained: DattNet = state.net
-    return trained
+    trained_policy: DattNet = state.net
+    return trained_policy
 
 
 RIVALS = {"datt": train_datt}

@@ -82,9 +82,9 @@ def _layers() -> tuple[Any, ...]:
 def _linear(layer: Any) -> eqx.nn.Linear:
     n_out, n_in = layer.weights.shape
     fresh = eqx.nn.Linear(n_in, n_out, key=random.key(0))
-    given = jnp.asarray(layer.weights, dtype=float), jnp.asarray(layer.biases, dtype=float).reshape(-1)
-    made: eqx.nn.Linear = eqx.tree_at(lambda linear: (linear.weight, linear.bias), fresh, given)
-    return made
+    weights = jnp.asarray(layer.weights, dtype=float), jnp.asarray(layer.biases, dtype=float).reshape(-1)
+    linear_layer: eqx.nn.Linear = eqx.tree_at(lambda linear: (linear.weight, linear.bias), fresh, weights)
+    return linear_layer
 
 
 class RaptorState(eqx.Module):
@@ -130,14 +130,14 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
 
     def substep(self, s: RaptorState, u: Command, effects: ExternalEffects) -> RaptorState:
         """Advance by one millisecond; every tenth one begins with a decision."""
-        action, hidden = lax.cond(s.ms % PERIOD == 0, lambda: self._decided(s), lambda: (s.action, s.hidden))
+        action, hidden = lax.cond(s.ms % PERIOD == 0, lambda: self._decide(s), lambda: (s.action, s.hidden))
         vehicle = self.base.vehicle
         throttle = 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0)[jnp.array(ORDER)]
         speeds = vehicle.motor_min + throttle * (vehicle.motor_max - vehicle.motor_min)
-        flown = BemQuadrotor(vehicle, CommandedSpeeds(speeds, self.base.loop.thrust_map), self.base.dt)
-        return RaptorState(flown.substep(s.body, u, effects), hidden, action, s.ms + 1)
+        model_at_speeds = BemQuadrotor(vehicle, CommandedSpeeds(speeds, self.base.loop.thrust_map), self.base.dt)
+        return RaptorState(model_at_speeds.substep(s.body, u, effects), hidden, action, s.ms + 1)
 
-    def _decided(self, s: RaptorState) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:
+    def _decide(self, s: RaptorState) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:
         body, x = s.body.body, self.state(s)
         goal = self.setpoint(SUBSTEP * s.ms.astype(x.p.dtype))
         facing = so3.rotz(goal.heading).T

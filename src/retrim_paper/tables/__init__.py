@@ -20,7 +20,7 @@ from .tuning import tuning as tuning
 from .vision import vision as vision
 from .where_learning_pays import where_learning_pays as where_learning_pays
 
-MADE = (
+TABLES = (
     hover, reversing, track, phase, vision, plants, model, fast, ablation, design, efficiency, transfer, raptor,
     buses, tuning, scaling, where_learning_pays,
 )  # fmt: skip

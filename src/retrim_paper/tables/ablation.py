@@ -67,18 +67,18 @@ def ablation(
                 table="ablation", preset=dump(preset), lever=lever.label, method=lever.method, seeds=list(seeds),
                 seconds=seconds, starts=starts,
             )  # fmt: skip
-            made = run.store(reporter).get_or_make(
+            section = run.store(reporter).get_or_make(
                 f"{PARTS}/{key}",
                 partial(_fly, name, preset, lever, task, studies, document, starts=starts, seconds=seconds),
                 section_codec(run.folder),
                 on_reuse=partial(run.reuse, f"{name}: {lever.label.strip('*')}", reporter),
                 on_store=partial(clear_flights, run),
             )
-            if made is None:
+            if section is None:
                 break
             if not run.interrupted:
-                lines += made[0].rows
-            result += made[1]
+                lines += section[0].rows
+            result += section[1]
         columns = tuple(
             each if reference is None else f"{reference}, {each}"
             for reference in REFERENCES[task]
@@ -109,7 +109,7 @@ def _fly(
         methods = (lever.method,)
         flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds)
         for scenario in scenarios:
-            group = [flight for flight in flights.flown if flight.spec.scenario == scenario]
+            group = [flight for flight in flights.flights if flight.spec.scenario == scenario]
             if group:
                 result.append(_row(group, preset.name, lever))
                 cells.append(cell(result[-1], digits=4))

@@ -14,7 +14,7 @@ from retrim.transport.bus import Bus
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
 
-from ..latency import COUNT, EVERY, SIZES, TOPICS, free_port, measured, other_process, rosmaster, two_machines
+from ..latency import COUNT, EVERY, SIZES, TOPICS, free_port, measure_latencies, other_process, rosmaster, two_machines
 
 INTRO = (
     "Made by `retrim reproduce buses`. One way, from the call in one process to the bytes in another, by the clock "
@@ -35,7 +35,7 @@ def buses(run: Run, reporter: Reporter) -> None:
     rows: list[dict[str, Any]] = []
     bus = SharedMemoryBus.create(TOPICS)
     try:
-        rows += _timed("shared memory", bus, other_process(str(bus.folder)), run, reporter)
+        rows += _time_bus("shared memory", bus, other_process(str(bus.folder)), run, reporter)
     finally:
         bus.remove()
     if find_spec("zenoh") is not None:
@@ -63,17 +63,17 @@ def buses(run: Run, reporter: Reporter) -> None:
 def _network(name: str, address: Address, inside: Sequence[str], run: Run, reporter: Reporter) -> list[dict[str, Any]]:
     where = f"{address.kind}:{address.host}:{address.port}"
     with closing(address.join(TOPICS, listen=True)) as bus:
-        return _timed(name, bus, [*inside, *other_process(where)], run, reporter)
+        return _time_bus(name, bus, [*inside, *other_process(where)], run, reporter)
 
 
-def _timed(name: str, bus: Bus, words: Sequence[str], run: Run, reporter: Reporter) -> list[dict[str, Any]]:
+def _time_bus(name: str, bus: Bus, words: Sequence[str], run: Run, reporter: Reporter) -> list[dict[str, Any]]:
     rows = []
     with reporter.progress(name) as advance:
         for i, (message, size) in enumerate(SIZES.items()):
             if run.interrupted:
                 break
             advance(i / len(SIZES), message)
-            took = 1e3 * np.array(measured(bus, words, size))
+            took = 1e3 * np.array(measure_latencies(bus, words, size))
             if len(took):
                 p50, p99 = np.percentile(took, (50, 99))
                 quantiles = {"p50_ms": float(p50), "p99_ms": float(p99), "max_ms": float(took.max())}

@@ -12,7 +12,7 @@ from retrim.evaluation.metrics import mean_and_deviation
 from retrim.evaluation.study import table_presets, train_all
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import FlightSpec
-from retrim.runkit.flying import scored, until_terminated
+from retrim.runkit.flying import cut_at_termination, score_flight
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 
@@ -27,9 +27,9 @@ from ..design import (
     ROLLOUT_S,
     ROLLOUTS,
     SCORED_S,
-    retrained,
+    retrain,
 )
-from ..design import flown as fly_as_it_is
+from ..design import fly_batch_of_policy as fly_as_it_is
 
 PAPER = "the paper: low fidelity trains about twice as fast at a comparable error; res-back costs about 30 % more time"
 COLUMNS = ("model", "time of an epoch [ms]", "beside the first", "compiling [s]", "residual left [m/s²]", "error [m]")
@@ -54,7 +54,7 @@ def design(
         starts: Scored flights per seed.
         epochs: Re-training epochs; a multiple of ten.
     """
-    (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=SCORED_S)
+    (base,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=SCORED_S)
     if epochs < CHUNK or epochs % CHUNK:
         raise ConfigError(f"--epochs {epochs} must be a positive multiple of {CHUNK}")
     intro = (
@@ -67,9 +67,9 @@ def design(
         "drag and rate controller at 1 kHz; its gradient is its own, or that of the point mass."
     )
     document = Document(run, "design", "Design study (Sec. IV-C of the paper)", intro, seeds, reporter)
-    study = train_all(loaded, seeds, run, reporter)
+    study = train_all(base, seeds, run, reporter)
     rows: list[dict[str, Any]] = []
-    setup = Setup.from_preset(loaded)
+    setup = Setup.from_preset(base)
     with run.interruptible(), reporter.progress("re-training") as advance:
         for seed, policy in study.policies.items() if not run.interrupted else ():
             logs = fly_as_it_is(setup, policy, ROLLOUTS, ROLLOUT_S, 1000 + seed)
@@ -77,13 +77,13 @@ def design(
                 if run.interrupted:
                     break
                 advance(len(rows) / (len(CHOICES) * len(study.policies)), f"{name}, seed {seed}")
-                made = retrained(setup, policy, logs, random.key(seed), choice, epochs=epochs)
+                result = retrain(setup, policy, logs, random.key(seed), choice, epochs=epochs)
                 spec = FlightSpec(Scenario(PUSH, PLANT), "base", 0, seed)
-                landed = fly_as_it_is(setup, made.policy, starts, SCORED_S, seed)
-                flights = [scored(setup, spec, until_terminated(setup.flight_task, log)) for log in landed]
+                flight_logs = fly_as_it_is(setup, result.policy, starts, SCORED_S, seed)
+                flights = [score_flight(setup, spec, cut_at_termination(setup.flight_task, log)) for log in flight_logs]
                 rows.append({
-                    "model": name, "seed": seed, "order": i, "compile_s": made.compile_s, "epoch_s": made.epoch_s,
-                    "residual_rms": made.residual_rms, "errors": [flight.steady for flight in flights],
+                    "model": name, "seed": seed, "order": i, "compile_s": result.compile_s, "epoch_s": result.epoch_s,
+                    "residual_rms": result.residual_rms, "errors": [flight.steady for flight in flights],
                 })  # fmt: skip
     if rows:
         document.add(_section(rows), rows)
@@ -100,13 +100,13 @@ def _section(rows: list[dict[str, Any]]) -> TableSection:
         times = 1e3 * np.concatenate([row["epoch_s"] for row in mine])
         errors = np.concatenate([row["errors"] for row in mine])
         whole = errors[np.isfinite(errors)]
-        crashed = f", {len(errors) - len(whole)} crashed" if len(whole) < len(errors) else ""
+        crashes = f", {len(errors) - len(whole)} crashed" if len(whole) < len(errors) else ""
         lines.append((
             name,
             f"{np.median(times):.1f} ({times.min():.1f} to {times.max():.1f})",
             f"{np.median(times) / (1e3 * first):.2f}",
             f"{max(row['compile_s'] for row in mine):.1f}",
             f"{np.mean([row['residual_rms'] for row in mine]):.3f}",
-            mean_and_deviation(whole) + crashed if len(whole) else "all crashed",
+            mean_and_deviation(whole) + crashes if len(whole) else "all crashed",
         ))  # fmt: skip
     return TableSection(COLUMNS, tuple(lines), "", PAPER[0].upper() + PAPER[1:] + ".")

@@ -53,20 +53,20 @@ def efficiency(
         presets: Presets for hover, to train and time.
         datt_steps: Number of training steps for DATT.
     """
-    loaded = table_presets(presets, "hover", seeds=(0,), starts=1, seconds=1.0)
-    if not loaded:
+    bases = table_presets(presets, "hover", seeds=(0,), starts=1, seconds=1.0)
+    if not bases:
         raise ConfigError("--presets: name at least one preset for hover")
     check_steps(datt_steps)
-    check_period(loaded[0])
+    check_period(bases[0])
     document = Document(run, "efficiency", "What each method costs", INTRO, [0], reporter)
     rows: list[dict[str, Any]] = []
-    for preset in loaded:
+    for preset in bases:
         if run.interrupted:
             break
         setup, watch = Setup.from_preset(preset), Stopwatch()
         policy, losses = train(setup, 0, reporter=reporter, stop=run.stop)
         p, compiling = preset.pretrain, watch.compile_s
-        trained = {
+        training_rows = {
             "method": preset.name, "steps": len(losses) * p.num_envs * p.horizon,
             "training_s": watch.total_s - compiling, "training_compile_s": compiling,
         }  # fmt: skip
@@ -75,9 +75,9 @@ def efficiency(
         reporter.say(f"{preset.name}: timing updates")
         with run.interruptible():
             flies = setup.controller(setup.learner.init(policy, random.key(0)))
-            rows.append({**trained, **updates(setup), "decision_s": decision_s(setup, flies)})
+            rows.append({**training_rows, **updates(setup), "decision_s": decision_s(setup, flies)})
             rows.append({"method": f"{preset.name}, LoRA", **updates(setup, lora=True)})
-    setup = Setup.from_preset(loaded[0])
+    setup = Setup.from_preset(bases[0])
     for name, baseline in BASELINES.items():
         if run.interrupted:
             break
@@ -87,7 +87,7 @@ def efficiency(
         watch = Stopwatch()
         with tempfile.TemporaryDirectory() as folder:  # always trained anew, even if the run's folder has the network
             afresh = Run("efficiency", Path(folder), stop=run.stop)
-            nets: dict[int, DattNet] = train_datt(loaded[0], [0], afresh, reporter, steps=datt_steps)
+            nets: dict[int, DattNet] = train_datt(bases[0], [0], afresh, reporter, steps=datt_steps)
         compiling = watch.compile_s
         if nets:
             rows.append({

@@ -75,7 +75,7 @@ def everything(run: Run, reporter: Reporter, *, quick: bool = False) -> None:
         remark = run.remark if name in QUICK else ""
         row: dict[str, Any] = {"table": name, "what": what, "page": f"{folder}/{name}.md"}
         place = run.folder / folder
-        part = Run("reproduce", place, stop=run.stop, remark=remark, trained=run.folder, executor=run.executor)
+        part = Run("reproduce", place, stop=run.stop, remark=remark, policy_folder=run.folder, executor=run.executor)
         key = f"{PARTS}/{section_key(table=name, options=options)}"
         page = run.folder / row["page"]
         before = store.get(key, TABLE) if page.is_file() else None

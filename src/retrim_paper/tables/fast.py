@@ -46,8 +46,8 @@ def fast(
         starts: Flights per disturbance, method and seed.
         plant: Plant for the flights.
     """
-    (loaded,) = table_presets([preset], "track", seeds=seeds, starts=starts, seconds=seconds)
-    sections = [_section(loaded, reference, plant, methods) for reference in references]
+    (base,) = table_presets([preset], "track", seeds=seeds, starts=starts, seconds=seconds)
+    sections = [_section(base, reference, plant, methods) for reference in references]
     document = Document(run, "fast", "Fast flight", INTRO, seeds, reporter)
     fly_levels(document, sections, starts=starts, seconds=seconds)
 

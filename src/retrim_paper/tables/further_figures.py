@@ -8,16 +8,16 @@ from retrim.evaluation.metrics import metres
 from retrim.runkit.document import TableSection
 
 
-def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[str, str]) -> TableSection:
+def figures_table(rows: Sequence[dict[str, Any]], title: str, levels: Mapping[str, str]) -> TableSection:
     """Return a section's supplementary figures at its last level, with a row per method.
 
     Args:
-        found: Rows of results.
+        rows: Rows of results.
         title: Title of the section.
         levels: Disturbances and their labels.
     """
     level = list(levels)[-1]
-    tracks = any(row.get("behind_s") is not None for row in found)
+    tracks = any(row.get("behind_s") is not None for row in rows)
     columns: dict[str, Callable[[dict[str, Any]], str]] = {
         "95 % interval [m]": lambda row: _interval(row["interval"]),
         "to 5 cm [s]": lambda row: _figure(row["settle_s"], 1),
@@ -28,7 +28,7 @@ def figures_table(found: Sequence[dict[str, Any]], title: str, levels: Mapping[s
     }
     lines = tuple(
         (find_method(row["method"]).label, *(show(row) for show in columns.values()))
-        for row in found
+        for row in rows
         if row["disturbance"] == level
     )
     about = (

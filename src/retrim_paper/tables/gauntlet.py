@@ -101,58 +101,58 @@ def gauntlet(
     if faults and (task != "hover" or sensors != "ideal"):
         raise ConfigError(f"--faults needs a preset for hover and ideal sensors, got {preset!r} and {sensors!r}")
     methods = methods or (FAULT_METHODS if faults else METHODS[task])
-    (loaded,) = table_presets([preset], task, seeds=seeds, starts=starts, seconds=seconds)
-    known = fault_conditions(loaded) if faults else conditions(loaded, sensors)
-    if unknown := [name for name in only if name not in known]:
-        raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(known)}")
-    chosen, left_out = _installed(loaded, {name: known[name] for name in only or known})
-    refuse_misfits(loaded, list(chosen.values()), methods=methods, starts=starts, seconds=seconds)
-    for line in left_out:
+    (base,) = table_presets([preset], task, seeds=seeds, starts=starts, seconds=seconds)
+    all_conditions = fault_conditions(base) if faults else conditions(base, sensors)
+    if unknown := [name for name in only if name not in all_conditions]:
+        raise ConfigError(f"no condition {unknown[0]!r}; there are {', '.join(all_conditions)}")
+    available, unavailable = _select_installed(base, {name: all_conditions[name] for name in only or all_conditions})
+    refuse_misfits(base, list(available.values()), methods=methods, starts=starts, seconds=seconds)
+    for line in unavailable:
         reporter.say(f"left out: {line}")
     name, title = ("faults", "Faults of measurements and vehicle") if faults else ("gauntlet", "The gauntlet")
     intro = (FAULTS_INTRO if faults else INTRO).format(sensors=sensors)
     document = Document(run, name, title, intro, seeds, reporter, data="results")
-    study = train_all(loaded, seeds, run, reporter)
-    home, flown, result = (
-        Setup.from_preset(loaded).flight_task.home(),
+    study = train_all(base, seeds, run, reporter)
+    home, by_condition, result = (
+        Setup.from_preset(base).flight_task.home(),
         dict[str, list[Flight]](),
         list[dict[str, Any]](),
     )
-    names, at_once = list(chosen), max(1, cores() // CORES)
+    names, at_once = list(available), max(1, cores() // CORES)
     for together in (names[n : n + at_once] for n in range(0, len(names), at_once)):
         if run.interrupted:
             break
         reporter.say(f"condition {', '.join(together)}")
-        scenarios = [chosen[name] for name in together]
+        scenarios = [available[name] for name in together]
         try:
-            flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flown
+            flights = fly_all(study, scenarios, run, reporter, methods=methods, starts=starts, seconds=seconds).flights
         except JobError as error:
-            left_out.append(f"{', '.join(together)}: {error}")
+            unavailable.append(f"{', '.join(together)}: {error}")
             continue
         for name, scenario in zip(together, scenarios, strict=True):
             if own := [flight for flight in flights if flight.spec.scenario == scenario]:
-                flown[name] = own
+                by_condition[name] = own
                 result += rows_of(name, own, change_times(scenario.disturbance, home, seconds))
         if result:
             run.write_results(result, seeds=seeds)  # written now, so that a kill loses only running flights
     if result:
         if faults:
-            document.more["promise"] = promise_rows(flown)
+            document.more["promise"] = promise_rows(by_condition)
             document.add(promise_section(document.more["promise"]))
-        document.add(_section(result, methods, flown, document, study.about(), left_out), result)
+        document.add(_section(result, methods, by_condition, document, study.about(), unavailable), result)
     document.write()
     if not run.interrupted:
         clear_flights(run)
 
 
-def _installed(preset: Preset, asked: Mapping[str, Scenario]) -> tuple[dict[str, Scenario], list[str]]:
+def _select_installed(preset: Preset, request: Mapping[str, Scenario]) -> tuple[dict[str, Scenario], list[str]]:
     """Return the conditions whose plants are installed, and a line about each of the others.
 
     Raises:
         PlantError: No condition has an installed plant.
     """
     result, lacking, why = dict[str, Scenario](), list[str](), None
-    for name, scenario in asked.items():
+    for name, scenario in request.items():
         try:
             scenario.make(preset.vehicle, dt=preset.dt)
             result[name] = scenario
@@ -212,29 +212,29 @@ def _recoveries(flight: Flight, changes: Sequence[float], limit: float) -> list[
 
 
 def _section(
-    found: Sequence[dict[str, Any]],
+    results: Sequence[dict[str, Any]],
     methods: Sequence[str],
-    flown: dict[str, list[Flight]],
+    by_condition: dict[str, list[Flight]],
     document: Document,
     about: str,
-    left_out: Sequence[str],
+    unavailable: Sequence[str],
 ) -> TableSection:
-    by = {(row["scenario"], row["method"], row["metric"]): row for row in found}
-    lines, names = list[tuple[str, ...]](), list(flown)
+    by = {(row["scenario"], row["method"], row["metric"]): row for row in results}
+    lines, names = list[tuple[str, ...]](), list(by_condition)
     for name in names:
         for method in methods:
             rows = [by[name, method, metric] for metric in METRICS if (name, method, metric) in by]
             if rows:
-                crashed = f"{rows[0]['crashes']} of {rows[0]['n']}"
-                lines.append((name, find_method(method).label, *map(_cell, rows), crashed))
+                crashes = f"{rows[0]['crashes']} of {rows[0]['n']}"
+                lines.append((name, find_method(method).label, *map(_cell, rows), crashes))
     columns = tuple(f"{metric} {unit}" for metric, unit in METRICS.items())
-    shown = ("late", "peak", "recovery_2cm")
-    values = [[[_value(by.get((name, m, metric))) for m in methods] for name in names] for metric in shown]
-    titles = [f"{metric} {METRICS[metric]}" for metric in shown]
-    drawn = plots.save(heat_map(titles, names, methods, np.array(values)), document.run.folder, document.name)
-    plots.save(_best_and_worst(flown), document.run.folder, f"{document.name}_flights")
-    notes = "".join(f" Left out: {line}" for line in left_out)
-    return TableSection(("condition", "method", *columns, "crashed"), tuple(lines), "", about + notes, drawn[0])
+    metrics = ("late", "peak", "recovery_2cm")
+    values = [[[_value(by.get((name, m, metric))) for m in methods] for name in names] for metric in metrics]
+    titles = [f"{metric} {METRICS[metric]}" for metric in metrics]
+    map_path = plots.save(heat_map(titles, names, methods, np.array(values)), document.run.folder, document.name)
+    plots.save(_best_and_worst(by_condition), document.run.folder, f"{document.name}_flights")
+    notes = "".join(f" Left out: {line}" for line in unavailable)
+    return TableSection(("condition", "method", *columns, "crashed"), tuple(lines), "", about + notes, map_path[0])
 
 
 def _value(row: dict[str, Any] | None) -> float:
@@ -247,13 +247,15 @@ def _cell(row: dict[str, Any]) -> str:
     return f"{value} ({worst})"
 
 
-def _best_and_worst(flown: dict[str, list[Flight]]) -> Any:
+def _best_and_worst(by_condition: dict[str, list[Flight]]) -> Any:
     """Plot all methods' errors from the starts where the last method had its smallest and its largest peak."""
-    last = [(name, f) for name, flights in flown.items() for f in flights if f.spec.method == flights[-1].spec.method]
-    ranked = sorted(last, key=lambda pair: pair[1].peak)
+    last = [
+        (name, f) for name, flights in by_condition.items() for f in flights if f.spec.method == flights[-1].spec.method
+    ]
+    ranking = sorted(last, key=lambda pair: pair[1].peak)
     panels = []
-    for title, (name, flight) in (("best", ranked[0]), ("worst", ranked[-1])):
-        same = [f for f in flown[name] if (f.spec.start, f.spec.seed) == (flight.spec.start, flight.spec.seed)]
+    for title, (name, flight) in (("best", ranking[0]), ("worst", ranking[-1])):
+        same = [f for f in by_condition[name] if (f.spec.start, f.spec.seed) == (flight.spec.start, flight.spec.seed)]
         curves = [Curve(f.log.t, 1000 * f.error, f.spec.method) for f in same]
         panels.append(Panel(f"{title}: {name}, start {flight.spec.start}", "time [s]", "error [mm]", curves))
     return panel_figure("The best and the worst flight", panels, across=2)

@@ -61,12 +61,12 @@ class Scoring:
 
 
 def _hover_scores(flight: Flight) -> dict[str, float]:
-    t, error, lost = flight.log.t, flight.error, flight.log.terminated
+    t, error, is_lost = flight.log.t, flight.error, flight.log.terminated
     return {
-        "error_m": np.inf if lost else float(np.mean(error[t >= PUSHED + AFTER - 1e-6])),
-        "to_10cm_s": recoveries(t, error, [PUSHED], 0.1, terminated=lost)[0],
-        "to_2cm_s": recoveries(t, error, [PUSHED], 0.02, terminated=lost)[0],
-        "peak_m": np.inf if lost else float(np.max(error[t >= PUSHED])),
+        "error_m": np.inf if is_lost else float(np.mean(error[t >= PUSHED + AFTER - 1e-6])),
+        "to_10cm_s": recoveries(t, error, [PUSHED], 0.1, terminated=is_lost)[0],
+        "to_2cm_s": recoveries(t, error, [PUSHED], 0.02, terminated=is_lost)[0],
+        "peak_m": np.inf if is_lost else float(np.max(error[t >= PUSHED])),
     }
 
 
@@ -109,20 +109,20 @@ class Entrant:
 
     preset: str
     method: str
-    told: bool = False
+    knows_vehicle: bool = False
     """Whether the method receives a vehicle file with the true parameters."""
 
     @property
     def label(self) -> str:
         """Name in tables and figures."""
-        return f"{self.method}, vehicle known" if self.told else f"{self.preset} {self.method}"
+        return f"{self.method}, vehicle known" if self.knows_vehicle else f"{self.preset} {self.method}"
 
 
 OPPONENTS = ("base", "base-do", "geometric-i", "indi")
 ENTRANTS: dict[str, tuple[Entrant, ...]] = {
     task: (
         *(Entrant(f"{task}/retrim", method) for method in OPPONENTS),
-        Entrant(f"{task}/retrim", "indi", told=True),
+        Entrant(f"{task}/retrim", "indi", knows_vehicle=True),
         *(Entrant(f"{task}/any", method) for method in ("base", "base-do", "base-id")),
     )
     for task in COURSES
@@ -221,12 +221,12 @@ def _fly(
     """Return the flights of all vehicles by one entrant."""
     scenarios = [_scenario(course, vehicle, sensors) for vehicle in vehicles]
     options: dict[str, Any] = {"methods": (entrant.method,), "starts": starts, "seconds": course.seconds}
-    if not entrant.told:
-        return fly_all(study, scenarios, run, reporter, **options).flown
+    if not entrant.knows_vehicle:
+        return fly_all(study, scenarios, run, reporter, **options).flights
     flights = list[Flight]()
     for vehicle, scenario in zip(vehicles, scenarios, strict=True):  # each vehicle file needs its own set-up
-        told = replace(study, preset=replace(study.preset, vehicle=vehicle.spec))
-        flights += fly_all(told, [scenario], run, reporter, **options).flown
+        informed_study = replace(study, preset=replace(study.preset, vehicle=vehicle.spec))
+        flights += fly_all(informed_study, [scenario], run, reporter, **options).flights
     return flights
 
 
@@ -240,7 +240,7 @@ def _row(
         "course": course.title,
         "preset": entrant.preset,
         "method": entrant.method,
-        "vehicle_known": entrant.told,
+        "vehicle_known": entrant.knows_vehicle,
         "seed": flight.spec.seed,
         "start": flight.spec.start,
         "vehicle": number,
@@ -257,7 +257,7 @@ def _row(
 
 
 def _section(
-    found: Sequence[dict[str, Any]],
+    rows: Sequence[dict[str, Any]],
     entrants: Sequence[Entrant],
     course: Course,
     scoring: Scoring,
@@ -265,22 +265,24 @@ def _section(
     run: Run,
     about: str,
 ) -> TableSection:
-    lines, maps, (coloured, *_) = list[tuple[str, ...]](), dict[str, np.ndarray](), scoring.columns
-    means = coloured.startswith("rms")
+    lines, maps, (colour_metric, *_) = list[tuple[str, ...]](), dict[str, np.ndarray](), scoring.columns
+    means = colour_metric.startswith("rms")
     for entrant in entrants:
-        key = entrant.preset, entrant.method, entrant.told
-        own = [row for row in found if (row["preset"], row["method"], row["vehicle_known"]) == key]
+        key = entrant.preset, entrant.method, entrant.knows_vehicle
+        own = [row for row in rows if (row["preset"], row["method"], row["vehicle_known"]) == key]
         if not own:
             continue
-        lost, label = sum(row["lost"] for row in own), find_method(entrant.method).label
+        is_lost, label = sum(row["lost"] for row in own), find_method(entrant.method).label
         cells = [_quantiles([row[name] for row in own], name) for name in scoring.columns]
-        survived = [row[coloured] for row in own if row[coloured] is not None]
-        cells += [metres(float(np.mean(survived))) if survived else "-"] if means else []
-        known = "known" if entrant.told else "not known"
-        lines.append((f"`{entrant.preset}`", label, known, f"{lost} of {len(own)}", *cells))
+        finite = [row[colour_metric] for row in own if row[colour_metric] is not None]
+        cells += [metres(float(np.mean(finite))) if finite else "-"] if means else []
+        knowledge = "known" if entrant.knows_vehicle else "not known"
+        lines.append((f"`{entrant.preset}`", label, knowledge, f"{is_lost} of {len(own)}", *cells))
         worst = np.full(len(vehicles), -np.inf)
         for row in own:
-            worst[row["vehicle"]] = max(worst[row["vehicle"]], np.inf if row[coloured] is None else row[coloured])
+            worst[row["vehicle"]] = max(
+                worst[row["vehicle"]], np.inf if row[colour_metric] is None else row[colour_metric]
+            )
         maps[entrant.label] = worst
     lag, delay = (np.array([getattr(v, name) for v in vehicles]) for name in ("rate_lag", "delay"))
     picture = plots.save(vehicle_map(course.title, lag, delay, maps, scoring.colour), run.folder, course.stem)[0]
@@ -290,7 +292,7 @@ def _section(
 
 def _quantiles(values: Sequence[float | None], name: str) -> str:
     """Return the median, the 95th percentile and the worst value over all flights."""
-    ranked = np.sort([np.inf if value is None else value for value in values])
-    chosen = [ranked[min(len(ranked) - 1, int(share * len(ranked)))] for share in (0.5, 0.95, 1.0)]
+    ranking = np.sort([np.inf if value is None else value for value in values])
+    quantiles = [ranking[min(len(ranking) - 1, int(share * len(ranking)))] for share in (0.5, 0.95, 1.0)]
     text = metres if name.endswith("_m") else "{:.2f}".format
-    return " / ".join(text(value) if np.isfinite(value) else "∞" for value in chosen)
+    return " / ".join(text(value) if np.isfinite(value) else "∞" for value in quantiles)

@@ -45,7 +45,7 @@ def hover(
         methods: Methods for the policies, and baselines without a policy; baselines fly only with the first preset.
         datt_steps: Number of training steps for DATT, if it is among the methods.
     """
-    loaded = table_presets(presets, "hover", seeds=seeds, starts=starts, seconds=seconds)
+    bases = table_presets(presets, "hover", seeds=seeds, starts=starts, seconds=seconds)
     scenario = Scenario(plant=plant, sensors=sensors)
     intro = (
         f"Made by `retrim reproduce hover`. Steady-state error [m], the mean over the last 2 s of {seconds:g} s:\n"
@@ -60,9 +60,9 @@ def hover(
             preset,
             scenario,
             f"hover_{preset.name.rpartition('/')[2]}",
-            methods if preset is loaded[0] else of_policies(methods),
+            methods if preset is bases[0] else of_policies(methods),
             PAPER,
         )
-        for preset in loaded
+        for preset in bases
     ]
     fly_levels(document, sections, starts=starts, seconds=seconds, datt_steps=datt_steps)

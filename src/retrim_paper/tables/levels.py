@@ -54,7 +54,7 @@ class Levels:
     paper: PaperRows = field(default_factory=dict)
     levels: Mapping[str, str] = field(default_factory=lambda: LEVELS)
     """Disturbances and their labels."""
-    drawn: Sequence[str] = ("base", "full")
+    drawn_methods: Sequence[str] = ("base", "full")
     """Methods in the picture, which shows the last level."""
 
     @property
@@ -97,16 +97,16 @@ def fly_levels(
             methods=list(section.methods), seeds=list(document.seeds), starts=starts, seconds=seconds,
             datt_steps=datt_steps if "datt" in section.methods else 0, files=_files_behind(section),
         )  # fmt: skip
-        made = run.store(reporter).get_or_make(
+        stored_section = run.store(reporter).get_or_make(
             f"{PARTS}/{key}",
             partial(_fly_section, section, studies, document, starts=starts, seconds=seconds, datt_steps=datt_steps),
             section_codec(run.folder),
             on_reuse=partial(run.reuse, section.title, reporter),
             on_store=partial(clear_flights, run),
         )
-        if made is not None:
-            document.add(*made)
-            document.add(figures_table(made[1], section.title, section.levels))
+        if stored_section is not None:
+            document.add(*stored_section)
+            document.add(figures_table(stored_section[1], section.title, section.levels))
         if run.interrupted:
             break
     document.write()
@@ -136,47 +136,51 @@ def _fly_section(
     if key not in studies and trains:
         studies[key] = train_all(section.preset, document.seeds, run, reporter)
     elif key not in studies:  # no method flies a policy, so only the seeds of the study matter
-        untrained = Setup.from_preset(section.preset).new_policy(random.key(0))
-        studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained), ())
+        untrained_policy = Setup.from_preset(section.preset).new_policy(random.key(0))
+        studies[key] = Study(section.preset, dict.fromkeys(document.seeds, untrained_policy), ())
     study = studies[key]
     methods, title = section.methods, section.title
     own = [method for method in methods if method not in RIVALS]
-    flown = []
+    flights_all = []
     if own:
-        flown = fly_all(study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds).flown
+        flights_all = fly_all(
+            study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds
+        ).flights
     for rival in (method for method in methods if method in RIVALS):
         nets = RIVALS[rival](study.preset, tuple(study.policies), run, reporter, steps=datt_steps)
-        trained = Study(study.preset, nets, ())
-        flown += fly_all(
-            trained, section.scenarios, run, reporter, methods=[rival], starts=starts, seconds=seconds
-        ).flown
-    if not flown:
+        policy_study = Study(study.preset, nets, ())
+        flights_all += fly_all(
+            policy_study, section.scenarios, run, reporter, methods=[rival], starts=starts, seconds=seconds
+        ).flights
+    if not flights_all:
         return None
     place = {scenario: i for i, scenario in enumerate(section.scenarios)}
-    flown.sort(key=lambda flight: (place[flight.spec.scenario], methods.index(flight.spec.method)))
-    result = [{**row, "preset": study.preset.name, "section": title} for row in rows(flown)]
-    kinds = [event.kind for flight in flown for event in flight.events]
-    crashed = sum(flight.log.terminated for flight in flown)
+    flights_all.sort(key=lambda flight: (place[flight.spec.scenario], methods.index(flight.spec.method)))
+    result = [{**row, "preset": study.preset.name, "section": title} for row in rows(flights_all)]
+    kinds = [event.kind for flight in flights_all for event in flight.events]
+    crashes = sum(flight.log.terminated for flight in flights_all)
     about = (
         f"{study.about()} The gate admitted {kinds.count('policy')} policies and refused {kinds.count('rejected')}. "
-        f"{crashed} of {len(flown)} flights crashed."
+        f"{crashes} of {len(flights_all)} flights crashed."
     )
     setup = Setup.from_preset(study.preset, section.scenario.reference)
-    first = [f for f in flown if f.spec.seed == flown[0].spec.seed and f.spec.method in section.drawn]
-    drawn = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
+    first = [
+        f for f in flights_all if f.spec.seed == flights_all[0].spec.seed and f.spec.method in section.drawn_methods
+    ]
+    picture_paths = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
     table = level_table(result, methods, section.paper, title, section.levels)
-    return replace(table, about=about, picture=drawn[0] if drawn else None), result
+    return replace(table, about=about, picture=picture_paths[0] if picture_paths else None), result
 
 
 def level_table(
-    found: Sequence[dict[str, Any]],
+    rows: Sequence[dict[str, Any]],
     methods: Sequence[str],
     paper: PaperRows,
     title: str,
     levels: Mapping[str, str] = LEVELS,
 ) -> TableSection:
     """Return results in the paper's layout: methods down, disturbances across, the paper's figures in brackets."""
-    by = {(row["method"], row["disturbance"]): row for row in found}
+    by = {(row["method"], row["disturbance"]): row for row in rows}
     cells = list[tuple[str, ...]]()
     for method in methods:
         ours = [by.get((method, level)) for level in levels]

@@ -19,10 +19,10 @@ from retrim.runkit.run import Run
 from retrim.viz import plots
 from retrim.viz.panels import Curve, Panel, panel_figure
 
-from ..published import GOLDEN_HOVER, Settled, published, settled_rotor
+from ..published import GOLDEN_HOVER, SteadyRotor, compare_published, settled_rotor
 
 DT = 0.02  # [s]
-SHOWN = ("small", "large", "kingfisher")  # vehicles shown; a user may have registered others
+QUADROTORS = ("small", "large", "kingfisher")  # vehicles shown; a user may have registered others
 PUBLISHED_MAP = 1.562522e-6  # [N s^2], thrust map of the 5.1 in rotors (Agilicious)
 
 
@@ -35,8 +35,8 @@ def model(run: Run, reporter: Reporter) -> None:
     """
     reporter.say("computing the curves of the blade-element model")
     panels = [thrust_panel(), drag_panel(), inflow_panel(), rate_panel(), step_panel(), sag_panel()]
-    drawn, _ = plots.save(panel_figure("The plant bem", panels), run.folder, "model")
-    table = published()
+    picture_path, _ = plots.save(panel_figure("The plant bem", panels), run.folder, "model")
+    table = compare_published()
     lines = tuple(
         (
             row["what"],
@@ -49,13 +49,15 @@ def model(run: Run, reporter: Reporter) -> None:
     )
     title = "The blade-element plant beside published figures"
     document = Document(run, "model", title, "Made by `retrim reproduce model`.", [0], reporter)
-    document.add(TableSection(("quantity", "here", "published", "deviation", "source"), lines, picture=drawn), table)
+    document.add(
+        TableSection(("quantity", "here", "published", "deviation", "source"), lines, picture=picture_path), table
+    )
 
 
 def thrust_panel() -> Panel:
     """Plot the 5.1 in rotor's thrust in still air, with the published thrust map."""
     speeds = np.linspace(200.0, 2300.0, 30)
-    ours = np.array([Settled(five_inch(), float(w), 0.0, 0.0).thrust for w in speeds])
+    ours = np.array([SteadyRotor(five_inch(), float(w), 0.0, 0.0).thrust for w in speeds])
     points = np.array(GOLDEN_HOVER)
     return Panel(
         "Hover thrust, 5.1 in rotor",
@@ -104,10 +106,10 @@ def _force(bem: BemQuadrotor, s: BemState, effects: ExternalEffects) -> Float[Ar
 def inflow_panel() -> Panel:
     """Plot the induced velocity against the descent speed, with and without the vortex-ring rule."""
     descents = np.linspace(-6.0, 14.0, 81)
-    ruled, plain = list[float](), list[float]()
+    ring_values, plain = list[float](), list[float]()
     for v in descents:
         _, inflow = settled_rotor(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
-        ruled.append(float(vortex_ring(inflow, jnp.array(float(v)))))
+        ring_values.append(float(vortex_ring(inflow, jnp.array(float(v)))))
         plain.append(float(inflow.v_i))
     spec = np.array([[-4, 5.3631], [-2, 6.5346], [-1, 7.1522], [0, 7.7904], [1, 8.7662], [2, 9.5403], [4, 10.9296]])
     return Panel(
@@ -115,7 +117,7 @@ def inflow_panel() -> Panel:
         "descent [m/s]",
         "induced velocity [m/s]",
         [
-            Curve(descents, np.array(ruled), "with the vortex-ring rule"),
+            Curve(descents, np.array(ring_values), "with the vortex-ring rule"),
             Curve(descents, np.array(plain), "momentum theory alone", dashed=True),
             Curve(spec[:, 0], spec[:, 1], "fine quadrature, bracketing search", marks=True, color=2),
         ],
@@ -125,11 +127,11 @@ def inflow_panel() -> Panel:
 def rate_panel() -> Panel:
     """Plot the roll-rate and yaw-rate responses to a command step."""
     curves = list[Curve]()
-    for name in SHOWN:
+    for name in QUADROTORS:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
         for axis, word in ((0, "roll"), (2, "yaw")):
             u = Command(jnp.array(STANDARD_GRAVITY), 2.0 * jnp.eye(3)[axis])
-            rates = np.asarray(_flown(bem, u, 300).omega)[:, axis]
+            rates = np.asarray(_fly_open_loop(bem, u, 300).omega)[:, axis]
             curves.append(
                 Curve(np.arange(1.0, 301.0), rates / 2.0, f"{name}, {word}", dashed=axis == 2, color=len(curves) // 2)
             )
@@ -139,10 +141,10 @@ def rate_panel() -> Panel:
 def step_panel() -> Panel:
     """Plot the acceleration response to a step in collective thrust."""
     curves = []
-    for name in SHOWN:
+    for name in QUADROTORS:
         bem = BemQuadrotor.of(VEHICLES[name](), DT)
         u = Command(jnp.array(STANDARD_GRAVITY + 5.0), jnp.zeros(3))
-        speeds = np.asarray(_flown(bem, u, 300).x.v)[:, 2]
+        speeds = np.asarray(_fly_open_loop(bem, u, 300).x.v)[:, 2]
         curves.append(Curve(np.arange(2.0, 301.0), np.diff(speeds) / SUBSTEP, name))
     curves.append(Curve(np.array([0.0, 300.0]), np.array([5.0, 5.0]), "commanded", dashed=True))
     return Panel("Step of collective thrust by 5 m/s²", "time [ms]", "vertical acceleration [m/s²]", curves)
@@ -165,7 +167,7 @@ def sag_panel() -> Panel:
 
 
 @eqx.filter_jit
-def _flown(bem: BemQuadrotor, u: Command, steps: int) -> RotorState:
+def _fly_open_loop(bem: BemQuadrotor, u: Command, steps: int) -> RotorState:
     """Return the state after each millisecond, starting from hover."""
     effects = ExternalEffects.calm(jnp.zeros(3).dtype)
 

@@ -79,7 +79,7 @@ def phase(
     fly_levels(document, sections, starts=starts, seconds=seconds)
 
 
-def _check(what: str, names: Sequence[str], known: Mapping[str, Any]) -> None:
+def _check(what: str, names: Sequence[str], options: Mapping[str, Any]) -> None:
     for name in names:
-        if name not in known:
-            raise ConfigError(f"{what} {name!r}: there are {', '.join(known)}")
+        if name not in options:
+            raise ConfigError(f"{what} {name!r}: there are {', '.join(options)}")

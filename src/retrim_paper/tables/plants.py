@@ -75,7 +75,7 @@ def plants(
         seconds: Length of a flight [s].
         starts: Flights per disturbance, method and seed.
     """
-    (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
+    (base,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
     for name in plant:
         PLANTS.find(name)
     own = ", ".join(f"`{name}` flies its {p.own_vehicle}" for name, p in PLANTS.items() if p.own_vehicle)
@@ -87,17 +87,17 @@ def plants(
         f"3.5 % more thrust than commanded, unless the row names another one; {own}."
     )
     document = Document(run, "plants", "Hover in many scenarios, on every plant", intro, seeds, reporter)
-    study = train_all(loaded, seeds, run, reporter)
+    study = train_all(base, seeds, run, reporter)
     for title, scenario, disturbances in groups():
         if scenario.plant not in plant or run.interrupted:
             continue
         scenarios = [replace(scenario, disturbance=name) for name in disturbances]
         try:
-            flown = fly_all(study, scenarios, run, reporter, methods=METHODS, starts=starts, seconds=seconds).flown
+            flights = fly_all(study, scenarios, run, reporter, methods=METHODS, starts=starts, seconds=seconds).flights
         except PlantError as error:
             document.add(TableSection((), (), title, f"Left out: {error}"))
             continue
-        result = [{**row, "group": title} for row in rows(flown)]
+        result = [{**row, "group": title} for row in rows(flights)]
         by = {(row["disturbance"], row["method"]): row for row in result}
         lines = []
         for name in disturbances:

@@ -26,13 +26,13 @@ def promise_rows(flights: Mapping[str, Sequence[Flight]]) -> list[dict[str, Any]
     """
     result = list[dict[str, Any]]()
     for condition, group in flights.items():
-        crashed = {(f.spec.method, f.spec.seed, f.spec.start): f.log.terminated for f in group}
+        crashes = {(f.spec.method, f.spec.seed, f.spec.start): f.log.terminated for f in group}
         bound = FACTOR * min(_steady(group, method) for method in (BASE, OBSERVER)) + MARGIN
         for method in ADAPTING:
             own = [f for f in group if f.spec.method == method]
             if not own:
                 continue
-            worse = sum(f.log.terminated and not crashed.get((BASE, f.spec.seed, f.spec.start), True) for f in own)
+            worse = sum(f.log.terminated and not crashes.get((BASE, f.spec.seed, f.spec.start), True) for f in own)
             steady = _steady(group, method)
             result.append(
                 {
@@ -40,7 +40,7 @@ def promise_rows(flights: Mapping[str, Sequence[Flight]]) -> list[dict[str, Any]
                     "method": method,
                     "n": len(own),
                     "crashes": sum(f.log.terminated for f in own),
-                    "crashes_base": sum(crashed[key] for key in crashed if key[0] == BASE),
+                    "crashes_base": sum(crashes[key] for key in crashes if key[0] == BASE),
                     "crashed_although_base_survived": worse,
                     "steady": steady if np.isfinite(steady) else None,
                     "bound": bound if np.isfinite(bound) else None,

@@ -73,20 +73,22 @@ def folder_of(make: Callable[..., None], *, quick: bool = False) -> Path | None:
     return Path("runs") / f"reproduce-{'all' if whole else make.__name__}{'-quick' * (quick and not whole)}"
 
 
-def looked(make: Callable[..., None], chosen: Mapping[str, Any], words: Sequence[str] = ()) -> tuple[Options, str]:
+def quick_options(
+    make: Callable[..., None], options: Mapping[str, Any], words: Sequence[str] = ()
+) -> tuple[Options, str]:
     """Return a table's options, and a remark about them for its documents.
 
     Args:
         make: Function that makes the table.
-        chosen: Command options; ``quick`` does not change those that differ from their defaults.
+        options: Command options; ``quick`` does not change those that differ from their defaults.
         words: Words of the command line; ``quick`` does not change the options that they name, either.
     """
     if make.__name__ not in QUICK:
-        return dict(chosen), ""
-    asked = {name: value for name, value in chosen.items() if name != "quick"}
-    if not chosen["quick"]:
-        return asked, ""
+        return dict(options), ""
+    request = {name: value for name, value in options.items() if name != "quick"}
+    if not options["quick"]:
+        return request, ""
     defaults = inspect.signature(make).parameters
-    named = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in words if word.startswith("--")}
-    left = {name for name, value in asked.items() if value == defaults[name].default} - named
-    return {**asked, **{name: value for name, value in QUICK[make.__name__].items() if name in left}}, REMARK
+    names = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in words if word.startswith("--")}
+    left = {name for name, value in request.items() if value == defaults[name].default} - names
+    return {**request, **{name: value for name, value in QUICK[make.__name__].items() if name in left}}, REMARK

@@ -60,9 +60,17 @@ def raptor(
             own = with_vehicle(preset, vehicle)
             name = name_of(own.vehicle)
             title, stem = f"{what}, {name}", f"raptor_{what.lower().replace('-', '')}_{name}"
-            drawn = ("raptor", "full")
+            drawn_methods = ("raptor", "full")
             sections.append(
-                Levels(title, own, Scenario(reference=reference), stem, methods, levels=DISTURBED, drawn=drawn)
+                Levels(
+                    title,
+                    own,
+                    Scenario(reference=reference),
+                    stem,
+                    methods,
+                    levels=DISTURBED,
+                    drawn_methods=drawn_methods,
+                )
             )
     document = Document(run, "raptor", "RAPTOR, without re-training", INTRO, seeds, reporter)
     fly_levels(document, sections, starts=starts, seconds=seconds)

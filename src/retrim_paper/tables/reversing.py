@@ -57,32 +57,32 @@ def reversing(
         seconds: Length of a flight [s].
         starts: Flights per method and seed.
     """
-    (loaded,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
+    (base,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=seconds)
     scenario = Scenario("reversing", plant=plant)
     if seconds < 2 * PERIOD:
         raise ConfigError(f"flights of {seconds:g} s: a push that reverses needs at least {2 * PERIOD:g} s")
     document = Document(
         run, "reversing", "Hover under a push that reverses (Sec. IV-B.3 of the paper)", INTRO, seeds, reporter
     )
-    study = train_all(loaded, seeds, run, reporter)
-    flown = fly_all(study, [scenario], run, reporter, methods=tuple(METHODS), starts=starts, seconds=seconds).flown
-    if not flown:
+    study = train_all(base, seeds, run, reporter)
+    flights = fly_all(study, [scenario], run, reporter, methods=tuple(METHODS), starts=starts, seconds=seconds).flights
+    if not flights:
         document.write()
         return
-    moments, updates = _moments(loaded.adapt, seconds)
-    span = min(1.0, loaded.adapt.update_every)
+    moments, updates = _moments(base.adapt, seconds)
+    span = min(1.0, base.adapt.update_every)
     errors: dict[str, list[np.ndarray]] = {
-        m: [_errors(f, moments, span) for f in flown if f.spec.method == m and not f.log.terminated] for m in METHODS
+        m: [_errors(f, moments, span) for f in flights if f.spec.method == m and not f.log.terminated] for m in METHODS
     }
-    result = rows(flown)
+    result = rows(flights)
     peaks = "; ".join(f"{METHODS[row['method']].strip('*')} {_peak(row)}" for row in result)
-    crashed = sum(row["crashes"] for row in result)
+    crashes = sum(row["crashes"] for row in result)
     about = f"{study.about()} Median of the largest error after 5 s [m]: {peaks}. "
-    about += f"{crashed} of {len(flown)} flights crashed."
-    pictured = [f for f in flown if f.spec.method in ("base", "full")]
-    drawn = picture(pictured, Setup.from_preset(loaded), scenario, run.folder)
+    about += f"{crashes} of {len(flights)} flights crashed."
+    drawn_flights = [f for f in flights if f.spec.method in ("base", "full")]
+    picture_path = picture(drawn_flights, Setup.from_preset(base), scenario, run.folder)
     document.more = {"moments_s": moments.tolist(), "errors_m": {m: np.array(e).tolist() for m, e in errors.items()}}
-    document.add(_section(errors, moments, updates, about, drawn[0] if drawn else None), result)
+    document.add(_section(errors, moments, updates, about, picture_path[0] if picture_path else None), result)
     if not run.interrupted:
         clear_flights(run)
 
@@ -114,7 +114,7 @@ def _errors(flight: Flight, moments: np.ndarray, span: float = 1.0) -> np.ndarra
 
 
 def _section(
-    errors: dict[str, list[np.ndarray]], moments: np.ndarray, updates: list[int], about: str, drawn: Path | None
+    errors: dict[str, list[np.ndarray]], moments: np.ndarray, updates: list[int], about: str, picture_path: Path | None
 ) -> TableSection:
     lines = list[tuple[str, ...]]()
     for i, reversal in enumerate(moments[:, 0]):
@@ -125,4 +125,4 @@ def _section(
             cells = cells or ["-"] * moments.shape[1]
             lines.append((f"reversed at {reversal:g} s, {name}", *cells))
     columns_ = ("", "just before it", "before an update takes effect", *(f"after update {i}" for i in updates))
-    return TableSection(columns_, tuple(lines), "", about, drawn)
+    return TableSection(columns_, tuple(lines), "", about, picture_path)

@@ -11,7 +11,7 @@ import numpy as np
 
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
-from retrim.evaluation.batches import LOT
+from retrim.evaluation.batches import FULL
 from retrim.evaluation.executor import report_progress
 from retrim.evaluation.fleet import Fleet
 from retrim.evaluation.limits import check_flights
@@ -57,13 +57,13 @@ def scaling(
             with a load.
         seconds: Length of a flight [s].
     """
-    (loaded,) = table_presets([preset], "hover", seeds=(0,), starts=1, seconds=seconds)
+    (base,) = table_presets([preset], "hover", seeds=(0,), starts=1, seconds=seconds)
     for n in flights or (0,):
         if n < EACH or n % EACH:
             raise ConfigError(f"--flights {n} must be a positive multiple of {EACH}")
         check_flights(n // EACH, seconds)
     scenarios = [Scenario(name) for name in CONDITIONS]
-    refuse_misfits(loaded, scenarios, methods=METHODS, starts=1, seconds=seconds)
+    refuse_misfits(base, scenarios, methods=METHODS, starts=1, seconds=seconds)
     intro = (
         f"Made by `retrim reproduce scaling`: flights of {seconds:g} s on plant `bem` in gusts or "
         "with a load, half of them adapting twice a second, in batches of at most 64 on each core; flights are "
@@ -72,17 +72,17 @@ def scaling(
         "if much was compiled. Memory: the largest memory of the process until then."
     )
     document = Document(run, "scaling", "Flights by the thousand", intro, [0], reporter)
-    study = train_all(loaded, (0,), run, reporter)
+    study = train_all(base, (0,), run, reporter)
     rows, sizes = list[dict[str, Any]](), list[int]()
     for n in flights if study.policies else ():
         if run.interrupted:
             break
-        fleet = Fleet(loaded, study.policies, scenarios, methods=METHODS, starts=n // EACH, seconds=seconds)
+        fleet = Fleet(base, study.policies, scenarios, methods=METHODS, starts=n // EACH, seconds=seconds)
         watch, errors = Stopwatch(), list[float]()
 
         def note(on_result: Sequence[Flight], errors: list[float] = errors) -> None:
             errors += [flight.steady for flight in on_result]
-            sizes.append(len(pickle.dumps(replace(on_result[0], learnt=None))))
+            sizes.append(len(pickle.dumps(replace(on_result[0], learner_state=None))))
 
         with run.interruptible(), reporter.progress(f"{n} flights") as advance:
             fleet.run(
@@ -109,7 +109,7 @@ def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
         bounds = {
             "flying": MANY * per_flight / m,
             "the client's network": MANY * size / LINK,
-            "the scheduler": MANY / LOT * JOB_S,
+            "the scheduler": MANY / FULL * JOB_S,
         }
         most = max(bounds, key=lambda name: bounds[name])
         lines.append((f"{m}", _time(compiling + bounds[most]), most))
@@ -118,7 +118,7 @@ def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
         f"Time = compiling ({compiling:.0f} s, on all machines at once, as measured above) + the largest of: flying "
         f"({1e3 * per_flight:.0f} ms a flight, measured above, divided by the machines); the network of the client, "
         f"who receives {size / 1e3:.0f} kB a flight (measured) at {LINK / 1e6:.0f} MB/s (assumed, a gigabit); the "
-        f"scheduler, at {1e3 * JOB_S:.0f} ms a job of {LOT} flights (assumed). Training, stragglers and lost machines "
+        f"scheduler, at {1e3 * JOB_S:.0f} ms a job of {FULL} flights (assumed). Training, stragglers and lost machines "
         "are left out. Beyond the network's limit more machines do not help: several clients do, each with a part of "
         "the seeds."
     )
@@ -170,7 +170,7 @@ def _section(rows: Sequence[dict[str, Any]], run: Run) -> TableSection:
         ),
         Panel("peak memory", "flights", "MB", [Curve(n, memory, "measured")], log=True),
     ]
-    drawn = save(panel_figure("Flights by the thousand", panels, across=2), run.folder, "scaling")
-    crashed = sum(row["crashes"] for row in rows)
-    about = f"{crashed} of {int(n.sum())} flights crashed."
-    return TableSection(COLUMNS, lines, about=about, picture=drawn[0])
+    picture_path = save(panel_figure("Flights by the thousand", panels, across=2), run.folder, "scaling")
+    crashes = sum(row["crashes"] for row in rows)
+    about = f"{crashes} of {int(n.sum())} flights crashed."
+    return TableSection(COLUMNS, lines, about=about, picture=picture_path[0])

@@ -72,11 +72,11 @@ def track(
         starts: Flights per disturbance, method and seed.
         plant: Plant for the flights.
     """
-    loaded = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
+    bases = table_presets(presets, "track", seeds=seeds, starts=starts, seconds=seconds)
     sections = [
         section
-        for preset in loaded
-        for section in _sections(preset, plant, methods if preset is loaded[0] else of_policies(methods))
+        for preset in bases
+        for section in _sections(preset, plant, methods if preset is bases[0] else of_policies(methods))
     ]
     document = Document(run, "track", "Tracking (Table II of the paper)", INTRO, seeds, reporter)
     fly_levels(document, sections, starts=starts, seconds=seconds, datt_steps=datt_steps)
@@ -88,8 +88,8 @@ def _sections(preset: Preset, plant: str, methods: Sequence[str]) -> list[Levels
     def section(
         title: str, preset: Preset, reference: str, paper: PaperRows, methods: Sequence[str] = methods
     ) -> Levels:
-        trained_on = preset.track.reference.replace("+", "-") if preset.track else ""
-        stem = "_".join(["track", preset.name.rpartition("/")[2], reference, trained_on])
+        training_name = preset.track.reference.replace("+", "-") if preset.track else ""
+        stem = "_".join(["track", preset.name.rpartition("/")[2], reference, training_name])
         return Levels(title, preset, Scenario(plant=plant, reference=reference), stem, methods, paper)
 
     if preset.track is not None and preset.track.looks_ahead:

@@ -17,7 +17,7 @@ quadrotor on the large one (600 g, other rotors, another rate controller's respo
 and the last 10 s of tracking [m]: mean ± standard deviation over flights. No method knows load, fan or vehicle; the
 thrust command is normalised by the mass that the flight controller knows. Learning is charged to flight time by the
 preset's fixed latencies. The paper gives no figures for these flights."""
-FLOWN = ("base", "base-i", "base-do", "geometric-i", "indi", "l1-mpc", "full", "lora")
+ENTRANTS = ("base", "base-i", "base-do", "geometric-i", "indi", "l1-mpc", "full", "lora")
 """The base policy, and methods that compensate for a load or wind."""
 HOVER_LEVELS = {"none": "alone", "payload": "with a load", "fan": "in front of a fan", "payload+fan": "load and fan"}
 TRACK_LEVELS = {"none": "calm air", "wind=4": "wind of 4 m/s"}
@@ -28,7 +28,7 @@ def transfer(
     reporter: Reporter,
     *,
     presets: tuple[str, str] = ("hover/retrim", "track/retrim"),
-    methods: tuple[str, ...] = FLOWN,
+    methods: tuple[str, ...] = ENTRANTS,
     seeds: tuple[int, ...] = (0, 1, 2),
     seconds: float = 30.0,
     starts: int = 8,

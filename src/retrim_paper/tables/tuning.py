@@ -18,7 +18,7 @@ from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.plants.sim import SimPlant
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import FlightSpec
-from retrim.runkit.flying import scored, until_terminated
+from retrim.runkit.flying import cut_at_termination, score_flight
 from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 from retrim.runtime.flight import FlightStopped
@@ -39,7 +39,7 @@ CONDITIONS: dict[Shown, tuple[tuple[str, str, str, str | None], ...]] = {
     ),
 }
 """Conditions by controller input: preset (for the task and the declared lag), disturbance, sensors and reference."""
-SHOWN = {"state": "the measured state", "keypoints": "the pose that a filter estimates from keypoints"}
+VIEWS = {"state": "the measured state", "keypoints": "the pose that a filter estimates from keypoints"}
 CRASH = 1.0  # [m], error assigned to a crashed flight in the score
 SETTLING = 3.0  # [s], initial part of a flight that does not count
 
@@ -80,14 +80,14 @@ def tuning(
     if unknown := [name for name in methods if name not in BASELINES]:
         raise ConfigError(f"{', '.join(unknown)}: no baseline with settings; there are {', '.join(BASELINES)}")
     conditions = CONDITIONS[shown]
-    listed = "; ".join(
-        f"{preset.partition('/')[0]}{f' ({reference})' if reference else ''}, {disturbed}, sensors {sensors}"
-        for preset, disturbed, sensors, reference in conditions
+    lines = "; ".join(
+        f"{preset.partition('/')[0]}{f' ({reference})' if reference else ''}, {disturbance_name}, sensors {sensors}"
+        for preset, disturbance_name, sensors, reference in conditions
     )
     intro = (
         f"Made by `retrim reproduce tuning --shown {shown}`. {candidates} candidates for each method (a third for "
         "MPPI), drawn evenly in the logarithm of each range, and the present settings, fly the small quadrotor on "
-        f"plant `{plant}` by {SHOWN[shown]}, from {starts} starts (seed {seed}) under: {listed}. The score is the root "
+        f"plant `{plant}` by {VIEWS[shown]}, from {starts} starts (seed {seed}) under: {lines}. The score is the root "
         f"mean square of the error after {SETTLING:g} s, the mean over flights [m], a crash counting {CRASH:g} m. No "
         "table flies these conditions, starts or seeds."
     )
@@ -98,34 +98,36 @@ def tuning(
         if run.interrupted:
             break
         baseline = BASELINES[name]
-        tried = [
+        settings_list = [
             dict(baseline.settings_for(setups[0].flight_task)),
-            *_drawn(baseline, -(-candidates // baseline.cost), seed),
+            *_draw_candidates(baseline, -(-candidates // baseline.cost), seed),
         ]
         with contextlib.suppress(FlightStopped), run.interruptible(), reporter.progress(name) as advance:
-            scores = np.zeros(len(tried))
-            for i, (setup, (_, disturbed, sensors, reference)) in enumerate(zip(setups, conditions, strict=True)):
-                scenario = Scenario(disturbed, plant, sensors=sensors, reference=reference)
+            scores = np.zeros(len(settings_list))
+            for i, (setup, (_, disturbance_name, sensors, reference)) in enumerate(
+                zip(setups, conditions, strict=True)
+            ):
+                scenario = Scenario(disturbance_name, plant, sensors=sensors, reference=reference)
                 advance(i / len(conditions), f"condition {i + 1} of {len(conditions)}")
-                result = _flown(
-                    baseline, tried, setup, scenario, starts=starts, seconds=seconds, seed=seed, stop=run.stop
+                result = _fly_candidates(
+                    baseline, settings_list, setup, scenario, starts=starts, seconds=seconds, seed=seed, stop=run.stop
                 )
                 scores += np.array(result) / len(conditions)
-            document.add(_section(name, tried, scores), _rows(name, tried, scores))
+            document.add(_section(name, settings_list, scores), _rows(name, settings_list, scores))
     document.write()
 
 
-def _drawn(baseline: Baseline, n: int, seed: int) -> list[Settings]:
+def _draw_candidates(baseline: Baseline, n: int, seed: int) -> list[Settings]:
     """Return random candidates, which depend only on the baseline, their number and the seed."""
     low, high = np.array(list(baseline.ranges.values())).T
     shares = np.asarray(random.uniform(random.key(seed), (n, len(low))))
-    drawn = low * (high / low) ** shares
-    return [dict(zip(baseline.ranges, row, strict=True)) for row in drawn.tolist()]
+    values = low * (high / low) ** shares
+    return [dict(zip(baseline.ranges, row, strict=True)) for row in values.tolist()]
 
 
-def _flown(
+def _fly_candidates(
     baseline: Baseline,
-    tried: Sequence[Settings],
+    settings_list: Sequence[Settings],
     setup: Setup,
     scenario: Scenario,
     *,
@@ -136,37 +138,37 @@ def _flown(
 ) -> list[float]:
     """Return the score of each candidate; all candidates fly as one batch."""
     specs = [FlightSpec(scenario, "base", start, seed) for start in range(starts)]
-    begun, dt = setup.flight_starts(starts, seed), setup.preset.dt
-    made = [scenario.make("small", dt=dt, seed=spec.plant_seed) for _ in tried for spec in specs]
-    plants = [each for each in made if isinstance(each, SimPlant)]
-    if len(plants) < len(made):
+    start_states, dt = setup.flight_starts(starts, seed), setup.preset.dt
+    all_plants = [scenario.make("small", dt=dt, seed=spec.plant_seed) for _ in settings_list for spec in specs]
+    plants = [each for each in all_plants if isinstance(each, SimPlant)]
+    if len(plants) < len(all_plants):
         raise ConfigError(f"plant {scenario.plant!r}: candidates are flown as one batch, which bem and simple can be")
     pilots = [
         ControllerPilot(
             MethodRequest(setup, None).by_state(baseline.make(baseline_request(setup, spec.key()), settings))
         )
-        for settings in tried
+        for settings in settings_list
         for spec in specs
     ]
-    logs = fly_together(plants, pilots, begun * len(tried), ticks=round(seconds / dt), stop=stop)
-    flights = [scored(setup, specs[0], until_terminated(setup.flight_task, log)) for log in logs]
+    logs = fly_together(plants, pilots, start_states * len(settings_list), ticks=round(seconds / dt), stop=stop)
+    flights = [score_flight(setup, specs[0], cut_at_termination(setup.flight_task, log)) for log in logs]
     errors = [
         CRASH if flight.log.terminated else float(np.sqrt(np.mean(flight.error[flight.log.t > SETTLING] ** 2)))
         for flight in flights
     ]
-    means: list[float] = np.reshape(errors, (len(tried), starts)).mean(axis=1).tolist()
+    means: list[float] = np.reshape(errors, (len(settings_list), starts)).mean(axis=1).tolist()
     return means
 
 
-def _rows(name: str, tried: Sequence[Settings], scores: np.ndarray) -> list[dict[str, Any]]:
-    scored_ones = zip(tried, scores.tolist(), strict=True)
+def _rows(name: str, settings_list: Sequence[Settings], scores: np.ndarray) -> list[dict[str, Any]]:
+    scored_ones = zip(settings_list, scores.tolist(), strict=True)
     return [{"method": name, "settings": dict(settings), "score": score} for settings, score in scored_ones]
 
 
-def _section(name: str, tried: Sequence[Settings], scores: np.ndarray) -> TableSection:
+def _section(name: str, settings_list: Sequence[Settings], scores: np.ndarray) -> TableSection:
     """Return a table of the present settings and the best three."""
     best = [int(i) for i in np.argsort(scores)[:3]]
-    columns = ("settings", *tried[0], "score [m]")
-    shown = [("present", 0), *((f"{'best' if k == 0 else f'{k + 1}.'}", i) for k, i in enumerate(best))]
-    lines = tuple((word, *(f"{v:.3g}" for v in tried[i].values()), f"{scores[i]:.4f}") for word, i in shown)
+    columns = ("settings", *settings_list[0], "score [m]")
+    selection = [("present", 0), *((f"{'best' if k == 0 else f'{k + 1}.'}", i) for k, i in enumerate(best))]
+    lines = tuple((word, *(f"{v:.3g}" for v in settings_list[i].values()), f"{scores[i]:.4f}") for word, i in selection)
     return TableSection(columns, lines, BASELINES[name].label)

@@ -58,19 +58,21 @@ def vision(
         starts: Flights per disturbance, method and seed.
         plant: Plant for the flights.
     """
-    loaded = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
-    if trained := [method for method in methods if method in RIVALS]:
-        raise ConfigError(f"--methods {trained[0]}: it is trained by a measured state; this table has none")
+    bases = table_presets(presets, "vision", seeds=seeds, starts=starts, seconds=seconds)
+    if rival_methods := [method for method in methods if method in RIVALS]:
+        raise ConfigError(f"--methods {rival_methods[0]}: it is trained by a measured state; this table has none")
     document = Document(run, "vision", "Hover from keypoints (Table III of the paper)", INTRO, seeds, reporter)
-    sections = [_section(preset, Scenario(plant=plant), methods) for preset in loaded]
+    sections = [_section(preset, Scenario(plant=plant), methods) for preset in bases]
     fly_levels(document, sections, starts=starts, seconds=seconds)
 
 
 def _section(preset: Preset, scenario: Scenario, methods: Sequence[str]) -> Levels:
     stem = f"vision_{preset.name.rpartition('/')[2]}"
-    drawn = ("base", "indi", "full")
-    flown = methods or _flyable(preset)
-    return Levels(TITLES.get(preset.name, preset.name), preset, scenario, stem, flown, PAPER, drawn=drawn)
+    drawn_methods = ("base", "indi", "full")
+    own_methods = methods or _flyable(preset)
+    return Levels(
+        TITLES.get(preset.name, preset.name), preset, scenario, stem, own_methods, PAPER, drawn_methods=drawn_methods
+    )
 
 
 def _flyable(preset: Preset) -> list[str]:

@@ -79,7 +79,7 @@ def where_learning_pays(
         methods = _methods(row, columns)
         flights = fly_all(
             studies[key], list(row.scenarios), run, reporter, methods=methods, starts=starts, seconds=row.seconds
-        ).flown
+        ).flights
         if len(flights) < len(methods) * len(row.scenarios) * len(seeds) * starts:
             break
         line, rows = _line(row, flights, columns)

@@ -8,7 +8,7 @@ import optax
 import pytest
 from jax import random
 
-from helpers import GOAL, random_command, random_field_flight, random_state, replaced, residual_targets
+from helpers import GOAL, random_command, random_field_flight, random_state, replace_fields, residual_targets
 from retrim.learn import EnsembleModel, FittedResidual, ResidualModel
 from retrim.learn.residuals import EnsembleResidual, EnsembleState, fit_ensemble
 from retrim.learn.residuals.ensemble import _spectral
@@ -48,13 +48,13 @@ def test_a_filling_window_counts_only_what_was_flown(key):
     v = jnp.where(jnp.arange(100)[:, None] < 70, 100.0, window.x.v)
     spoilt = eqx.tree_at(lambda w: (w.x.v, w.valid), window, (v, jnp.arange(100) >= 71))
     rows = residual_targets(spoilt, PointMass(0.02))
-    fitted, errors = fit(state_of(ensemble(key)), rows)
+    fit_result, errors = fit(state_of(ensemble(key)), rows)
     assert float(np.asarray(errors)[-1]) < 1e-2
-    predicted = np.asarray(predictions(fitted.residual, rows))[np.asarray(rows.valid)]
-    np.testing.assert_allclose(predicted, np.broadcast_to([1.0, 0.0, 0.0], predicted.shape), atol=0.3)
+    prediction = np.asarray(predictions(fit_result.residual, rows))[np.asarray(rows.valid)]
+    np.testing.assert_allclose(prediction, np.broadcast_to([1.0, 0.0, 0.0], prediction.shape), atol=0.3)
 
 
-def fitted_on(field, key, fits=3):
+def fit_on(field, key, fits=3):
     state = state_of(ensemble(key))
     rows = residual_targets(random_field_flight(field, key), PointMass(0.02))
     for _ in range(fits):  # warm starts
@@ -64,19 +64,19 @@ def fitted_on(field, key, fits=3):
 
 def test_recovers_a_constant(key):
     a = jnp.array([2.0, -0.5, 0.3])
-    state, rows, _ = fitted_on(lambda x, u: a, key)
-    predicted = np.asarray(predictions(state.residual, rows))
-    np.testing.assert_allclose(predicted, np.broadcast_to(a, predicted.shape), atol=0.05)
+    state, rows, _ = fit_on(lambda x, u: a, key)
+    prediction = np.asarray(predictions(state.residual, rows))
+    np.testing.assert_allclose(prediction, np.broadcast_to(a, prediction.shape), atol=0.05)
 
 
 def test_recovers_a_field_linear_in_velocity(key):
-    state, rows, _ = fitted_on(linear_drag, key)
-    predicted = np.asarray(predictions(state.residual, rows))
-    assert np.sqrt(np.mean((predicted - np.asarray(rows.a_res)) ** 2)) < 0.1 * np.std(rows.a_res)
+    state, rows, _ = fit_on(linear_drag, key)
+    prediction = np.asarray(predictions(state.residual, rows))
+    assert np.sqrt(np.mean((prediction - np.asarray(rows.a_res)) ** 2)) < 0.1 * np.std(rows.a_res)
 
 
 def test_warm_start_continues(key):
-    once, rows, first = fitted_on(linear_drag, key, fits=1)
+    once, rows, first = fit_on(linear_drag, key, fits=1)
     _, second = fit(once, rows)
     assert float(second[0]) < 3.0 * float(first[-1]) < 0.1 * float(first[0])
 
@@ -88,7 +88,7 @@ def test_fresh_ensemble_predicts_nothing_and_its_members_differ(key):
 
 
 def test_prediction_is_the_mean_of_the_members(key):
-    state, rows, _ = fitted_on(linear_drag, key, fits=1)
+    state, rows, _ = fit_on(linear_drag, key, fits=1)
     x, u = jax.tree.map(lambda leaf: leaf[5], (rows.x, rows.u))
     np.testing.assert_allclose(state.residual(x, u), state.residual.members(x, u).mean(axis=0))
 
@@ -98,17 +98,17 @@ def test_power_iteration_finds_the_spectral_norm_and_its_gradient(key):
     v = jnp.ones(20) / jnp.sqrt(20.0)
     spectral = jax.jit(_spectral)
     for _ in range(300):
-        squared, v = spectral(W, v)
+        square, v = spectral(W, v)
     U, S, Vt = np.linalg.svd(W)
-    assert float(squared) == pytest.approx(S[0] ** 2, rel=1e-6)
+    assert float(square) == pytest.approx(S[0] ** 2, rel=1e-6)
     gradient = jax.jit(jax.grad(lambda W: _spectral(W, v)[0]))(W)
     np.testing.assert_allclose(gradient, 2 * S[0] * np.outer(U[:, 0], Vt[0]), atol=1e-4 * S[0])
 
 
 def test_the_penalty_of_a_zero_matrix_is_zero_and_finite():
     value_and_slope = jax.jit(jax.value_and_grad(_spectral, has_aux=True))
-    (squared, v), slope = value_and_slope(jnp.zeros((3, 5)), jnp.ones(5))
-    assert float(squared) == 0.0
+    (square, v), slope = value_and_slope(jnp.zeros((3, 5)), jnp.ones(5))
+    assert float(square) == 0.0
     np.testing.assert_array_equal(v, 1.0)
     assert np.isfinite(slope).all()
 
@@ -166,13 +166,13 @@ def test_a_fit_goes_on_where_the_last_one_ended(model, key):
     for v, v_fresh in zip(jax.tree.leaves(twice.vectors), jax.tree.leaves(fresh.vectors), strict=True):
         assert np.abs(np.asarray(v) - np.asarray(v_fresh)).max() > 1e-3
         assert np.linalg.norm(v) == pytest.approx(1.0)
-    at_once, _ = fit_of_model(replaced(model, steps=60), fresh, rows)
+    at_once, _ = fit_of_model(replace_fields(model, steps=60), fresh, rows)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), twice, at_once)
 
 
 def test_a_fit_reports_the_error_before_its_last_step(model, key):
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
-    _, rms = fit_of_model(replaced(model, steps=1), fresh_state(model, key), rows)
+    _, rms = fit_of_model(replace_fields(model, steps=1), fresh_state(model, key), rows)
     assert float(rms) == pytest.approx(np.sqrt(np.mean(np.sum(np.asarray(rows.a_res) ** 2, axis=1))))
 
 
@@ -202,15 +202,15 @@ def test_the_spectral_weight_reaches_every_layer_of_every_member(key):
         residual.layers,
         is_leaf=lambda l: isinstance(l, eqx.nn.Linear),
     )
-    state = replaced(state, vectors=exact)
+    state = replace_fields(state, vectors=exact)
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
-    rows = replaced(rows, valid=jnp.zeros_like(rows.valid))
+    rows = replace_fields(rows, valid=jnp.zeros_like(rows.valid))
     one_step = eqx.filter_jit(
         lambda weight: fit_ensemble(state, rows, optimiser=descent, steps=1, spectral_weight=weight)
     )
     (after, _), (still, _) = (one_step(jnp.array(weight)) for weight in (0.5, 0.0))
-    for member, moved, unmoved in zip(residual.layers, after.residual.layers, still.residual.layers, strict=True):
-        for layer, new, same in zip(member, moved, unmoved, strict=True):
+    for member, shift, at_rest in zip(residual.layers, after.residual.layers, still.residual.layers, strict=True):
+        for layer, new, same in zip(member, shift, at_rest, strict=True):
             U, S, Vt = np.linalg.svd(np.asarray(layer.weight))
             step = 1e-2 * 0.5 * 2.0 * S[0] * np.outer(U[:, 0], Vt[0])
             assert np.abs(step).max() > 1e-4
@@ -221,13 +221,13 @@ def test_the_spectral_weight_reaches_every_layer_of_every_member(key):
 
 def test_the_weight_of_the_model_is_the_weight_of_the_fit(model, key):
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
-    heavy = replaced(model, spectral_weight=jnp.array(0.3), steps=5)
+    heavy = replace_fields(model, spectral_weight=jnp.array(0.3), steps=5)
     fresh = fresh_state(heavy, key)
-    found, _ = fit_of_model(heavy, fresh, rows)
+    result, _ = fit_of_model(heavy, fresh, rows)
     by_weight = eqx.filter_jit(lambda w: fit_ensemble(fresh, rows, optimiser=OPTIMISER, steps=5, spectral_weight=w)[0])
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), found, by_weight(jnp.array(0.3)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), result, by_weight(jnp.array(0.3)))
     without = by_weight(jnp.array(0.0)).residual.layers[0][1].weight
-    assert np.abs(np.asarray(found.residual.layers[0][1].weight) - np.asarray(without)).max() > 1e-3
+    assert np.abs(np.asarray(result.residual.layers[0][1].weight) - np.asarray(without)).max() > 1e-3
 
 
 def test_a_fit_has_a_step():

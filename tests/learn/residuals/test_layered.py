@@ -40,20 +40,20 @@ def rows_of(field, key, start=0, noise=0.0, n=N):
 
 
 @eqx.filter_jit
-def missed(state, rows, first=None):
+def miss(state, rows, first=None):
     """Root mean square of what both layers miss, or a closed form alone."""
     predict = MODEL.predict if first is None else lambda _, x, u: FIRST.predict(first, x, u)
-    predicted = jax.vmap(lambda x, u: predict(state, x, u))(rows.x, rows.u)
-    return jnp.sqrt(jnp.mean(jnp.sum((rows.a_res - predicted) ** 2, axis=1)))
+    prediction = jax.vmap(lambda x, u: predict(state, x, u))(rows.x, rows.u)
+    return jnp.sqrt(jnp.mean(jnp.sum((rows.a_res - prediction) ** 2, axis=1)))
 
 
-def flown(field, key, fits=20):
+def fly_once(field, key, fits=20):
     """What both layers, and the closed form alone, miss ten ticks ahead of each window of one flight."""
     state, errors = fresh(key), []
     for i in range(fits):
         state, _ = fit(state, rows_of(field, key, jnp.array(10.0 * i)))
         ahead = rows_of(field, key, jnp.array(10.0 * i + 10.0))
-        errors.append((float(missed(state, ahead)), float(missed(state, ahead, state.first))))
+        errors.append((float(miss(state, ahead)), float(miss(state, ahead, state.first))))
     return state, np.array(errors)
 
 
@@ -65,7 +65,7 @@ def jet(x, u):
 @pytest.fixture(scope="module")
 def in_the_jet():
     with jax.numpy_dtype_promotion("standard"):
-        return flown(jet, random.key(0))
+        return fly_once(jet, random.key(0))
 
 
 def test_what_the_closed_form_leaves_is_learnt(in_the_jet):
@@ -100,7 +100,7 @@ def test_an_ensemble_that_was_fitted_to_another_world_is_not_believed(in_the_jet
         rows = rows_of(opposite, key, jnp.array(250.0 + 10.0 * i))
         state, _ = fit(state, rows)
     ahead = rows_of(opposite, key, jnp.array(280.0))
-    assert float(missed(state, ahead)) < 1.1 * float(missed(state, ahead, alone(rows)))
+    assert float(miss(state, ahead)) < 1.1 * float(miss(state, ahead, alone(rows)))
 
 
 def test_it_is_a_residual_model():
@@ -119,8 +119,8 @@ def test_with_no_row_that_counts_it_knows_what_it_knew(key):
     limits = Command(jnp.array(5.0), -10.0 * jnp.ones(3)), Command(jnp.array(25.0), 10.0 * jnp.ones(3))
     model = LayeredModel(RegressionModel.of(0.02, limits=limits), SECOND)
     limited, rows = eqx.filter_jit(model.fit), rows_of(jet, key)
-    known, _ = limited(model.init(key), rows)
+    names, _ = limited(model.init(key), rows)
     idle = Targets(rows.x, jax.vmap(Command)(jnp.full(N, 5.1), rows.u.omega), rows.a_res, rows.omega, rows.valid)
-    after, rms = limited(known, idle)
-    jax.tree.map(np.testing.assert_array_equal, eqx.filter(after, eqx.is_array), eqx.filter(known, eqx.is_array))
+    after, rms = limited(names, idle)
+    jax.tree.map(np.testing.assert_array_equal, eqx.filter(after, eqx.is_array), eqx.filter(names, eqx.is_array))
     assert float(rms) == 0.0

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax, random
 
-from helpers import random_command, random_state, replaced
+from helpers import random_command, random_state, replace_fields
 from retrim.learn.residuals import LinearModel, Targets
 from retrim.learn.residuals.linear import features_of
 from retrim.testing import check_residual
@@ -38,7 +38,7 @@ def part(rows, start, stop):
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[start:stop]), rows)
 
 
-def carried(model, rows, count):
+def carry(model, rows, count):
     """States after each of ``count`` windows of N rows, STEP apart."""
     state, states = model.init(random.key(0)), []
     for k in range(count):
@@ -54,27 +54,27 @@ def test_the_laws_of_a_residual_model():
 def test_windows_one_by_one_are_all_rows_at_once(key):
     """Weighted ridge regression in NumPy on every row that was seen, each once."""
     rows, count = flight(key), 5
-    states = carried(MODEL, rows, count)
-    seen = N + (count - 1) * STEP
-    phi = np.asarray(features(rows.x, rows.u))[:seen]
-    weight = np.exp(-DT * np.arange(seen - 1, -1, -1) / 1.5) / 0.4**2
+    states = carry(MODEL, rows, count)
+    observation = N + (count - 1) * STEP
+    phi = np.asarray(features(rows.x, rows.u))[:observation]
+    weight = np.exp(-DT * np.arange(observation - 1, -1, -1) / 1.5) / 0.4**2
     precision = np.diag(1.0 / np.asarray(MODEL.prior) ** 2) + phi.T @ (weight[:, None] * phi)
-    wanted = np.linalg.solve(precision, phi.T @ (weight[:, None] * np.asarray(rows.a_res)[:seen]))
+    expected = np.linalg.solve(precision, phi.T @ (weight[:, None] * np.asarray(rows.a_res)[:observation]))
     state, rms = states[-1]
-    np.testing.assert_allclose(state.weights, wanted, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(state.weights, expected, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(state.covariance, np.linalg.inv(precision), rtol=1e-7, atol=1e-12)
-    error = np.asarray(rows.a_res)[seen - N : seen] - phi[-N:] @ wanted
+    error = np.asarray(rows.a_res)[observation - N : observation] - phi[-N:] @ expected
     np.testing.assert_allclose(rms, np.sqrt(np.mean(np.sum(error**2, axis=1))), rtol=1e-7)
 
 
 def test_it_becomes_more_certain_and_is_as_wrong_as_it_says(key):
     rows = flight(key, n=400)
-    states = [state for state, _ in carried(replaced(MODEL, memory=jnp.array(1e6), noise=jnp.array(0.3)), rows, 15)]
+    states = [state for state, _ in carry(replace_fields(MODEL, memory=jnp.array(1e6), noise=jnp.array(0.3)), rows, 15)]
     new = part(rows, 380, 400)
     spread = eqx.filter_jit(lambda state: jax.vmap(lambda x, u: MODEL.spread(state, x, u))(new.x, new.u))
     assert float(spread(states[-1]).max()) < 0.5 * float(spread(states[0]).max())
-    predicted = eqx.filter_jit(lambda state: jax.vmap(lambda x, u: MODEL.predict(state, x, u))(new.x, new.u))
-    error = np.asarray(new.a_res) - np.asarray(predicted(states[-1]))
+    prediction = eqx.filter_jit(lambda state: jax.vmap(lambda x, u: MODEL.predict(state, x, u))(new.x, new.u))
+    error = np.asarray(new.a_res) - np.asarray(prediction(states[-1]))
     assert np.sqrt(np.mean(error**2)) < 2.0 * 0.3
 
 
@@ -87,13 +87,13 @@ def test_an_invalid_row_does_not_count(key):
         np.testing.assert_array_equal(a, b)
     nothing = dataclasses.replace(rows, valid=jnp.zeros(N, dtype=bool))
     state, _ = fit(MODEL, MODEL.init(key), rows)
-    kept, _ = fit(MODEL, state, nothing)
-    jax.tree.map(np.testing.assert_array_equal, kept, state)
+    rest, _ = fit(MODEL, state, nothing)
+    jax.tree.map(np.testing.assert_array_equal, rest, state)
 
 
 def test_single_precision_is_enough(key):
     """Ten minutes of flight, and a memory that keeps them all."""
-    rows, model = flight(key, n=2000), replaced(MODEL, memory=jnp.array(600.0))
+    rows, model = flight(key, n=2000), replace_fields(MODEL, memory=jnp.array(600.0))
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, tree)  # noqa: E731
 
     @eqx.filter_jit

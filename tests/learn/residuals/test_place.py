@@ -59,7 +59,7 @@ def learn(force, begin=0.0, end=2.0 * LAP, state=None, model=MODEL):
 
 
 @pytest.fixture(scope="module")
-def fitted():
+def fit_model():
     return learn(lambda t, p: local_force(p) + np.array([1.0, -0.5, 0.3]))
 
 
@@ -72,17 +72,17 @@ def test_the_laws_of_a_residual_model():
     check_residual(MODEL)
 
 
-def test_after_two_laps_the_map_is_the_local_force_without_the_steady_push(fitted):
-    p, a = lap_values(fitted)
-    missed = a - local_force(p)
-    np.testing.assert_allclose(missed - missed.mean(axis=0), 0.0, atol=0.5)
-    assert np.sqrt(np.mean((missed - missed.mean(axis=0)) ** 2)) < 0.1
-    assert np.abs(missed.mean(axis=0)).max() < 0.4  # a small part of the push that repeats is a matter of the prior
+def test_after_two_laps_the_map_is_the_local_force_without_the_steady_push(fit_model):
+    p, a = lap_values(fit_model)
+    error = a - local_force(p)
+    np.testing.assert_allclose(error - error.mean(axis=0), 0.0, atol=0.5)
+    assert np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)) < 0.1
+    assert np.abs(error.mean(axis=0)).max() < 0.4  # a small part of the push that repeats is a matter of the prior
 
 
-def test_far_from_the_path_the_map_is_zero(fitted):
+def test_far_from_the_path_the_map_is_zero(fit_model):
     away = jnp.array([[0.0, 0.0, 3.0], [5.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
-    np.testing.assert_allclose(at_place(MODEL, fitted, away), 0.0, atol=1e-3)
+    np.testing.assert_allclose(at_place(MODEL, fit_model, away), 0.0, atol=1e-3)
 
 
 def test_a_push_that_changes_with_time_does_not_enter_the_map():
@@ -109,19 +109,19 @@ def test_one_fit_is_the_regression_on_all_rows_at_once():
     np.testing.assert_allclose(np.asarray(state.map.weights)[np.append(used, True)], weights, atol=1e-8)
 
 
-def test_a_force_that_disappears_loses_its_influence(fitted):
+def test_a_force_that_disappears_loses_its_influence(fit_model):
     place = jnp.array([[2.0, 0.0, 1.0]])
-    before = float(at_place(MODEL, fitted, place)[0, 2])
-    state = learn(lambda t, p: np.zeros_like(p), 2.0 * LAP, 4.0 * LAP, fitted)
+    before = float(at_place(MODEL, fit_model, place)[0, 2])
+    state = learn(lambda t, p: np.zeros_like(p), 2.0 * LAP, 4.0 * LAP, fit_model)
     after = float(at_place(MODEL, state, place)[0, 2])
     assert before < -3.0
     assert abs(after) < 0.35 * abs(before)
-    assert float(state.share) < 0.6 < float(fitted.share)
+    assert float(state.share) < 0.6 < float(fit_model.share)
 
 
-def test_windows_without_valid_rows_change_nothing(fitted):
-    after, _ = fit(MODEL, fitted, window(20.0, lambda t, p: local_force(p), valid=False))
-    jax.tree.map(np.testing.assert_array_equal, after, fitted)
+def test_windows_without_valid_rows_change_nothing(fit_model):
+    after, _ = fit(MODEL, fit_model, window(20.0, lambda t, p: local_force(p), valid=False))
+    jax.tree.map(np.testing.assert_array_equal, after, fit_model)
 
 
 def test_old_centres_make_room_for_new_places():

@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import first_order, random_state, replaced, residual_targets
+from helpers import first_order, random_state, replace_fields, residual_targets
 from retrim.learn import Window
 from retrim.learn.residuals import RateModel
-from retrim.physics import Command, Lagged, PointMass, so3
-from retrim.physics.actuators import RateBiased
+from retrim.physics import Command, LaggedModel, PointMass, so3
+from retrim.physics.actuators import RateBiasedModel
 
 DT = 0.02
 MODEL = RateModel.of(DT, memory=0.5)
-ENDLESS = replaced(MODEL, memory=jnp.array(1e9))
+ENDLESS = replace_fields(MODEL, memory=jnp.array(1e9))
 
 
 @eqx.filter_jit
 def window_of(key, tau, bias, noise=0.0, n=100):
     """A flight under random commands of a vehicle that turns late and too fast, measured with noise [rad]."""
     k_x, k_c, k_w, k_noise = random.split(key, 4)
-    model = Lagged(RateBiased(PointMass(DT), bias), first_order(tau))
+    model = LaggedModel(RateBiasedModel(PointMass(DT), bias), first_order(tau))
     c = 9.81 + random.normal(k_c, (n,))
     u = jax.vmap(Command)(c, jnp.repeat(random.normal(k_w, (n // 4, 3)), 4, axis=0))
 
@@ -35,53 +35,53 @@ def window_of(key, tau, bias, noise=0.0, n=100):
 
 
 @eqx.filter_jit
-def fitted(model, window):
+def fit(model, window):
     return model.fit(residual_targets(window, PointMass(DT)))
 
 
 @pytest.mark.parametrize("tau", [0.01, 0.03, 0.08])
 @pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.1)])
 def test_lag_and_bias_are_identified(key, tau, bias):
-    found = fitted(ENDLESS, window_of(key, jnp.array(tau), jnp.array(bias)))
-    np.testing.assert_allclose(found.bias, bias, atol=0.01)
-    np.testing.assert_allclose(np.log(found.tau / tau), 0.0, atol=0.15)  # the grid's step is a fifth
+    result = fit(ENDLESS, window_of(key, jnp.array(tau), jnp.array(bias)))
+    np.testing.assert_allclose(result.bias, bias, atol=0.01)
+    np.testing.assert_allclose(np.log(result.tau / tau), 0.0, atol=0.15)  # the grid's step is a fifth
 
 
 @pytest.mark.parametrize("yaw", [0.02, 0.2, 0.5])
 def test_yaw_has_a_lag_of_its_own(key, yaw):
     lag = Command(jnp.array(0.03), jnp.array([0.06, 0.06, yaw]))
-    found = fitted(ENDLESS, window_of(key, lag, jnp.array([0.1, -0.1, 0.1]), n=200))
-    np.testing.assert_allclose(np.log(found.tau / lag.omega), 0.0, atol=0.2)
-    assert found.tau[0] == found.tau[1]
-    np.testing.assert_allclose(found.bias, [0.1, -0.1, 0.1], atol=0.03)
+    result = fit(ENDLESS, window_of(key, lag, jnp.array([0.1, -0.1, 0.1]), n=200))
+    np.testing.assert_allclose(np.log(result.tau / lag.omega), 0.0, atol=0.2)
+    assert result.tau[0] == result.tau[1]
+    np.testing.assert_allclose(result.bias, [0.1, -0.1, 0.1], atol=0.03)
 
 
 def test_noise_does_not_shorten_the_lag(key):
     """Attitudes to 0.2 degrees: rates of a tick to a quarter of a radian per second."""
     window = window_of(key, jnp.array(0.06), jnp.array([0.2, 0.0, -0.2]), noise=0.0035, n=200)
-    found = fitted(ENDLESS, window)
-    np.testing.assert_allclose(found.bias, [0.2, 0.0, -0.2], atol=3.0 * float(found.deviation[0]))
-    assert ((found.tau > 0.04) & (found.tau < 0.09)).all()
+    result = fit(ENDLESS, window)
+    np.testing.assert_allclose(result.bias, [0.2, 0.0, -0.2], atol=3.0 * float(result.deviation[0]))
+    assert ((result.tau > 0.04) & (result.tau < 0.09)).all()
 
 
 def test_a_bias_that_begins_is_learnt_within_the_memory(key):
     before, after = (window_of(key, jnp.array(0.03), jnp.array([b, 0.0, 0.0])) for b in (0.0, 0.4))
-    joined = jax.tree.map(lambda a, b: jnp.concatenate([a[:50], b[50:]]), before, after)
-    assert abs(float(fitted(replaced(MODEL, memory=jnp.array(0.2)), joined).bias[0]) - 0.4) < 0.06
+    whole = jax.tree.map(lambda a, b: jnp.concatenate([a[:50], b[50:]]), before, after)
+    assert abs(float(fit(replace_fields(MODEL, memory=jnp.array(0.2)), whole).bias[0]) - 0.4) < 0.06
 
 
 def test_without_data_it_is_the_prior(key):
     window = window_of(key, jnp.array(0.03), jnp.array([0.4, 0.0, 0.0]))
-    found = fitted(MODEL, replaced(window, valid=jnp.zeros(100, dtype=bool)))
-    jax.tree.map(np.testing.assert_array_equal, found, MODEL.init())
+    result = fit(MODEL, replace_fields(window, valid=jnp.zeros(100, dtype=bool)))
+    jax.tree.map(np.testing.assert_array_equal, result, MODEL.init())
 
 
 def test_a_hover_says_nothing_of_the_lag(key):
     """Commands that do not change leave the prior's time constant, and give the bias."""
     window = window_of(key, jnp.array(0.1), jnp.array([0.2, 0.0, 0.0]))
-    still = replaced(window, u=jax.tree.map(jnp.zeros_like, window.u))
+    still = replace_fields(window, u=jax.tree.map(jnp.zeros_like, window.u))
     R = jax.vmap(lambda t: so3.exp(t * jnp.array([0.2, 0.0, 0.0])))(still.t)
-    found = fitted(ENDLESS, eqx.tree_at(lambda w: w.x.R, still, R))
-    np.testing.assert_allclose(found.bias[0], 0.2, atol=0.01)
-    ratio = found.tau / MODEL.tau_prior
+    result = fit(ENDLESS, eqx.tree_at(lambda w: w.x.R, still, R))
+    np.testing.assert_allclose(result.bias[0], 0.2, atol=0.01)
+    ratio = result.tau / MODEL.tau_prior
     assert ((ratio > 0.5) & (ratio < 2.0)).all()

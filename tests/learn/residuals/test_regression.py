@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import random_command, random_field_flight, random_state, replaced, residual_targets
+from helpers import random_command, random_field_flight, random_state, replace_fields, residual_targets
 from retrim.learn.residuals import RegressionModel, Targets
 from retrim.learn.residuals.regression import BLOCK, features_of
 from retrim.physics import Command, PointMass, so3
 
 MODEL = RegressionModel.of(0.02, memory=0.5, noise=0.5)
-ENDLESS = replaced(MODEL, memory=jnp.array(1e9))
+ENDLESS = replace_fields(MODEL, memory=jnp.array(1e9))
 
 
 def rows_of(parameters, key, n=96, noise=0.0, valid=None):
@@ -38,13 +38,13 @@ def push(*d):
 _fit = eqx.filter_jit(lambda model, state, rows: model.fit(state, rows))
 
 
-def fitted(model, rows):
+def fit(model, rows):
     return _fit(model, model.init(random.key(0)), rows)
 
 
 def test_without_data_it_is_the_prior(key):
     rows = rows_of(push(1.0, 2.0, 3.0), key, valid=jnp.zeros(96, dtype=bool))
-    state, _ = fitted(MODEL, rows)
+    state, _ = fit(MODEL, rows)
     jax.tree.map(np.testing.assert_allclose, state, MODEL.init(key))
     x, u = random_state(key), random_command(key)
     np.testing.assert_array_equal(MODEL.predict(state, x, u), 0.0)
@@ -57,7 +57,7 @@ def test_the_posterior_is_the_one_of_the_textbook(key):
     for phi, a in zip(np.asarray(jax.vmap(features_of)(rows.x, rows.u)), np.asarray(rows.a_res), strict=True):
         gain = covariance @ phi.T @ np.linalg.inv(phi @ covariance @ phi.T + 0.25 * np.eye(3))
         mean, covariance = mean + gain @ (a - phi @ mean), covariance - gain @ phi @ covariance
-    state, _ = fitted(ENDLESS, rows)
+    state, _ = fit(ENDLESS, rows)
     np.testing.assert_allclose(state.mean, mean, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(state.covariance, covariance, rtol=1e-7, atol=1e-12)
 
@@ -66,7 +66,7 @@ def test_old_rows_count_for_less(key):
     """A slow drift that no test calls a change: a short memory follows it more closely than a long one."""
     drift = np.linspace(0.0, 0.4, 96)[:, None] * np.asarray(push(1.0, 0.0, 0.0))
     rows = rows_of(drift, key)
-    short, long = (float(fitted(replaced(MODEL, memory=jnp.array(m)), rows)[0].mean[0]) for m in (0.1, 1e9))
+    short, long = (float(fit(replace_fields(MODEL, memory=jnp.array(m)), rows)[0].mean[0]) for m in (0.1, 1e9))
     assert 0.33 < short < 0.4
     assert 0.15 < long < 0.25
 
@@ -77,7 +77,7 @@ def test_a_change_is_forgotten_at_once(key, since):
     n = 96
     before = (jnp.arange(n) < n - since)[:, None]
     rows = rows_of(jnp.where(before, push(-1.0, -1.0, -1.0), push(1.0, 1.0, 1.0)), key, noise=0.1)
-    state, _ = fitted(MODEL, rows)
+    state, _ = fit(MODEL, rows)
     np.testing.assert_allclose(state.mean[:3], 1.0, atol=0.2)
 
 
@@ -88,9 +88,9 @@ def test_noise_is_no_change(key):
     def precision(key):
         return model.fit(model.init(key), rows_of(np.zeros(10), key, noise=0.5))[0].covariance[0, 0]
 
-    found = np.asarray(jax.jit(jax.vmap(precision))(random.split(key, 400)))
-    whole = np.asarray(fitted(model, rows_of(jnp.zeros(10), key))[0].covariance[0, 0])
-    assert (found < 1.5 * whole).mean() > 0.98
+    result = np.asarray(jax.jit(jax.vmap(precision))(random.split(key, 400)))
+    whole = np.asarray(fit(model, rows_of(jnp.zeros(10), key))[0].covariance[0, 0])
+    assert (result < 1.5 * whole).mean() > 0.98
 
 
 @pytest.mark.parametrize(
@@ -104,22 +104,22 @@ def test_noise_is_no_change(key):
 )
 def test_known_worlds_are_identified(key, field, parameter, value, tolerance):
     """From states and commands of a flight, with the delay of the plant; priors made wide, since the data are many."""
-    model = replaced(ENDLESS, prior=10.0 * MODEL.prior, noise=jnp.array(0.05))
+    model = replace_fields(ENDLESS, prior=10.0 * MODEL.prior, noise=jnp.array(0.05))
     window = random_field_flight(field, key, n=100, delay_ticks=1)
     rows = residual_targets(window, PointMass(0.02), delay_ticks=1)
-    state, rms = fitted(model, rows)
+    state, rms = fit(model, rows)
     np.testing.assert_allclose(state.mean[parameter], value, atol=tolerance)
     assert float(rms) < 0.05
 
 
 def test_it_turns_with_the_world(key):
     """Turned rows give the turned prediction: features are physical, not of the axes."""
-    isotropic = replaced(MODEL, prior=MODEL.prior)
+    isotropic = replace_fields(MODEL, prior=MODEL.prior)
     Q = so3.exp(random.normal(key, (3,)))
     rows = rows_of(0.5 * random.normal(key, (10,)) * MODEL.prior, key, noise=0.2)
     x = jax.vmap(lambda x: type(x)(so3.act(Q, x.p), so3.mul(Q, x.R), so3.act(Q, x.v)))(rows.x)
-    turned = Targets(x, rows.u, rows.a_res @ Q.T, rows.omega, rows.valid)
-    here, there = fitted(isotropic, rows)[0], fitted(isotropic, turned)[0]
+    rotation = Targets(x, rows.u, rows.a_res @ Q.T, rows.omega, rows.valid)
+    here, there = fit(isotropic, rows)[0], fit(isotropic, rotation)[0]
     one = jax.tree.map(lambda leaf: leaf[3], rows.x), jax.tree.map(lambda leaf: leaf[3], rows.u)
     other = jax.tree.map(lambda leaf: leaf[3], x), one[1]
     np.testing.assert_allclose(MODEL.predict(there, *other), so3.act(Q, MODEL.predict(here, *one)), atol=1e-9)
@@ -128,7 +128,7 @@ def test_it_turns_with_the_world(key):
 def test_the_spread_shrinks_with_data(key):
     x, u = random_state(key), random_command(key)
     wide = MODEL.spread(MODEL.init(key), x, u)
-    narrow = MODEL.spread(fitted(MODEL, rows_of(jnp.zeros(10), key))[0], x, u)
+    narrow = MODEL.spread(fit(MODEL, rows_of(jnp.zeros(10), key))[0], x, u)
     assert (np.asarray(narrow) < 0.2 * np.asarray(wide)).all()
     assert (np.asarray(narrow) > 0.0).all()
 
@@ -138,22 +138,22 @@ LIMITS = Command(jnp.array(0.5), -10.0 * jnp.ones(3)), Command(jnp.array(40.5), 
 
 def test_commands_at_a_limit_tell_nothing(key):
     """At the least thrust a mixer lifts by what it takes to turn: no gain of the thrust, and no bias of the rates."""
-    rows, model = rows_of(push(1.0, 0.0, 0.0), key), replaced(ENDLESS, limits=LIMITS)
+    rows, model = rows_of(push(1.0, 0.0, 0.0), key), replace_fields(ENDLESS, limits=LIMITS)
     at = jnp.arange(96) % 2 == 0
     idle = jax.vmap(Command)(jnp.where(at, 1.0, rows.u.c), jnp.where(at[:, None], 9.5, rows.u.omega))
-    lifted = jnp.where(at[:, None], 10.0 * rows.x.R[:, :, 2], 0.0)
-    mixed = replaced(rows, u=idle, a_res=rows.a_res + lifted, omega=jnp.where(at[:, None], 0.0, rows.omega))
-    told, left = fitted(model, mixed)[0], fitted(model, replaced(mixed, valid=~at))[0]
-    jax.tree.map(np.testing.assert_array_equal, told, left)
-    np.testing.assert_allclose(told.mean, push(1.0, 0.0, 0.0), atol=0.05)
-    assert float(fitted(ENDLESS, mixed)[0].mean[3]) < -0.5  # the gain that would explain it
+    lift = jnp.where(at[:, None], 10.0 * rows.x.R[:, :, 2], 0.0)
+    mixture = replace_fields(rows, u=idle, a_res=rows.a_res + lift, omega=jnp.where(at[:, None], 0.0, rows.omega))
+    message, left = fit(model, mixture)[0], fit(model, replace_fields(mixture, valid=~at))[0]
+    jax.tree.map(np.testing.assert_array_equal, message, left)
+    np.testing.assert_allclose(message.mean, push(1.0, 0.0, 0.0), atol=0.05)
+    assert float(fit(ENDLESS, mixture)[0].mean[3]) < -0.5  # the gain that would explain it
 
 
 def test_with_no_row_that_counts_it_knows_what_it_knew(key):
-    model = replaced(MODEL, limits=LIMITS)
-    known, _ = fitted(model, rows_of(push(1.0, 0.0, 0.0), key))
-    assert float(known.mean[0]) > 0.5
+    model = replace_fields(MODEL, limits=LIMITS)
+    names, _ = fit(model, rows_of(push(1.0, 0.0, 0.0), key))
+    assert float(names.mean[0]) > 0.5
     rows = rows_of(push(0.0, 2.0, 0.0), key)
-    idle = replaced(rows, u=jax.vmap(Command)(jnp.zeros(96), rows.u.omega))
-    state, _ = _fit(model, known, idle)
-    jax.tree.map(np.testing.assert_array_equal, state, known)
+    idle = replace_fields(rows, u=jax.vmap(Command)(jnp.zeros(96), rows.u.omega))
+    state, _ = _fit(model, names, idle)
+    jax.tree.map(np.testing.assert_array_equal, state, names)

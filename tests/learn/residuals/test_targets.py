@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import first_order, random_field_flight, replaced, residual_targets
+from helpers import first_order, random_field_flight, replace_fields, residual_targets
 from retrim.learn import Window
-from retrim.physics import Command, Lagged, PointMass, State
+from retrim.physics import Command, LaggedModel, PointMass, State
 
 DT = 0.02
 
@@ -19,12 +19,12 @@ def linear_drag(x, u):
     return -0.4 * x.v + jnp.array([0.5, 0.0, 0.2])
 
 
-dragged = jax.jit(jax.vmap(linear_drag))
+drag = jax.jit(jax.vmap(linear_drag))
 
 
-def paused(window, at, seconds=7.0):
+def pause(window, at, seconds=7.0):
     """The same ticks, with ``seconds`` lost between the ticks ``at - 1`` and ``at``."""
-    return replaced(window, t=window.t + seconds * (np.arange(window.t.size) >= at))
+    return replace_fields(window, t=window.t + seconds * (np.arange(window.t.size) >= at))
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
@@ -33,10 +33,10 @@ def test_targets_are_exact_when_the_delay_is_right(delay, key):
     rows = residual_targets(window, PointMass(DT), delay_ticks=delay)
     assert rows.a_res.shape == (29 - delay, 3)
     assert np.all(rows.valid)
-    np.testing.assert_allclose(rows.a_res, dragged(rows.x, rows.u), atol=1e-10)
+    np.testing.assert_allclose(rows.a_res, drag(rows.x, rows.u), atol=1e-10)
     for wrong in {max(delay - 1, 0), delay + 1} - {delay}:
         other = residual_targets(window, PointMass(DT), delay_ticks=wrong)
-        assert np.abs(np.asarray(other.a_res) - np.asarray(dragged(other.x, other.u))).max() > 0.1
+        assert np.abs(np.asarray(other.a_res) - np.asarray(drag(other.x, other.u))).max() > 0.1
 
 
 def test_a_row_holds_the_state_at_its_tick_and_the_command_that_acted(key):
@@ -51,14 +51,14 @@ def test_measured_accelerations_take_the_place_of_differences(delay, key):
     """Noise of the velocity then leaves the targets alone; without the measurement it is magnified by 1 / dt."""
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=delay)
     clean = residual_targets(window, PointMass(DT), delay_ticks=delay)
-    measured = jnp.asarray(np.append(np.diff(window.x.v, axis=0) / DT, np.zeros((1, 3)), axis=0))
-    rows = residual_targets(window, PointMass(DT), delay_ticks=delay, a_gt=measured)
+    measurement = jnp.asarray(np.append(np.diff(window.x.v, axis=0) / DT, np.zeros((1, 3)), axis=0))
+    rows = residual_targets(window, PointMass(DT), delay_ticks=delay, a_gt=measurement)
     np.testing.assert_allclose(rows.a_res, clean.a_res, atol=1e-10)
     noisy = eqx.tree_at(lambda w: w.x.v, window, window.x.v + 0.1 * jax.random.normal(key, (30, 3)))
-    aided = residual_targets(noisy, PointMass(DT), delay_ticks=delay, a_gt=measured)
-    np.testing.assert_allclose(aided.a_res, clean.a_res, atol=1e-10)
-    unaided = residual_targets(noisy, PointMass(DT), delay_ticks=delay)
-    assert np.abs(np.asarray(unaided.a_res) - np.asarray(clean.a_res)).max() > 1.0
+    with_aid = residual_targets(noisy, PointMass(DT), delay_ticks=delay, a_gt=measurement)
+    np.testing.assert_allclose(with_aid.a_res, clean.a_res, atol=1e-10)
+    without_aid = residual_targets(noisy, PointMass(DT), delay_ticks=delay)
+    assert np.abs(np.asarray(without_aid.a_res) - np.asarray(clean.a_res)).max() > 1.0
 
 
 def test_a_window_must_be_longer_than_the_delay(key):
@@ -70,7 +70,7 @@ def test_a_window_must_be_longer_than_the_delay(key):
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_a_gap_in_time_masks_the_rows_that_straddle_it(delay, key):
     """Seven seconds between the ticks 11 and 12: row k takes the ticks k to k + delay + 1, so delay + 1 rows go."""
-    window = paused(random_field_flight(linear_drag, key, n=30, delay_ticks=delay), at=12)
+    window = pause(random_field_flight(linear_drag, key, n=30, delay_ticks=delay), at=12)
     rows = residual_targets(window, PointMass(DT), delay_ticks=delay)
     straddling = [k for k in range(29 - delay) if k < 12 <= k + delay + 1]
     assert len(straddling) == delay + 1
@@ -80,10 +80,10 @@ def test_a_gap_in_time_masks_the_rows_that_straddle_it(delay, key):
 def test_jitter_of_the_clock_masks_nothing(key):
     """A tick may be up to a quarter longer or shorter; one that was lost may not."""
     window = random_field_flight(linear_drag, key, n=30)
-    jittery = replaced(window, t=window.t + 0.1 * DT * jnp.sin(jnp.arange(30.0)))
+    jittery = replace_fields(window, t=window.t + 0.1 * DT * jnp.sin(jnp.arange(30.0)))
     assert residual_targets(jittery, PointMass(DT)).valid.all()
-    lost = residual_targets(paused(window, at=12, seconds=DT), PointMass(DT))
-    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(lost.valid)), [11])
+    gap = residual_targets(pause(window, at=12, seconds=DT), PointMass(DT))
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(gap.valid)), [11])
 
 
 @pytest.mark.parametrize("tau", [0.033, 0.1])
@@ -91,13 +91,13 @@ def test_jitter_of_the_clock_masks_nothing(key):
 def test_rows_wait_until_the_lag_has_settled(tau, filling, key):
     """The first ceil(3 tau / dt) valid rows: until then the lag still remembers the hover that it assumed."""
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=1)
-    window = replaced(window, valid=jnp.arange(30) >= filling)
-    settled = residual_targets(window, Lagged(PointMass(DT), first_order(tau)), delay_ticks=1).valid
+    window = replace_fields(window, valid=jnp.arange(30) >= filling)
+    has_settled = residual_targets(window, LaggedModel(PointMass(DT), first_order(tau)), delay_ticks=1).valid
     plain = residual_targets(window, PointMass(DT), delay_ticks=1).valid
     assert np.argmax(plain) == filling  # without a lag every valid row counts
     assert np.sum(plain) == 28 - filling
     ticks = math.ceil(3.0 * tau / DT - 0.01)
-    np.testing.assert_array_equal(np.flatnonzero(settled), np.arange(filling + ticks, 28))
+    np.testing.assert_array_equal(np.flatnonzero(has_settled), np.arange(filling + ticks, 28))
 
 
 # ---- windows
@@ -105,10 +105,10 @@ def test_rows_wait_until_the_lag_has_settled(tau, filling, key):
 
 def test_a_window_of_columns_and_back(key):
     """From the columns of a log; what it holds is what was given, and every tick counts."""
-    flown = random_field_flight(linear_drag, key, n=30)
-    columns = [np.asarray(a) for a in (flown.t, flown.x.p, flown.x.R, flown.x.v, flown.u.c, flown.u.omega)]
+    flight = random_field_flight(linear_drag, key, n=30)
+    columns = [np.asarray(a) for a in (flight.t, flight.x.p, flight.x.R, flight.x.v, flight.u.c, flight.u.omega)]
     window = Window.of(*columns)
-    jax.tree.map(np.testing.assert_array_equal, window, flown)
+    jax.tree.map(np.testing.assert_array_equal, window, flight)
     assert window.valid.all()
     again = Window.of(window.t, window.x.p, window.x.R, window.x.v, window.u.c, window.u.omega)
     jax.tree.map(np.testing.assert_array_equal, again, window)
@@ -123,11 +123,11 @@ def test_a_row_whose_command_lies_beyond_a_gap_does_not_count(age, delay):
     v = np.cumsum(DT * (np.append(np.full(delay, 9.81), c)[:n] - 9.81))
     # States of the beginning of each tick, as far back as they are old; between two of them thrust is constant.
     t, zero = DT * np.arange(n), np.zeros((n, 3))
-    seen = np.interp(t - age, t, np.concatenate([[0.0], v[:-1]]))
-    made = Window.of(t, zero, np.tile(np.eye(3), (n, 1, 1)), seen[:, None] * np.array([0.0, 0.0, 1.0]), c, zero)
-    window = replaced(made, age=jnp.full(n, age))
-    gone = jax.tree.map(lambda leaf: jnp.asarray(np.delete(leaf, 20, axis=0)), window)
-    rows = residual_targets(gone, PointMass(DT), delay_ticks=delay)
+    observation = np.interp(t - age, t, np.concatenate([[0.0], v[:-1]]))
+    setup = Window.of(t, zero, np.tile(np.eye(3), (n, 1, 1)), observation[:, None] * np.array([0.0, 0.0, 1.0]), c, zero)
+    window = replace_fields(setup, age=jnp.full(n, age))
+    loss = jax.tree.map(lambda leaf: jnp.asarray(np.delete(leaf, 20, axis=0)), window)
+    rows = residual_targets(loss, PointMass(DT), delay_ticks=delay)
     assert np.abs(np.asarray(rows.a_res)[np.asarray(rows.valid)]).max() < 1e-9
     every = residual_targets(window, PointMass(DT), delay_ticks=delay)
     assert np.sum(every.valid) - np.sum(rows.valid) == 2 + delay + whole
@@ -137,7 +137,7 @@ FINE, PUSH = 4, (0.5, -0.2, 0.3)
 
 
 @jax.jit
-def finely_flown(key, delay):
+def fly_finely(key, delay):
     """Commands of 40 ticks, and states of every quarter of a tick under ``PUSH``."""
     k_c, k_w = jax.random.split(key)
     u = jax.vmap(Command)(9.81 + jax.random.normal(k_c, (40,)), 0.5 * jax.random.normal(k_w, (40, 3)))
@@ -154,15 +154,17 @@ def finely_flown(key, delay):
 @pytest.mark.parametrize("delay", [0, 1])
 def test_a_late_measurement_is_paired_with_the_command_that_acted_then(age, delay, key):
     """Of states that are 0 to 30 ms old, at a tick of 20 ms: the targets are those of the world, to a few per cent."""
-    u, x = finely_flown(key, delay)
-    seen = np.maximum(FINE * np.arange(40) - round(age / DT * FINE), 0)
-    states = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[seen]), x)
+    u, x = fly_finely(key, delay)
+    observation = np.maximum(FINE * np.arange(40) - round(age / DT * FINE), 0)
+    states = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[observation]), x)
     window = Window(DT * jnp.arange(40.0), states, u, jnp.ones(40, dtype=bool), jnp.full(40, age))
     rows = residual_targets(window, PointMass(DT), delay_ticks=delay)
-    told = (np.asarray(rows.a_res) - np.array(PUSH))[np.asarray(rows.valid)]
+    message = (np.asarray(rows.a_res) - np.array(PUSH))[np.asarray(rows.valid)]
     assert np.sum(~np.asarray(rows.valid)) == math.ceil(age / DT)
-    untold = residual_targets(replaced(window, age=None), PointMass(DT), delay_ticks=delay).a_res - np.array([PUSH])
-    assert np.abs(told).mean() < 0.03
+    untold = residual_targets(replace_fields(window, age=None), PointMass(DT), delay_ticks=delay).a_res - np.array(
+        [PUSH]
+    )
+    assert np.abs(message).mean() < 0.03
     assert np.abs(untold).mean() > 0.1 or age == 0.0
     if age == 0.0:
-        np.testing.assert_array_equal(told, untold)
+        np.testing.assert_array_equal(message, untold)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from helpers import replaced
+from helpers import replace_fields
 from retrim.physics import (
     BemQuadrotor,
     Command,
@@ -48,13 +48,13 @@ def state(case):
 
 def plants():
     """The kingfisher with the arms of the golden file, without drag: by blade elements and by coefficients."""
-    vehicle = replaced(
+    vehicle = replace_fields(
         kingfisher(), arm=jnp.abs(jnp.array(SIMPLE["arms"][0][:2])), torque_ratio=jnp.array(SIMPLE["kappa"])
     )
     assert (float(vehicle.mass), vehicle.inertia.tolist()) == (SIMPLE["mass"], SIMPLE["J"])
     assert float(vehicle.thrust_coefficient) == SIMPLE["thrust_coefficient"][0]
-    bem = BemQuadrotor.of(replaced(vehicle, drag_area=1e-12 * jnp.ones(3)), 0.02)
-    return bem, replaced(LinearDragQuadrotor.of(vehicle, 0.02, thrust_error=0.0), drag=jnp.zeros(3))
+    bem = BemQuadrotor.of(replace_fields(vehicle, drag_area=1e-12 * jnp.ones(3)), 0.02)
+    return bem, replace_fields(LinearDragQuadrotor.of(vehicle, 0.02, thrust_error=0.0), drag=jnp.zeros(3))
 
 
 def test_quadratic_rotors_and_a_step(case):
@@ -108,9 +108,9 @@ def test_acceleration_of_blade_elements(index):
     case, (bem, _) = BEM["cases"][index], plants()
     T, H3, Q = (jnp.array(case[name], dtype=float) for name in ("thrust", "hforce", "torque"))
     golden = np.add(case["dvel"], [0.0, 0.0, BEM["G"]])
-    ours, assembled = acceleration(bem, state(case), BladeForces(T, H3 / 3.0, Q))
+    ours, matrix = acceleration(bem, state(case), BladeForces(T, H3 / 3.0, Q))
     np.testing.assert_allclose(ours, golden, atol=0.5)
-    np.testing.assert_allclose(assembled, golden, atol=0.01)
+    np.testing.assert_allclose(matrix, golden, atol=0.01)
 
 
 # The small quadrotor's numbers, like its propeller, are a proposal.
@@ -118,7 +118,7 @@ def test_acceleration_of_blade_elements(index):
 def test_damping(make, edgewise, axial):
     """Of the rotors alone, at hover [1/s]: at 3 m/s edgewise, and climbing."""
     model = BemQuadrotor.of(make(), 0.02, thrust_error=0.0)
-    model = replaced(model, vehicle=replaced(model.vehicle, drag_area=1e-12 * jnp.ones(3)))
+    model = replace_fields(model, vehicle=replace_fields(model.vehicle, drag_area=1e-12 * jnp.ones(3)))
     motors = jnp.sqrt(model.vehicle.mass * 9.81 / (4.0 * model.loop.thrust_map)) * jnp.ones(4)
 
     def at(*v):

@@ -53,14 +53,14 @@ def pad(x: Any, value: Any, config: Sequence[tuple[int, int, int]]) -> Any:
 
 def dynamic_slice(x: Any, starts: Sequence[Any], sizes: Index) -> Any:
     """Return a block of ``x``; its start is clamped so that the block lies inside."""
-    at = _clamped(x.shape, starts, sizes)
+    at = _clamp(x.shape, starts, sizes)
     return x[tuple(slice(i, i + n) for i, n in zip(at, sizes, strict=True))]
 
 
 def dynamic_update_slice(x: Any, block: Any, starts: Sequence[Any]) -> Any:
     """Return a copy of ``x`` with ``block`` written at a start that is clamped so that the block lies inside."""
     block, out = np.asarray(block), np.array(x)
-    at = _clamped(out.shape, starts, block.shape)
+    at = _clamp(out.shape, starts, block.shape)
     out[tuple(slice(i, i + n) for i, n in zip(at, block.shape, strict=True))] = block
     return out
 
@@ -90,8 +90,8 @@ def gather(
     """
     x, indices = np.asarray(x), np.asarray(indices)
     batch = indices.shape[:-1]
-    kept = tuple(n for axis, n in enumerate(sizes) if axis not in collapsed)
-    out = np.empty((*batch, *kept), dtype=x.dtype)
+    remaining_sizes = tuple(n for axis, n in enumerate(sizes) if axis not in collapsed)
+    out = np.empty((*batch, *remaining_sizes), dtype=x.dtype)
     kind = x.dtype.kind
     if value is None:
         value = np.nan if kind == "f" else kind == "b" or getattr(np.iinfo(x.dtype), "max" if kind == "u" else "min")
@@ -99,8 +99,8 @@ def gather(
         starts = [0] * x.ndim
         for axis, i in zip(start_map, indices[row], strict=True):
             starts[axis] = int(i)
-        at = _clamped(x.shape, starts, sizes)
-        block = x[tuple(slice(i, i + n) for i, n in zip(at, sizes, strict=True))].reshape(kept)
+        at = _clamp(x.shape, starts, sizes)
+        block = x[tuple(slice(i, i + n) for i, n in zip(at, sizes, strict=True))].reshape(remaining_sizes)
         out[row] = value if fill and list(at) != starts else block
     order, rows, inner = [], iter(range(len(batch))), iter(range(len(batch), out.ndim))
     for axis in range(out.ndim):
@@ -121,10 +121,10 @@ def scatter(x: Any, indices: Any, updates: Any, window: Index, inserted: Index, 
         starts = [0] * out.ndim
         for axis, i in zip(dims, indices[row], strict=True):
             starts[axis] = int(i)
-        if list(_clamped(out.shape, starts, tuple(sizes))) == starts:
+        if list(_clamp(out.shape, starts, tuple(sizes))) == starts:
             out[tuple(slice(i, i + n) for i, n in zip(starts, sizes, strict=True))] = updates[row].reshape(sizes)
     return out
 
 
-def _clamped(shape: Index, starts: Sequence[Any], sizes: Index) -> list[int]:
+def _clamp(shape: Index, starts: Sequence[Any], sizes: Index) -> list[int]:
     return [min(max(int(i), 0), n - size) for i, n, size in zip(starts, shape, sizes, strict=True)]

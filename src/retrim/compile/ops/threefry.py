@@ -45,8 +45,8 @@ def split(key: Any, shape: tuple[int, ...]) -> np.ndarray:
 def bits(key: Any, shape: tuple[int, ...], width: int) -> Any:
     """Return random integers with a width of 8 to 64 bits."""
     a, b = threefry(key, *_counters(shape))
-    drawn = (a ^ b).astype(f"uint{width}")
-    return drawn if width < 64 else a.astype(np.uint64) << np.uint64(32) | b.astype(np.uint64)
+    words = (a ^ b).astype(f"uint{width}")
+    return words if width < 64 else a.astype(np.uint64) << np.uint64(32) | b.astype(np.uint64)
 
 
 def _counters(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

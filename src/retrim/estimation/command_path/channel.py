@@ -114,7 +114,7 @@ class Channel(eqx.Module):
         )  # fmt: skip
 
     def measured(
-        self, features: Float[Array, "axes m"], sample: Sample, keep: Float[Array, ""], dt: float, *, pushed: bool
+        self, features: Float[Array, "axes m"], sample: Sample, keep: Float[Array, ""], dt: float, *, may_jump: bool
     ) -> "Channel":
         """Return the channel after one tick.
 
@@ -123,7 +123,7 @@ class Channel(eqx.Module):
             sample: The measurement; if it is not usable, only the time advances.
             keep: Remaining weight of earlier measurements.
             dt: Control tick [s].
-            pushed: Whether the disturbance of the channel may jump, as a push does.
+            may_jump: Whether the disturbance of the channel may jump, as a push does.
         """
         row = jnp.concatenate([features, sample.other, sample.value[:, None]], axis=1)
         innovation, variance = self.whitening.innovation(row, sample.kinds)
@@ -137,13 +137,13 @@ class Channel(eqx.Module):
         doubt = jnp.where(sample.usable, doubt, self.doubt)
         counts = sample.usable & (~far | (self.doubt > DOUBTFUL))
         # The beginning of a push is not a property of the vehicle, so the disturbance is estimated again.
-        jumped = sample.usable & ~counts & pushed
+        jumps = sample.usable & ~counts & may_jump
         weight = counts.astype(keep.dtype)
         column = jnp.concatenate([innovation[..., :-1], misfit[..., None]], axis=2)
         column = jnp.where(counts, column, 0.0) / jnp.sqrt(variance)[:, None, None]
         axes = row.shape[0]
         return Channel(
-            self.whitening.after(innovation, sample.kinds, counts, jumped),
+            self.whitening.after(innovation, sample.kinds, counts, jumps),
             keep * self.products + column[..., :, None] * column[..., None, :],
             keep * self.half_log + weight * 0.5 * axes * jnp.log(variance),
             keep * self.count + weight * axes,

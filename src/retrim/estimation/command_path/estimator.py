@@ -2,7 +2,7 @@
 
 Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimator.issued` with the new command, and
 :meth:`PathEstimator.accepted` if the plant accepted a different one. For a batch of ticks, call
-:meth:`PathEstimator.measured` in each and :meth:`PathEstimator.estimated` at the end. All arrays have fixed shapes.
+:meth:`PathEstimator.measured` in each and :meth:`PathEstimator.estimate_path` at the end. All arrays have fixed shapes.
 """
 
 import dataclasses
@@ -123,7 +123,7 @@ class PathEstimator(eqx.Module):
         unknown = Estimate(zero, zero, zero, zero, jnp.array(False))
         estimate = PathEstimate(*(unknown,) * 8)
         start = Consistency.start(x)
-        return self.estimated(
+        return self.estimate_path(
             PathState(CommandHistory.at_hover(self.dt), x, zero - jnp.inf, zero, start, channels, estimate)
         )
 
@@ -137,7 +137,7 @@ class PathEstimator(eqx.Module):
         age: Float[Array, ""] | float = 0.0,
     ) -> PathState:
         """Return the memory after a measurement, with a new estimate; for the arguments, see :meth:`measured`."""
-        return self.estimated(self.measured(s, t, x, omega, a, age))
+        return self.estimate_path(self.measured(s, t, x, omega, a, age))
 
     def measured(
         self,
@@ -173,36 +173,36 @@ class PathEstimator(eqx.Module):
 
         turning = so3.log(so3.mul(s.x.R.T, x.R)) / dt
         if omega is None:
-            turned = Reading(turning, certain, DIFFERENCE, age, dt)
+            turn_reading = Reading(turning, certain, DIFFERENCE, age, dt)
         else:
-            turned = Reading(omega, jnp.all(jnp.abs(omega) < RATE), DIRECT, jnp.zeros_like(age), 0.0)
+            turn_reading = Reading(omega, jnp.all(jnp.abs(omega) < RATE), DIRECT, jnp.zeros_like(age), 0.0)
             turning = omega
         now = s.channels
-        rates = now.rates.measured(features[1:3], turned.sample(slice(0, 2), none[1:3]), keep, dt, pushed=False)
-        yaw = now.yaw.measured(features[3:], turned.sample(slice(2, 3), none[3:]), keep, dt, pushed=False)
+        rates = now.rates.measured(features[1:3], turn_reading.sample(slice(0, 2), none[1:3]), keep, dt, may_jump=False)
+        yaw = now.yaw.measured(features[3:], turn_reading.sample(slice(2, 3), none[3:]), keep, dt, may_jump=False)
 
-        settled = certain & (s.elapsed > SETTLING)
+        has_settled = certain & (s.elapsed > SETTLING)
         up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype)
         axis = 0.5 * (s.x.R + x.R)[:, 2]
         drag = -0.5 * jnp.sum(axis * (s.x.v + x.v))
         fading = jnp.exp(-s.elapsed / jnp.array(FADING, dtype))
         other = jnp.concatenate([drag[None], fading])[None]
         lift = jnp.sum(axis * ((x.v - s.x.v) / dt + up)) - STANDARD_GRAVITY
-        lifted = Reading(lift[None], settled, DIFFERENCE, age, dt).sample(slice(0, 1), other)
-        thrust = now.thrust.measured(features[:1], lifted, keep, dt, pushed=True)
+        lift_sample = Reading(lift[None], has_settled, DIFFERENCE, age, dt).sample(slice(0, 1), other)
+        thrust = now.thrust.measured(features[:1], lift_sample, keep, dt, may_jump=True)
         force = now.force
         if a is not None:
             # The accelerometer has no latency, even if the attitude does.
             turn = so3.exp(age * turning)
             axis = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))[:, 2]
             lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
-            usable = settled & jnp.all(jnp.abs(a) < ACCELERATION)
+            usable = has_settled & jnp.all(jnp.abs(a) < ACCELERATION)
             now_read = Reading(lift[None], usable, DIRECT, jnp.zeros_like(age), dt)
-            force = force.measured(features[:1], now_read.sample(slice(0, 1), other), keep, dt, pushed=True)
+            force = force.measured(features[:1], now_read.sample(slice(0, 1), other), keep, dt, may_jump=True)
         channels = Channels(rates, yaw, thrust, force)
         return PathState(history, x, t, s.elapsed + dt, consistency, channels, s.estimate)
 
-    def estimated(self, s: PathState) -> PathState:
+    def estimate_path(self, s: PathState) -> PathState:
         """Return the memory with a new estimate.
 
         The rates determine the delay for all channels, and the accelerations provide a prior for the velocities.

@@ -43,8 +43,8 @@ class CommandHistory(eqx.Module):
         """Return, for each command entry, the steps at each of the :func:`ages` and the command before these steps."""
         newest_first = self.commands[::-1]
         steps = newest_first[:-1] - newest_first[1:]
-        joined = jnp.asarray(_joining(dt), dtype=steps.dtype) @ steps
-        return jnp.concatenate([joined, newest_first[-1:]]).T
+        whole = jnp.asarray(_joining(dt), dtype=steps.dtype) @ steps
+        return jnp.concatenate([whole, newest_first[-1:]]).T
 
 
 def ages(dt: float) -> np.ndarray:

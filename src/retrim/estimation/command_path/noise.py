@@ -52,7 +52,7 @@ class Whitening(eqx.Module):
         innovation: Float[Array, "kinds axes columns"],
         kinds: Float[Array, "kinds 2"],
         counts: Bool[Array, ""],
-        jumped: Bool[Array, ""],
+        jumps: Bool[Array, ""],
     ) -> "Whitening":
         """Return the memory after a row with this innovation.
 
@@ -60,7 +60,7 @@ class Whitening(eqx.Module):
             innovation: Result of :meth:`innovation`.
             kinds: :data:`DIRECT` or :data:`DIFFERENCE`.
             counts: Whether the row counts; otherwise only the time advances.
-            jumped: Whether the disturbance has jumped, and is therefore unknown.
+            jumps: Whether the disturbance has jumped, and is therefore unknown.
         """
         mu, wander = kinds.T
         b, cross, error = self.spread.T
@@ -70,11 +70,11 @@ class Whitening(eqx.Module):
         # Variance of b times that of the other terms, less the squared covariance, to avoid a difference of large
         # numbers.
         left = (b * (error + 1.0) - cross**2) / total
-        seen = jnp.stack([left + wander, gain, 1.0 - 1.0 / total], axis=1)
-        passed = jnp.stack([b + wander, jnp.zeros_like(b), jnp.ones_like(b)], axis=1)
+        gains = jnp.stack([left + wander, gain, 1.0 - 1.0 / total], axis=1)
+        carry = jnp.stack([b + wander, jnp.zeros_like(b), jnp.ones_like(b)], axis=1)
         unknown = jnp.stack([jnp.full_like(b, DIFFUSE), jnp.zeros_like(b), jnp.ones_like(b)], axis=1)
         return Whitening(
             self.disturbance + jnp.where(counts, gain, 0.0)[:, None, None] * innovation,
             jnp.where(counts, 1.0 / total, 0.0)[:, None, None] * innovation,
-            jnp.where(jumped, unknown, jnp.where(counts, seen, passed)),
+            jnp.where(jumps, unknown, jnp.where(counts, gains, carry)),
         )

@@ -102,5 +102,5 @@ def log_prior(cells: Float[Array, "cells 3"], prior: Prior, belief: Belief | Non
 def _inverse(a: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
     """Return the inverse of a covariance, with a correlation of at most 0.9999."""
     a = a + jnp.diag(1e-4 * jnp.diag(a) + TINY)
-    turned = jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
-    return turned / (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
+    adjugate = jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
+    return adjugate / (a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])

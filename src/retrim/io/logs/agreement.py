@@ -12,7 +12,7 @@ import numpy as np
 
 from .log_map import LogMap
 from .on_one_clock import UP, Ticks, turning
-from .resampling import smoothed
+from .resampling import smooth
 
 SMOOTH = 0.2  # time span of differences [s]
 MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.25  # [m/s], [rad], [rad/s], [m/s^2]: least motion that is compared
@@ -31,7 +31,7 @@ CLAIMS: Mapping[str, str] = {
 """What each figure means."""
 
 
-def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, float]:
+def agreement(log_map: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, float]:
     """Return the agreement figures, where 1 is complete agreement; a figure is absent if there is too little motion."""
     k = max(1, round(SMOOTH / ticks.dt))
     both = np.convolve(valid, np.ones(k + 1), mode="valid") > k
@@ -43,47 +43,51 @@ def agreement(chosen: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, floa
         return np.asarray(((total[k:] - total[:-k]) / k)[both])
 
     scores = dict[str, float]()
-    moved, told = ((ticks.p[k:] - ticks.p[:-k]) / (k * ticks.dt))[both], mean(ticks.v)
-    independent = chosen.position is not None and chosen.velocity is not None
-    if independent and max(_rms(moved), _rms(told)) > MOVES:
-        scores["motion"] = _with_signs(_explained(moved, told), moved, told, MOVES, _explained)
-    felt, axis = mean(ticks.a + UP), mean(ticks.R[:, :, 2])
-    scores["lift"] = _lift(felt, axis)
-    along = np.sum(felt * axis, axis=1)
-    if (scale := chosen.thrust.scale) is not None:
-        given = scale * float(np.median(mean(ticks.thrust[:, None])))
+    velocity, velocity_log = ((ticks.p[k:] - ticks.p[:-k]) / (k * ticks.dt))[both], mean(ticks.v)
+    independent = log_map.position is not None and log_map.velocity is not None
+    if independent and max(_rms(velocity), _rms(velocity_log)) > MOVES:
+        scores["motion"] = _with_signs(
+            _explained_share(velocity, velocity_log), velocity, velocity_log, MOVES, _explained_share
+        )
+    specific_force, axis = mean(ticks.a + UP), mean(ticks.R[:, :, 2])
+    scores["lift"] = _lift(specific_force, axis)
+    along = np.sum(specific_force * axis, axis=1)
+    if (scale := log_map.thrust.scale) is not None:
+        thrust = scale * float(np.median(mean(ticks.thrust[:, None])))
         had = float(np.median(np.abs(along)))
-        scores["thrust"] = 1.0 - abs(math.log2(max(given, 1e-6) / max(had, 1e-6)))
+        scores["thrust"] = 1.0 - abs(math.log2(max(thrust, 1e-6) / max(had, 1e-6)))
     rows = max(1, round(SLOW / ticks.dt))
-    changes = along - smoothed(along, rows)
+    changes = along - smooth(along, rows)
     if _beyond_noise(changes, k) > CLIMBS:
         late = max(1, round(LATE / ticks.dt))
         shifts = [np.concatenate([np.full(lag, ticks.thrust[0]), ticks.thrust])[: len(ticks.t)] for lag in range(late)]
         thrusts = [mean(each[:, None])[:, 0] for each in shifts]
-        result = max(_correlation(changes, each - smoothed(each, rows)) for each in thrusts)
+        result = max(_correlation(changes, each - smooth(each, rows)) for each in thrusts)
         scores["climb"] = result * abs(result)
-    turned = mean(turning(ticks.R, ticks.dt))
+    turn_rates = mean(turning(ticks.R, ticks.dt))
     for name, rates in (("turning", ticks.command), ("gyroscope", ticks.rates if ticks.gyroscope else None)):
-        if rates is not None and max(_rms(mean(rates)), _rms(turned)) > TURNS:
-            scores[name] = _with_signs(_alike(turned, mean(rates)), turned, mean(rates), TURNS, _alike)
+        if rates is not None and max(_rms(mean(rates)), _rms(turn_rates)) > TURNS:
+            scores[name] = _with_signs(_alike(turn_rates, mean(rates)), turn_rates, mean(rates), TURNS, _alike)
     return scores
 
 
 def heading_between(ticks: Ticks, valid: np.ndarray) -> float:
     """Return the rotation about the vertical that aligns the attitudes' tilt with the acceleration [deg]."""
-    felt, axis = (x - x.mean(axis=0) for x in ((ticks.a + UP)[valid, :2], ticks.R[valid, :2, 2]))
-    cross = np.sum(axis[:, 0] * felt[:, 1] - axis[:, 1] * felt[:, 0])
-    return float(np.nan_to_num(np.degrees(np.arctan2(cross, np.sum(axis * felt)))))
+    specific_force, axis = (x - x.mean(axis=0) for x in ((ticks.a + UP)[valid, :2], ticks.R[valid, :2, 2]))
+    cross = np.sum(axis[:, 0] * specific_force[:, 1] - axis[:, 1] * specific_force[:, 0])
+    return float(np.nan_to_num(np.degrees(np.arctan2(cross, np.sum(axis * specific_force)))))
 
 
-def _lift(felt: np.ndarray, axis: np.ndarray) -> float:
+def _lift(specific_force: np.ndarray, axis: np.ndarray) -> float:
     """Return the worse of two agreements: specific force with thrust axis, and its sideways part with the tilt."""
-    aligned = float(np.mean(np.sum(felt * axis, axis=1) / np.maximum(np.linalg.norm(felt, axis=1), 1e-9)))
-    sideways, tilt = (x[:, :2] - x[:, :2].mean(axis=0) for x in (felt, axis))
+    alignment = float(
+        np.mean(np.sum(specific_force * axis, axis=1) / np.maximum(np.linalg.norm(specific_force, axis=1), 1e-9))
+    )
+    sideways, tilt = (x[:, :2] - x[:, :2].mean(axis=0) for x in (specific_force, axis))
     if _rms(tilt) <= TILTS:
-        return aligned
+        return alignment
     leans = float(np.sum(sideways * tilt) / max(np.linalg.norm(sideways) * np.linalg.norm(tilt), 1e-12))
-    return min(aligned, _with_signs(leans, sideways, tilt, TILTS, _correlation))
+    return min(alignment, _with_signs(leans, sideways, tilt, TILTS, _correlation))
 
 
 def _with_signs(
@@ -110,7 +114,7 @@ def _rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
 
 
-def _explained(x: np.ndarray, by: np.ndarray) -> float:
+def _explained_share(x: np.ndarray, by: np.ndarray) -> float:
     """Return the explained share of the larger of the two signals."""
     return 1.0 - float(np.sum((x - by) ** 2) / max(np.sum(x**2), np.sum(by**2), 1e-12))
 

@@ -26,7 +26,7 @@ def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarra
             f"{values.shape[1]}"
         )
     if spec.form == "rotation vector":
-        turned, good = Rotation.from_rotvec(ANGLES[spec.unit] * values), np.ones(len(values), dtype=bool)
+        rotation, good = Rotation.from_rotvec(ANGLES[spec.unit] * values), np.ones(len(values), dtype=bool)
     elif spec.form == "roll pitch yaw":
         angles = ANGLES[spec.unit] * values
         if np.abs(angles).max() > 2.0 * np.pi + OFF:
@@ -34,7 +34,7 @@ def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarra
                 f"{path}: attitude: angles reach {np.abs(values).max():.4g} {spec.unit}; "
                 + ("are they in deg?" if spec.unit == "rad" else "no attitude is beyond a turn")
             )
-        turned = Rotation.from_euler("ZYX", angles[:, ::-1])
+        rotation = Rotation.from_euler("ZYX", angles[:, ::-1])
         good = np.ones(len(values), dtype=bool)
     elif spec.form == "matrix":
         R = values.reshape(-1, 3, 3)
@@ -42,15 +42,15 @@ def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarra
         good = _mostly(off < OFF, path, "matrices", "orthogonal")
         if np.median(np.linalg.det(R)) < 0.0:
             raise LogError(f"{path}: attitude: the matrices are mirrors, no rotations: an axis has the wrong sign")
-        turned = Rotation.from_matrix(np.where(good[:, None, None], R, np.eye(3)))
+        rotation = Rotation.from_matrix(np.where(good[:, None, None], R, np.eye(3)))
     else:
         norm = np.linalg.norm(values, axis=1)
         good = _mostly(np.abs(norm - 1.0) < OFF, path, "quaternions", "of norm one")
-        ordered = values if spec.form == "xyzw" else np.roll(values, -1, axis=1)
-        turned = Rotation.from_quat(np.where(good[:, None], ordered, [0.0, 0.0, 0.0, 1.0]))
+        order = values if spec.form == "xyzw" else np.roll(values, -1, axis=1)
+        rotation = Rotation.from_quat(np.where(good[:, None], order, [0.0, 0.0, 0.0, 1.0]))
     if spec.turns == "world to body":
-        turned = turned.inv()
-    return np.asarray(turned.as_matrix()), good
+        rotation = rotation.inv()
+    return np.asarray(rotation.as_matrix()), good
 
 
 def _mostly(good: np.ndarray, path: Path, what: str, right: str) -> np.ndarray:

@@ -14,7 +14,7 @@ from .series import Clock, Series, first_of, missing_field, sign_of
 
 
 def read_csv(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
+    path: Path, request: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
     """Read the columns of a CSV file; see :class:`~retrim.io.logs.series.LogReader`.
 
@@ -25,7 +25,7 @@ def read_csv(
         raise LogError(f'{path}: a CSV file needs a table [time] in the map, as field = "t" and unit = "s"')
     header, lines = _lines(path)
     places = {"": [_place(path, time.field, header)]}
-    for what, fields in wanted.items():
+    for what, fields in request.items():
         try:
             places[what] = [first_of(name, lambda each: _place(path, each, header)) for name in fields]
         except LogError:
@@ -35,7 +35,9 @@ def read_csv(
     if lines and len(lines[-1][1]) < len(header):
         notes.append(f"line {lines[-1][0]}, the last, is torn, and is left out")
         lines.pop()
-    columns: dict[int, list[list[float]]] = {place: [] for taken in places.values() for place, _ in taken}
+    columns: dict[int, list[list[float]]] = {
+        place: [] for parts_of_place in places.values() for place, _ in parts_of_place
+    }
     for number, cells in lines:
         if len(cells) != len(header):
             raise LogError(f"{path}, line {number}: {len(cells)} cells, but the header has {len(header)}")
@@ -46,10 +48,10 @@ def read_csv(
     if times.shape[1] != 1:
         raise LogError(f"{path}: column {time.field!r} holds lists, not times")
     result = dict[str, Series]()
-    for what, taken in list(places.items())[1:]:
+    for what, parts_of_place in list(places.items())[1:]:
         parts = [
             sign_of(name) * _part(path, name, arrays[place], part)
-            for name, (place, part) in zip(wanted[what], taken, strict=True)
+            for name, (place, part) in zip(request[what], parts_of_place, strict=True)
         ]
         result[what] = Series(time.scale * times[:, 0], np.concatenate(parts, axis=1))
     return result, notes
@@ -91,10 +93,10 @@ def _place(path: Path, name: str, header: list[str]) -> tuple[int, slice]:
 
 
 def _part(path: Path, name: str, array: np.ndarray, part: slice) -> np.ndarray:
-    chosen = array[:, part]
-    if not chosen.size:
+    columns = array[:, part]
+    if not columns.size:
         raise LogError(f"{path}: field {name!r}: the column holds {array.shape[1]} numbers")
-    return chosen
+    return columns
 
 
 def _is_number(cell: str) -> bool:

@@ -13,7 +13,7 @@ from .on_one_clock import Ticks, grid_of, on_one_clock
 from .other_maps import Other
 from .plausibility import check_plausible
 from .quantities import read_quantities
-from .thrust_map import mass_normalised
+from .thrust_map import normalise_thrust
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,18 @@ def read_flight_log(path: Path, log_map: LogMap | None = None, *, dt: float = 0.
     Raises:
         LogError: The file cannot be read, a field is missing, or the columns contradict the map.
     """
-    series, chosen, notes = read_quantities(path, log_map)
-    grid = grid_of(path, series, chosen.part, dt)
-    ticks = on_one_clock(path, chosen, series, grid)
-    marks = marks_of(chosen, series, grid.t)
-    valid, more = flight_part(path, ticks, marks, measured_position=chosen.position is not None)
+    series, used_map, notes = read_quantities(path, log_map)
+    grid = grid_of(path, series, used_map.part, dt)
+    ticks = on_one_clock(path, used_map, series, grid)
+    marks = marks_of(used_map, series, grid.t)
+    valid, more = flight_part(path, ticks, marks, measured_position=used_map.position is not None)
     notes += more
 
     def read(other: Other, part: slice) -> Ticks:
-        return on_one_clock(path, other.log_map, other.applied(series), replace(grid, t=grid.t[part]))
+        return on_one_clock(path, other.log_map, other.apply(series), replace(grid, t=grid.t[part]))
 
-    scores, warnings = check_plausible(path, chosen, ticks, read, valid)
-    c, full, more = mass_normalised(path, chosen.thrust, ticks, valid)
+    scores, warnings = check_plausible(path, used_map, ticks, read, valid)
+    c, full, more = normalise_thrust(path, used_map.thrust, ticks, valid)
     notes += more
     if gaps := int(np.sum(~ticks.known[ENDS:-ENDS])):
         notes.append(f"{gaps * ticks.dt:.2f} s have gaps in the samples, and are left out")

@@ -36,27 +36,27 @@ def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bo
     if most <= 0.0 and ticks.known.any():
         raise LogError(f'{path}: thrust is never above zero; if it points downwards the map must say positive = "down"')
     for name, holds in marks.holds.items():
-        if lost := float(np.sum(~holds) * dt):
-            notes.append(f"{name} was not valid for {lost:.1f} s, which are left out")
+        if gap := float(np.sum(~holds) * dt):
+            notes.append(f"{name} was not valid for {gap:.1f} s, which are left out")
         valid &= around(holds, ENDS)
     ground = on_ground(ticks) if valid.any() else np.zeros(len(valid), dtype=bool)
-    ground |= marks.landed
-    if (stood := float(np.sum(ground) * dt)) > 0.5:
-        said = f" (its land detector says {np.sum(marks.landed) * dt:.1f} s)" if marks.landed.any() else ""
-        notes.append(f"{stood:.1f} s on the ground{said} are left out")
+    ground |= marks.is_final
+    if (ground_time := float(np.sum(ground) * dt)) > 0.5:
+        detector_note = f" (its land detector says {np.sum(marks.is_final) * dt:.1f} s)" if marks.is_final.any() else ""
+        notes.append(f"{ground_time:.1f} s on the ground{detector_note} are left out")
     valid &= ~ground
     for name in ("velocity", "attitude"):
-        told, seen = marks.resets.get(name, np.zeros(len(valid), dtype=bool)), jumps_of(ticks, name)
-        if (both := (told | seen) & valid).any():
+        resets, airborne_jumps = marks.resets.get(name, np.zeros(len(valid), dtype=bool)), jumps_of(ticks, name)
+        if (both := (resets | airborne_jumps) & valid).any():
             notes.append(
-                f"{name} jumps {np.sum(both)} times ({np.sum(told & both)} resets by its counter); what is around is "
+                f"{name} jumps {np.sum(both)} times ({np.sum(resets & both)} resets by its counter); what is around is "
                 f"left out"
             )
-        valid &= around(~(told | seen), ENDS)
+        valid &= around(~(resets | airborne_jumps), ENDS)
     if measured_position:
-        more, said_too = _moves(path, ticks, ~ground, marks)
+        more, jump_notes = _moves(path, ticks, ~ground, marks)
         valid &= more
-        notes += said_too
+        notes += jump_notes
     if np.sum(valid) * dt < LEAST:
         why = f" ({'; '.join(notes)})" if notes else ""
         raise LogError(f"{path}: {np.sum(valid) * dt:.2f} s of flight are left, at least {LEAST:g} s are needed{why}")
@@ -74,8 +74,8 @@ def _finite(ticks: Ticks) -> np.ndarray:
 def _moves(path: Path, ticks: Ticks, airborne: np.ndarray, marks: Marks) -> tuple[np.ndarray, list[str]]:
     """Return where positions neither jump nor freeze."""
     notes, dt = list[str](), ticks.dt
-    moved = np.diff(ticks.p, axis=0) - 0.5 * dt * (ticks.v[1:] + ticks.v[:-1])
-    jumps = np.concatenate([[False], np.linalg.norm(moved, axis=1) > JUMP * dt + 0.05])
+    steps = np.diff(ticks.p, axis=0) - 0.5 * dt * (ticks.v[1:] + ticks.v[:-1])
+    jumps = np.concatenate([[False], np.linalg.norm(steps, axis=1) > JUMP * dt + 0.05])
     still = np.concatenate([[False], np.all(np.diff(ticks.p, axis=0) == 0.0, axis=1)])
     frozen = runs(still, max(2, round(FROZEN / dt))) & airborne
     if airborne.any() and np.mean(frozen[airborne]) > 0.5:
@@ -84,11 +84,13 @@ def _moves(path: Path, ticks: Ticks, airborne: np.ndarray, marks: Marks) -> tupl
         notes.append(f"position does not change for {np.sum(frozen) * dt:.2f} s in the air, which are left out")
     if np.mean(jumps) > 0.2:
         raise LogError(
-            f"{path}: position moves {np.median(np.linalg.norm(moved, axis=1)) / dt:.3g} m/s faster than velocity says "
+            f"{path}: position moves {np.median(np.linalg.norm(steps, axis=1)) / dt:.3g} m/s faster than velocity says "
             f"in {100 * np.mean(jumps):.0f} % of the flight; are the units right?"
         )
     jumps |= marks.resets.get("position", np.zeros(len(jumps), dtype=bool))
-    if (seen := jumps[1:] & airborne[1:]).any():
-        far = np.linalg.norm(moved, axis=1)[seen].max()
-        notes.append(f"position jumps {np.sum(seen)} times, by up to {far:.2f} m; what is around it is left out")
+    if (airborne_jumps := jumps[1:] & airborne[1:]).any():
+        far = np.linalg.norm(steps, axis=1)[airborne_jumps].max()
+        notes.append(
+            f"position jumps {np.sum(airborne_jumps)} times, by up to {far:.2f} m; what is around it is left out"
+        )
     return ~frozen & around(~jumps, ENDS), notes

@@ -4,7 +4,7 @@ import numpy as np
 
 from ...physics.state import STANDARD_GRAVITY
 from .on_one_clock import UP, Ticks
-from .resampling import runs, smoothed
+from .resampling import runs, smooth
 
 FLIES = 0.3  # share of the largest thrusts below which a vehicle is not in the air
 AROUND, LASTS = 0.3, 0.5  # averaging time, and shortest duration of a contact [s]
@@ -18,15 +18,15 @@ ENOUGH = 2.0  # flight time that is sufficient to determine hover thrust [s]
 
 def on_ground(ticks: Ticks) -> np.ndarray:
     """Return a mask of the ticks at which the vehicle is not in the air, (n,)."""
-    thrust = smoothed(ticks.thrust, max(1, round(1.0 / ticks.dt)))
+    thrust = smooth(ticks.thrust, max(1, round(1.0 / ticks.dt)))
     idle = thrust <= FLIES * np.percentile(thrust[ticks.known], 95)
     rows = max(1, round(AROUND / ticks.dt))
     speed, push, turn = (
-        np.linalg.norm(np.stack([smoothed(column, rows) for column in x.T], axis=1), axis=1)
+        np.linalg.norm(np.stack([smooth(column, rows) for column in x.T], axis=1), axis=1)
         for x in (ticks.v, ticks.a, ticks.rates)
     )
     hover = _hover(ticks, ~idle & ticks.known, speed)
-    lift = smoothed(ticks.thrust * ticks.R[:, 2, 2], rows)
+    lift = smooth(ticks.thrust * ticks.R[:, 2, 2], rows)
     stands = (speed < STILL) & (push < STEADY) & (turn < TURNS)
     z = ticks.p[:, 2]
     contact = runs(stands & (lift < CARRIES * hover), max(1, round(LASTS / ticks.dt)))

@@ -26,12 +26,12 @@ def jumps_of(ticks: Ticks, name: str) -> np.ndarray:
     return np.concatenate([[False], stands_out(steps, ticks.known[1:] & ticks.known[:-1], LEAST[name])])
 
 
-def stands_out(steps: np.ndarray, known: np.ndarray, least: float) -> np.ndarray:
+def stands_out(steps: np.ndarray, usable: np.ndarray, least: float) -> np.ndarray:
     """Return the steps that differ from the steps before and after them by more than the noise.
 
     Args:
         steps: Steps per unit of time, (n, columns).
-        known: Steps that are used to estimate the noise, (n,).
+        usable: Steps that are used to estimate the noise, (n,).
         least: Minimum difference for a detected step, whatever the noise.
     """
     if len(steps) < 4 * BESIDE:
@@ -43,7 +43,7 @@ def stands_out(steps: np.ndarray, known: np.ndarray, least: float) -> np.ndarray
     late = np.abs(before[-2 * BESIDE : -BESIDE]) < CALM * np.abs(before[-BESIDE:])
     after[-BESIDE:] = np.where(late, before[-BESIDE:], 0.0)
     far = np.where(before * after > 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
-    bent = np.abs(0.5 * (before + after))[known] if known.any() else np.zeros((1, 3))
+    bent = np.abs(0.5 * (before + after))[usable] if usable.any() else np.zeros((1, 3))
     limit = np.maximum(least, BEYOND * 1.4826 * np.median(bent, axis=0))
     far[:BESIDE] /= ENDS  # so that a vehicle that starts or stops does not count as a jump
     far[-BESIDE:] /= ENDS

@@ -151,7 +151,7 @@ class Acceleration:
 
 
 @dataclass(frozen=True, config=STRICT)
-class Landed:
+class LandDetector:
     """Fields that are non-zero while the vehicle is on the ground, if the log contains them."""
 
     fields: Flags
@@ -196,7 +196,7 @@ class LogMap:
     measured_rates: BodyRates | None = None
     """Gyroscope rates; by default they are derived from the attitudes."""
     acceleration: Acceleration | None = None
-    landed: Landed | None = None
+    is_final: LandDetector | None = None
     time: Time | None = None
     frames: Frames = Frames()
     part: Part = Part()

@@ -54,14 +54,14 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
     """
     times, notes, ahead = dict[str, np.ndarray](), list[str](), dict[str, float]()
     for topic, both in stamps.items():
-        stamp, received = both.T
+        stamp, arrival = both.T
         if np.mean(np.isnan(stamp) | (stamp == 0.0)) > 0.5:
-            times[topic], even = evenly(received)
-            said = ", less what held single messages up" if even else ""
-            notes.append(f"{topic} has no stamps; its times are those of reception{said}")
+            times[topic], even = evenly(arrival)
+            remark = ", less what held single messages up" if even else ""
+            notes.append(f"{topic} has no stamps; its times are those of reception{remark}")
         else:
             times[topic] = stamp
-            ahead[topic] = float(np.nanpercentile(received - stamp, EARLY))
+            ahead[topic] = float(np.nanpercentile(arrival - stamp, EARLY))
     alike = not ahead or max(ahead.values()) - min(ahead.values()) < APART
     if len(ahead) < len(times):
         alike = alike and all(abs(shift) < APART for shift in ahead.values())
@@ -72,25 +72,25 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
     return times, notes
 
 
-def evenly(received: np.ndarray) -> tuple[np.ndarray, bool]:
+def evenly(arrival: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the send times (plus the shortest delay) of messages with an even rate, and whether the rate is even.
 
     A message may be late but never early. The neighbour with the shortest delay therefore determines the send times of
     the messages around it. If the rate is not even, or if messages are lost, the times of reception are returned.
     """
-    n = len(received)
+    n = len(arrival)
     if n < FEWEST:
-        return received, False
+        return arrival, False
     turn = np.arange(n)
-    slope, start = np.polyfit(turn, received - received[0], 1)
-    late = received - received[0] - start - slope * turn
+    slope, start = np.polyfit(turn, arrival - arrival[0], 1)
+    late = arrival - arrival[0] - start - slope * turn
     reach = max(1, round(AROUND / slope)) if slope > 0.0 else n
     if reach >= n or np.ptp(late) > EVEN * slope:
-        return received, False
+        return arrival, False
     from scipy.ndimage import minimum_filter1d, uniform_filter1d  # local: they take as long to import as all of retrim
 
     least = minimum_filter1d(late, 2 * reach + 1, mode="nearest")
     if np.ptp(least) > LOST * slope:
-        return received, False
+        return arrival, False
     least = uniform_filter1d(least, 2 * reach + 1, mode="nearest")
-    return received - late + np.minimum(least, late), True
+    return arrival - late + np.minimum(least, late), True

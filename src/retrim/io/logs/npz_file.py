@@ -11,7 +11,7 @@ from .series import Clock, Series, first_of, missing_field, sign_of
 
 
 def read_npz(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
+    path: Path, request: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
     """Read the arrays of an NPZ file; ``u[1:4]`` selects columns. See :class:`~retrim.io.logs.series.LogReader`."""
     if time is None:
@@ -19,7 +19,7 @@ def read_npz(
     arrays = NpzMembers(path)
     t = _flat(path, time.field, arrays)[:, 0] * time.scale
     result = dict[str, Series]()
-    for what, fields in wanted.items():
+    for what, fields in request.items():
         try:
             columns = [sign_of(name) * first_of(name, lambda each: _flat(path, each, arrays)) for name in fields]
         except LogError:
@@ -46,9 +46,9 @@ def _flat(path: Path, name: str, arrays: NpzMembers) -> np.ndarray:
         return columns
     first, _, last = part.rstrip("]").partition(":")
     try:
-        chosen = columns[:, int(first) : int(last) if last else int(first) + 1]
+        column_part = columns[:, int(first) : int(last) if last else int(first) + 1]
     except ValueError as error:
         raise LogError(f"{path}: field {name!r}: the columns must be as [0] or [0:3]") from error
-    if not chosen.size:
+    if not column_part.size:
         raise LogError(f"{path}: field {name!r}: {base!r} has {columns.shape[1]} columns")
-    return chosen
+    return column_part

@@ -11,7 +11,7 @@ from . import log_map as maps
 from .attitudes import attitudes
 from .axes import to_body, to_world
 from .log_map import LogMap
-from .resampling import around, derivative, held, held_mean, interpolated, known, period, turned
+from .resampling import around, derivative, held_mean, hold_last, interpolate, interpolate_attitudes, mark_known, period
 from .series import Series
 
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
@@ -72,13 +72,13 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
         )
     if own < SHORTEST:
         raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
-    needed = {name: each for name, each in series.items() if " " not in name}  # marks also hold before and after
-    zero = min(each.t[0] for each in needed.values())
-    first = max(max(each.t[0] for each in needed.values()), zero + part.start)
+    required = {name: each for name, each in series.items() if " " not in name}  # marks also hold before and after
+    zero = min(each.t[0] for each in required.values())
+    first = max(max(each.t[0] for each in required.values()), zero + part.start)
     last = min(min(series[name].t[-1] for name in states), np.inf if part.end is None else zero + part.end)
     tick = dt if own <= (1.0 + ALIKE) * dt else own
     if last - first < 4.0 * tick:
-        spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in needed.items())
+        spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in required.items())
         raise LogError(f"{path}: the quantities have no time in common: {spans}")
     if (last - first) / tick > LONGEST:
         raise LogError(f"{path}: it lasts {last - first:.3g} s with a sample every {own:.3g} s; are the times right?")
@@ -99,46 +99,50 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     W, B = to_world(log_map.frames.world), to_body(log_map.frames.body)
     t, dt = grid.t, grid.dt
     of = {name: _columns(path, name, series) for name in series if " " not in name}
-    there = np.all([known(each, t, dt) for name, each in of.items() if name in STATES], axis=0)
-    logged, rotations = attitudes(of["attitude"].values, log_map.attitude, path)
+    there = np.all([mark_known(each, t, dt) for name, each in of.items() if name in STATES], axis=0)
+    attitude, rotations = attitudes(of["attitude"].values, log_map.attitude, path)
     stamps = of["attitude"].t
-    R = logged[np.searchsorted(stamps, t)] if grid.sampled else turned(stamps[rotations], logged[rotations], t)
+    R = (
+        attitude[np.searchsorted(stamps, t)]
+        if grid.sampled
+        else interpolate_attitudes(stamps[rotations], attitude[rotations], t)
+    )
     if not rotations.all():
-        there &= held(Series(stamps, rotations[:, None].astype(float)), t)[:, 0] > 0.5
+        there &= hold_last(Series(stamps, rotations[:, None].astype(float)), t)[:, 0] > 0.5
     own_world, own_body = log_map.attitude.world, log_map.attitude.body
     R = (to_world(own_world) if own_world else W) @ R @ (to_body(own_body) if own_body else B).T
     if log_map.attitude.heading:
         c, s = np.cos(np.deg2rad(log_map.attitude.heading)), np.sin(np.deg2rad(log_map.attitude.heading))
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
-    v = _speed(log_map) * interpolated(of["velocity"], t)
+    v = _speed(log_map) * interpolate(of["velocity"], t)
     in_world = log_map.velocity is None or log_map.velocity.axes == "world"
     v = v @ W.T if in_world else np.einsum("nij,nj->ni", R, v @ B.T)
     if log_map.position is None:
         p = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1]), axis=0)])
     else:
-        p = maps.METRES[log_map.position.unit] * interpolated(of["position"], t) @ W.T
+        p = maps.METRES[log_map.position.unit] * interpolate(of["position"], t) @ W.T
     spin = B * np.linalg.det(B)  # a rate is a pseudovector
-    thrust = _told(of["thrust"], grid)[:, 0] * log_map.thrust.sign / log_map.thrust.full
-    there &= known(of["thrust"], t, dt, held=COMMAND_HELD)
-    command = measured = hover = None
+    thrust = _sample_command(of["thrust"], grid)[:, 0] * log_map.thrust.sign / log_map.thrust.full
+    there &= mark_known(of["thrust"], t, dt, hold_s=COMMAND_HELD)
+    command = measurement = hover = None
     if log_map.rates is not None and "rates" in of:
-        command = maps.RATES[log_map.rates.unit] * _told(of["rates"], grid) @ spin.T
-        there &= known(of["rates"], t, dt, held=COMMAND_HELD)
+        command = maps.RATES[log_map.rates.unit] * _sample_command(of["rates"], grid) @ spin.T
+        there &= mark_known(of["rates"], t, dt, hold_s=COMMAND_HELD)
     if log_map.measured_rates is not None and "measured_rates" in of:
-        measured = maps.RATES[log_map.measured_rates.unit] * interpolated(of["measured_rates"], t) @ spin.T
-        there &= known(of["measured_rates"], t, dt)
+        measurement = maps.RATES[log_map.measured_rates.unit] * interpolate(of["measured_rates"], t) @ spin.T
+        there &= mark_known(of["measured_rates"], t, dt)
     if "hover" in of:
-        hover = held(of["hover"], t)[:, 0] / log_map.thrust.full
+        hover = hold_last(of["hover"], t)[:, 0] / log_map.thrust.full
     if log_map.acceleration is None:
         a = derivative(v, dt)
         there &= around(there, 2)
     else:
-        a = maps.ACCELERATIONS[log_map.acceleration.unit] * interpolated(of["acceleration"], t)
+        a = maps.ACCELERATIONS[log_map.acceleration.unit] * interpolate(of["acceleration"], t)
         a = a @ W.T if log_map.acceleration.axes == "world" else np.einsum("nij,nj->ni", R, a @ B.T)
         a = a - UP * (log_map.acceleration.gravity == "felt")
-        there &= known(of["acceleration"], t, dt)
-    rates = turning(R, dt) if measured is None else measured
-    return Ticks(t, p, R, v, a, rates, thrust, command, there, hover, dt, measured is not None)
+        there &= mark_known(of["acceleration"], t, dt)
+    rates = turning(R, dt) if measurement is None else measurement
+    return Ticks(t, p, R, v, a, rates, thrust, command, there, hover, dt, measurement is not None)
 
 
 def _speed(log_map: LogMap) -> float:
@@ -148,10 +152,10 @@ def _speed(log_map: LogMap) -> float:
     return 1.0 if log_map.position is None else maps.METRES[log_map.position.unit]
 
 
-def _told(command: Series, grid: Grid) -> np.ndarray:
+def _sample_command(command: Series, grid: Grid) -> np.ndarray:
     """Return a command at each tick: its sample, or its mean over the tick if the command has its own times."""
-    sampled = grid.sampled and np.array_equal(np.intersect1d(command.t, grid.t), grid.t)
-    return held(command, grid.t) if sampled else held_mean(command, grid.t, grid.dt)
+    samples = grid.sampled and np.array_equal(np.intersect1d(command.t, grid.t), grid.t)
+    return hold_last(command, grid.t) if samples else held_mean(command, grid.t, grid.dt)
 
 
 def turning(R: np.ndarray, dt: float) -> np.ndarray:
@@ -167,8 +171,8 @@ def turning(R: np.ndarray, dt: float) -> np.ndarray:
 
 def _columns(path: Path, name: str, series: dict[str, Series]) -> Series:
     """Return a series after checking its number of columns."""
-    wanted, result = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
-    if name != "attitude" and result != wanted:
+    width, result = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
+    if name != "attitude" and result != width:
         hint = "; add the motors' thrusts up into one column" if name == "thrust" and result == 4 else ""
-        raise LogError(f"{path}: {name} needs {wanted} number{'s' * (wanted > 1)}, its fields hold {result}{hint}")
+        raise LogError(f"{path}: {name} needs {width} number{'s' * (width > 1)}, its fields hold {result}{hint}")
     return series[name]

@@ -28,7 +28,7 @@ class Other(NamedTuple):
     turns: Mapping[str, np.ndarray]
     """Matrices that multiply the quantities' columns from the right."""
 
-    def applied(self, series: Mapping[str, Series]) -> dict[str, Series]:
+    def apply(self, series: Mapping[str, Series]) -> dict[str, Series]:
         """Return the series after multiplication by ``turns``."""
         return {
             name: Series(each.t, each.values @ self.turns[name]) if name in self.turns else each
@@ -36,10 +36,10 @@ class Other(NamedTuple):
         }
 
 
-def others(chosen: LogMap) -> Iterator[Other]:
+def others(log_map: LogMap) -> Iterator[Other]:
     """Return maps that differ in one unit, form, frame or sign, or in both frames."""
     for table, key in STATEMENTS:
-        spec: Any = getattr(chosen, table)
+        spec: Any = getattr(log_map, table)
         if spec is None:
             continue
         for value in _values(spec, key):
@@ -47,20 +47,20 @@ def others(chosen: LogMap) -> Iterator[Other]:
                 continue
             if table == "attitude" and key == "form" and {value, spec.form} != {"xyzw", "wxyz"}:
                 continue
-            yield Other(f'{table}.{key} = "{value}"', _with(chosen, table, key, value), {})
-    yield from _frames(chosen)
-    yield from _signs(chosen)
+            yield Other(f'{table}.{key} = "{value}"', _with(log_map, table, key, value), {})
+    yield from _frames(log_map)
+    yield from _signs(log_map)
 
 
-def with_heading(chosen: LogMap, degrees: float) -> Other:
+def with_heading(log_map: LogMap, degrees: float) -> Other:
     """Return a map with an additional rotation of the attitudes about the vertical."""
-    heading = math.remainder(chosen.attitude.heading + round(degrees), 360.0)
-    attitude = dataclasses.replace(chosen.attitude, heading=heading)
-    return Other(f"attitude.heading = {heading:.0f}", dataclasses.replace(chosen, attitude=attitude), {})
+    heading = math.remainder(log_map.attitude.heading + round(degrees), 360.0)
+    attitude = dataclasses.replace(log_map.attitude, heading=heading)
+    return Other(f"attitude.heading = {heading:.0f}", dataclasses.replace(log_map, attitude=attitude), {})
 
 
-def _frames(chosen: LogMap) -> Iterator[Other]:
-    frames = chosen.frames
+def _frames(log_map: LogMap) -> Iterator[Other]:
+    frames = log_map.frames
     pairs = [
         (frames.world, other_body(frames.body)),
         (other_world(frames.world), frames.body),
@@ -69,22 +69,22 @@ def _frames(chosen: LogMap) -> Iterator[Other]:
     for world, body in pairs:
         if left_handed(world) == left_handed(body):
             words = _differences("frames", (frames.world, frames.body), (world, body))
-            yield Other(words, dataclasses.replace(chosen, frames=maps.Frames(world, body)), {})
-    own = chosen.attitude.world or frames.world, chosen.attitude.body or frames.body
-    turned = [(world, own[1]) for world in turned_about_z(own[0], "ENWS")]
-    turned += [(own[0], body) for body in turned_about_z(own[1], "FLBR")]
-    for world, body in [*pairs, *turned]:
+            yield Other(words, dataclasses.replace(log_map, frames=maps.Frames(world, body)), {})
+    own = log_map.attitude.world or frames.world, log_map.attitude.body or frames.body
+    variants = [(world, own[1]) for world in turned_about_z(own[0], "ENWS")]
+    variants += [(own[0], body) for body in turned_about_z(own[1], "FLBR")]
+    for world, body in [*pairs, *variants]:
         if left_handed(world) == left_handed(body):
-            attitude = dataclasses.replace(chosen.attitude, world=world, body=body)
+            attitude = dataclasses.replace(log_map.attitude, world=world, body=body)
             words = _differences("attitude", own, (world, body))
-            yield Other(words, dataclasses.replace(chosen, attitude=attitude), {})
+            yield Other(words, dataclasses.replace(log_map, attitude=attitude), {})
 
 
 def _differences(table: str, old: tuple[str, str], new: tuple[str, str]) -> str:
     """Return the axes that differ, in the syntax of a map."""
     names = ("world", "body")
-    said = [f'{table}.{name} = "{b}"' for name, a, b in zip(names, old, new, strict=True) if a != b]
-    return " and ".join(said)
+    statements = [f'{table}.{name} = "{b}"' for name, a, b in zip(names, old, new, strict=True) if a != b]
+    return " and ".join(statements)
 
 
 def turned_about_z(name: str, letters: str) -> list[str]:
@@ -105,10 +105,10 @@ def other_body(name: str) -> str:
     return "FRD" if "U" in name else "FLU"
 
 
-def _signs(chosen: LogMap) -> Iterator[Other]:
+def _signs(log_map: LogMap) -> Iterator[Other]:
     """Return maps in which a quantity's numbers have different signs, or a different order."""
     for table in ("position", "velocity", "attitude", "rates", "measured_rates"):
-        spec: Any = getattr(chosen, table)
+        spec: Any = getattr(log_map, table)
         if spec is None or (table == "attitude" and spec.form in ("matrix", "rotation vector")):
             continue
         quaternion = table == "attitude" and spec.form in ("xyzw", "wxyz")
@@ -116,29 +116,29 @@ def _signs(chosen: LogMap) -> Iterator[Other]:
             if quaternion and signs == (-1, -1, -1):
                 continue  # this is the inverse, which `turns` covers
             row = signs if not quaternion else (*signs, 1) if spec.form == "xyzw" else (1, *signs)
-            yield _arranged(chosen, table, range(len(row)), row)
+            yield _arrange(log_map, table, range(len(row)), row)
         if table == "attitude" and not quaternion:
             for order in ((1, 0, 2), (2, 1, 0)):
-                yield _arranged(chosen, table, order, (1, 1, 1))
+                yield _arrange(log_map, table, order, (1, 1, 1))
         if table != "attitude":
             for signs in ((1, 1, 1), *SIGNS):
-                yield _arranged(chosen, table, (1, 0, 2), signs)
+                yield _arrange(log_map, table, (1, 0, 2), signs)
 
 
-def _arranged(chosen: LogMap, table: str, order: Sequence[int], signs: Sequence[int]) -> Other:
+def _arrange(log_map: LogMap, table: str, order: Sequence[int], signs: Sequence[int]) -> Other:
     """Return a map with the fields in a different order, each with a sign."""
-    spec: Any = getattr(chosen, table)
+    spec: Any = getattr(log_map, table)
     turn = np.zeros((len(order), len(order)))
     for column, (row, sign) in enumerate(zip(order, signs, strict=True)):
         turn[row, column] = sign
     if len(spec.fields) != len(order):
-        shown = ", ".join("-" * (sign < 0) + str(row) for row, sign in zip(order, signs, strict=True))
-        words = f"the numbers {shown} of {', '.join(spec.fields)} for {table}.fields"
+        entries = ", ".join("-" * (sign < 0) + str(row) for row, sign in zip(order, signs, strict=True))
+        words = f"the numbers {entries} of {', '.join(spec.fields)} for {table}.fields"
     else:
         names = [(spec.fields[row], sign) for row, sign in zip(order, signs, strict=True)]
-        signed = [name if sign > 0 else name[1:] if name.startswith("-") else f"-{name}" for name, sign in names]
-        words = f"{table}.fields = [" + ", ".join(f'"{name}"' for name in signed) + "]"
-    return Other(words, chosen, {table: turn})
+        signed_names = [name if sign > 0 else name[1:] if name.startswith("-") else f"-{name}" for name, sign in names]
+        words = f"{table}.fields = [" + ", ".join(f'"{name}"' for name in signed_names) + "]"
+    return Other(words, log_map, {table: turn})
 
 
 def _values(spec: Any, key: str) -> tuple[Any, ...]:
@@ -146,8 +146,8 @@ def _values(spec: Any, key: str) -> tuple[Any, ...]:
     return get_args(kind)
 
 
-def _with(chosen: LogMap, table: str, key: str, value: Any) -> LogMap:
+def _with(log_map: LogMap, table: str, key: str, value: Any) -> LogMap:
     changes = {key: value} | (
         {"mass": None, "hover": None, "full": 1.0} if table == "thrust" else {}
     )  # these belong to a single unit
-    return dataclasses.replace(chosen, **{table: dataclasses.replace(getattr(chosen, table), **changes)})
+    return dataclasses.replace(log_map, **{table: dataclasses.replace(getattr(log_map, table), **changes)})

@@ -26,13 +26,13 @@ DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.65, "climb": 0.25, "turning
 
 
 def check_plausible(
-    path: Path, chosen: LogMap, ticks: Ticks, read: Callable[[Other, slice], Ticks], valid: np.ndarray
+    path: Path, log_map: LogMap, ticks: Ticks, read: Callable[[Other, slice], Ticks], valid: np.ndarray
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Check that a log's quantities agree with each other.
 
     Args:
         path: The log file, for messages.
-        chosen: The map.
+        log_map: The map.
         ticks: The log, read with the map.
         read: Reads a part of the log with a different map.
         valid: Mask of the ticks that are used.
@@ -43,10 +43,10 @@ def check_plausible(
     Raises:
         LogError: The quantities do not agree; the message names the wrong statement in the map, if there is one.
     """
-    scores = agreement(chosen, ticks, valid)
+    scores = agreement(log_map, ticks, valid)
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
-    if wrong and (mended := _mended(chosen, read, valid)):
-        raise LogError(f"{path}: {mended}")
+    if wrong and (correction := _find_correction(log_map, read, valid)):
+        raise LogError(f"{path}: {correction}")
     for name, score in sorted(wrong.items(), key=lambda item: item[1]):
         if score < REFUSED[name]:
             raise LogError(
@@ -60,25 +60,25 @@ def check_plausible(
     )
 
 
-def _mended(chosen: LogMap, read: Callable[[Other, slice], Ticks], valid: np.ndarray) -> str:
+def _find_correction(log_map: LogMap, read: Callable[[Other, slice], Ticks], valid: np.ndarray) -> str:
     """Return the error and the map statement that corrects it best; an empty string if no statement corrects it."""
     part = _part(valid)
-    ticks = read(Other("", chosen, {}), part)
-    scores = agreement(chosen, ticks, valid[part])
+    ticks = read(Other("", log_map, {}), part)
+    scores = agreement(log_map, ticks, valid[part])
     wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
     best, result = (0.0, 0.0), ""
-    turned = with_heading(chosen, heading_between(ticks, valid[part]) if valid[part].any() else 0.0)
-    for other in (*others(chosen), turned) if wrong else ():
+    rotated_map = with_heading(log_map, heading_between(ticks, valid[part]) if valid[part].any() else 0.0)
+    for other in (*others(log_map), rotated_map) if wrong else ():
         try:
             after = agreement(other.log_map, read(other, part), valid[part])
         except LogError:
             continue
-        mended = [name for name in wrong if 1.0 - after.get(name, -1.0) < (1.0 - wrong[name]) / BETTER]
-        kept = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items())
-        if not mended or not kept or _least(after) < AGREES:
+        correction = [name for name in wrong if 1.0 - after.get(name, -1.0) < (1.0 - wrong[name]) / BETTER]
+        holds = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items())
+        if not correction or not holds or _least(after) < AGREES:
             continue
         if (rank := (round(_least(after), 1), sum(after.values()))) > best:
-            name, best = min(mended, key=lambda each: wrong[each]), rank
+            name, best = min(correction, key=lambda each: wrong[each]), rank
             result = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
     return result
 

@@ -48,8 +48,8 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
         LogError: The file cannot be read, or a field is missing.
     """
     reader = _reader(path)
-    raw, chosen, notes = _read(path, reader, log_map)
-    age, clock = raw.pop("age", None), _clock(chosen)
+    raw, used_map, notes = _read(path, reader, log_map)
+    age, clock = raw.pop("age", None), _clock(used_map)
     if age is not None and clock is not None:  # the states were measured earlier, by the logged age
         for name in ("position", "velocity", "attitude"):
             if name in raw:
@@ -69,64 +69,64 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
         notes += more
     if "position" in series and "velocity" in series and not len(_valid(series, "position").t):
         del series["position"]
-        chosen = replace(chosen, position=None)
+        used_map = replace(used_map, position=None)
         notes.append("position is never valid, and is not used")
     if "velocity" not in series:
-        series["velocity"], said = slope_of(
-            path, _valid(series, "position"), METRES[getattr(chosen.position, "unit", "m")]
+        series["velocity"], remark = slope_of(
+            path, _valid(series, "position"), METRES[getattr(used_map.position, "unit", "m")]
         )
-        notes.append(said)
+        notes.append(remark)
         for name in ("position", "attitude"):  # the derivative does not exist at the ends
             there = np.isin(series[name].t, series["velocity"].t)
             if np.sum(there) == len(series["velocity"].t):
                 series[name] = Series(series[name].t[there], series[name].values[there])
     elif "position" not in series:
         notes.append("positions are the integral of the velocities")
-    return series, chosen, notes
+    return series, used_map, notes
 
 
 def _read(path: Path, reader: LogReader, log_map: LogMap | None) -> tuple[dict[str, Series], LogMap, list[str]]:
     first: LogError | None = None
-    for chosen in [log_map] if log_map is not None else map(read_map, _usual(path)):
-        wanted, optional = _wanted(chosen)
+    for used_map in [log_map] if log_map is not None else map(read_map, _usual(path)):
+        request, optional = _list_fields(used_map)
         try:
-            raw, notes = reader(path, wanted, _clock(chosen), optional)
+            raw, notes = reader(path, request, _clock(used_map), optional)
         except LogError as error:
             if log_map is not None or "no field" not in str(error):
                 raise
             first = first or error
         else:
-            return raw, chosen, notes
+            return raw, used_map, notes
     usual = " or ".join(repr(name) for name in _usual(path))
     raise LogError(f"{first}; without a map it is read as {usual}: give --map map.toml") from first
 
 
-def _wanted(chosen: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]]:
+def _list_fields(used_map: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]]:
     """Return the fields of each quantity and mark, and the set of those that are optional."""
-    wanted, optional = dict[str, tuple[str, ...]](), set[str]()
+    request, optional = dict[str, tuple[str, ...]](), set[str]()
     marks = dict[str, tuple[str, ...]]()
     for name in QUANTITIES:
-        spec: Any = getattr(chosen, name)
+        spec: Any = getattr(used_map, name)
         if spec is None:
             continue
-        wanted[name] = tuple(spec.fields)
+        request[name] = tuple(spec.fields)
         optional |= {name} if getattr(spec, "optional", False) else set()
         for flag in FLAGS:
             marks[f"{name} {flag}"] = getattr(spec, flag, ())
-    marks["landed"] = () if chosen.landed is None else chosen.landed.fields
+    marks["landed"] = () if used_map.is_final is None else used_map.is_final.fields
     for name, fields in marks.items():
         for k, field in enumerate(fields):
-            wanted[f"{name} {k}"] = (field.partition("==")[0],)
+            request[f"{name} {k}"] = (field.partition("==")[0],)
             optional.add(f"{name} {k}")
-    if isinstance(chosen.thrust.hover, str):
-        wanted["hover"] = (chosen.thrust.hover,)
-    if chosen.time is not None and chosen.time.age is not None:
-        wanted["age"] = (chosen.time.age,)
-    return wanted, optional
+    if isinstance(used_map.thrust.hover, str):
+        request["hover"] = (used_map.thrust.hover,)
+    if used_map.time is not None and used_map.time.age is not None:
+        request["age"] = (used_map.time.age,)
+    return request, optional
 
 
-def _clock(chosen: LogMap) -> Clock | None:
-    return None if chosen.time is None else Clock(chosen.time.field, SECONDS[chosen.time.unit])
+def _clock(used_map: LogMap) -> Clock | None:
+    return None if used_map.time is None else Clock(used_map.time.field, SECONDS[used_map.time.unit])
 
 
 def _valid(series: dict[str, Series], name: str) -> Series:

@@ -36,7 +36,7 @@ class Recording:
     """The task's error [m], (n,)."""
     target: np.ndarray | None = None
     """The vehicle's target position in the world frame [m], (n, 3)."""
-    flown_by: Sequence[str] | None = None
+    controllers: Sequence[str] | None = None
     """Name of the controller that commanded the vehicle, (n,)."""
     policy_age: np.ndarray | None = None
     """Age of the flight data from which the policy was learned [s], (n,)."""
@@ -65,7 +65,7 @@ def write_mcap(path: Path, flight: Recording) -> None:
 
     types = get_typestore(Stores.ROS2_JAZZY)
     make = _Messages(types.types)
-    turned = [quaternions(x) for x in (flight.measured, flight.true)]
+    rotations = [quaternions(x) for x in (flight.measured, flight.true)]
     with tempfile.TemporaryDirectory(dir=path.parent) as place:
         bag = Path(place) / "flight"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -80,17 +80,19 @@ def write_mcap(path: Path, flight: Recording) -> None:
             later = 0.0 if first == 0.0 else 1e-9 - first
             for k, t in enumerate((flight.t + later).tolist()):
                 x, truth, u = flight.measured[k], flight.true[k], flight.command[k]
-                seen = t - float(flight.age[k])  # the header has the time of the state, and the log that of its arrival
-                add("/measured/pose", t, make.pose(seen, x, turned[0][k]))
-                add("/measured/velocity", t, make.twist(seen, x[12:15], np.zeros(3)))
-                add("/true/pose", t, make.pose(t, truth, turned[1][k]))
+                stamp = t - float(
+                    flight.age[k]
+                )  # the header has the time of the state, and the log that of its arrival
+                add("/measured/pose", t, make.pose(stamp, x, rotations[0][k]))
+                add("/measured/velocity", t, make.twist(stamp, x[12:15], np.zeros(3)))
+                add("/true/pose", t, make.pose(t, truth, rotations[1][k]))
                 add("/true/velocity", t, make.twist(t, truth[12:15], np.zeros(3)))
                 add("/command", t, make.twist(t, np.array([0.0, 0.0, u[0]]), u[1:]))
                 add("/error", t, make.number(float(flight.error[k])))
                 if flight.target is not None:
                     add("/reference", t, make.point(t, flight.target[k]))
-                if flight.flown_by is not None:
-                    add("/flown_by", t, make.text(flight.flown_by[k]))
+                if flight.controllers is not None:
+                    add("/flown_by", t, make.text(flight.controllers[k]))
                 if flight.policy_age is not None:
                     add("/age/policy", t, make.number(float(flight.policy_age[k])))
             for event in sorted(flight.events, key=lambda event: event.t):

@@ -62,19 +62,19 @@ def _write(rr: Any, stream: Any, flight: Recording) -> None:
         over_time(f"command/rates/{axis}", rr.Scalars.columns(scalars=flight.command[:, 1 + k]))
     if flight.policy_age is not None:
         over_time("age/policy", rr.Scalars.columns(scalars=flight.policy_age))
-    told = _told(flight)
-    if told:
-        times, texts = zip(*told, strict=True)
+    entries = _list_entries(flight)
+    if entries:
+        times, texts = zip(*entries, strict=True)
         over_time("events", rr.TextLog.columns(text=texts), np.asarray(times))
 
 
-def _told(flight: Recording) -> list[tuple[float, str]]:
+def _list_entries(flight: Recording) -> list[tuple[float, str]]:
     """Return the events and each change of the active controller, with times [s], in order."""
-    told = [(event.t, f"{event.kind}: {event.note}") for event in flight.events]
-    flown_by = flight.flown_by or ()
+    entries = [(event.t, f"{event.kind}: {event.note}") for event in flight.events]
+    controllers = flight.controllers or ()
     before: str | None = None
-    for t, name in zip(flight.t.tolist(), flown_by, strict=False):
+    for t, name in zip(flight.t.tolist(), controllers, strict=False):
         if name != before:
-            told.append((t, f"flown by {name}"))
+            entries.append((t, f"flown by {name}"))
         before = name
-    return sorted(told)
+    return sorted(entries)

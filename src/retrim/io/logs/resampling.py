@@ -12,16 +12,16 @@ def period(series: Series) -> float:
     return float(np.median(np.diff(series.t)))
 
 
-def known(series: Series, grid: np.ndarray, dt: float, *, held: float = 0.0) -> np.ndarray:
+def mark_known(series: Series, grid: np.ndarray, dt: float, *, hold_s: float = 0.0) -> np.ndarray:
     """Return where on a grid a series is known: between samples that are not far apart.
 
     Args:
         series: The samples.
         grid: Times [s].
         dt: Period of the grid [s].
-        held: Minimum time for which a command is held without a new sample [s].
+        hold_s: Minimum time for which a command is held without a new sample [s].
     """
-    longest = max(GAP * max(period(series), dt), held)
+    longest = max(GAP * max(period(series), dt), hold_s)
     after = np.searchsorted(series.t, grid, side="right")
     inside = (grid >= series.t[0]) & (grid <= series.t[-1])
     left, right = np.clip(after - 1, 0, len(series.t) - 1), np.clip(after, 0, len(series.t) - 1)
@@ -30,12 +30,12 @@ def known(series: Series, grid: np.ndarray, dt: float, *, held: float = 0.0) -> 
     return result
 
 
-def interpolated(series: Series, grid: np.ndarray) -> np.ndarray:
+def interpolate(series: Series, grid: np.ndarray) -> np.ndarray:
     """Return the values at grid times, interpolated linearly between samples."""
     return np.stack([np.interp(grid, series.t, column) for column in series.values.T], axis=1)
 
 
-def held(series: Series, grid: np.ndarray) -> np.ndarray:
+def hold_last(series: Series, grid: np.ndarray) -> np.ndarray:
     """Return the last value at or before each grid time."""
     return series.values[np.clip(np.searchsorted(series.t, grid, side="right") - 1, 0, None)]
 
@@ -51,7 +51,7 @@ def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
     return np.asarray((both[1] - both[0]) / dt)
 
 
-def turned(t: np.ndarray, R: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def interpolate_attitudes(t: np.ndarray, R: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return the attitudes at grid times, interpolated along the shortest rotation between samples."""
     from scipy.spatial.transform import Rotation, Slerp  # local, because it takes as long to import as all of retrim
 
@@ -65,7 +65,7 @@ def derivative(values: np.ndarray, dt: float) -> np.ndarray:
     return np.concatenate([inner[:1], inner[:1], inner, inner[-1:], inner[-1:]])
 
 
-def smoothed(x: np.ndarray, rows: int) -> np.ndarray:
+def smooth(x: np.ndarray, rows: int) -> np.ndarray:
     """Return the centred mean of a column over about ``rows`` rows, and over fewer at the ends."""
     kernel = np.ones(min(rows, len(x)))
     return np.asarray(np.convolve(x, kernel, mode="same") / np.convolve(np.ones(len(x)), kernel, mode="same"))
@@ -73,8 +73,8 @@ def smoothed(x: np.ndarray, rows: int) -> np.ndarray:
 
 def around(valid: np.ndarray, reach: int) -> np.ndarray:
     """Return where all rows up to ``reach`` before and after are valid."""
-    padded = np.concatenate([np.zeros(reach, bool), valid, np.zeros(reach, bool)])
-    return np.asarray(np.all([padded[k : k + len(valid)] for k in range(2 * reach + 1)], axis=0))
+    mask = np.concatenate([np.zeros(reach, bool), valid, np.zeros(reach, bool)])
+    return np.asarray(np.all([mask[k : k + len(valid)] for k in range(2 * reach + 1)], axis=0))
 
 
 def runs(flags: np.ndarray, length: int) -> np.ndarray:

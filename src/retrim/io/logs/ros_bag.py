@@ -30,7 +30,7 @@ class Place(NamedTuple):
 
 
 def read_bag(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
+    path: Path, request: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
     """Read topics from a bag; see :class:`~retrim.io.logs.series.LogReader`.
 
@@ -39,7 +39,7 @@ def read_bag(
     if find_spec("rosbags") is None:
         raise LogError(f"{path}: a bag needs rosbags: pip install rosbags")
     try:
-        return _read(path, wanted, time, optional)
+        return _read(path, request, time, optional)
     except LogError:
         raise
     except Exception as error:  # the parsers raise various errors for bytes that are not a bag
@@ -48,24 +48,24 @@ def read_bag(
 
 
 def _read(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str]
+    path: Path, request: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str]
 ) -> tuple[dict[str, Series], list[str]]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
-        places = _places(path, wanted, sorted({connection.topic for connection in bag.connections}), optional)
-        taken: dict[Place, list[list[float]]] = {place: [] for result in places.values() for place in result}
-        stamps: dict[str, list[tuple[float, float]]] = {place.topic: [] for place in taken}
-        chosen = [connection for connection in bag.connections if connection.topic in stamps]
-        for connection, received, raw in bag.messages(connections=chosen):
+        places = _places(path, request, sorted({connection.topic for connection in bag.connections}), optional)
+        values: dict[Place, list[list[float]]] = {place: [] for result in places.values() for place in result}
+        stamps: dict[str, list[tuple[float, float]]] = {place.topic: [] for place in values}
+        connections = [connection for connection in bag.connections if connection.topic in stamps]
+        for connection, arrival, raw in bag.messages(connections=connections):
             topic, message = connection.topic, bag.deserialize(raw, connection.msgtype)
             if not stamps[topic]:
-                _check_fields(path, topic, message, places, taken, optional)
-            stamps[topic].append((stamp_of(message, time), NANOSECOND * received))
-            for place in taken:
+                _check_fields(path, topic, message, places, values, optional)
+            stamps[topic].append((stamp_of(message, time), NANOSECOND * arrival))
+            for place in values:
                 if place.topic == topic:
-                    taken[place].append(_numbers(path, place, message))
+                    values[place].append(_numbers(path, place, message))
     for what in [what for what, result in places.items() if not stamps[result[0].topic]]:
         if what not in optional:
             raise LogError(f"{path}: topic {places[what][0].topic!r} has no message")
@@ -73,19 +73,19 @@ def _read(
     times, notes = on_one_time({topic: np.array(both) for topic, both in stamps.items() if both})
     result = dict[str, Series]()
     for what, fields in places.items():
-        parts = [sign_of(name) * np.array(taken[place]) for name, place in zip(wanted[what], fields, strict=True)]
+        parts = [sign_of(name) * np.array(values[place]) for name, place in zip(request[what], fields, strict=True)]
         result[what] = Series(times[fields[0].topic], np.concatenate(parts, axis=1))
     return result, notes
 
 
 def _places(
-    path: Path, wanted: Mapping[str, Sequence[str]], known: Sequence[str], optional: Collection[str]
+    path: Path, request: Mapping[str, Sequence[str]], topics: Sequence[str], optional: Collection[str]
 ) -> dict[str, list[Place]]:
     """Return the locations of each quantity's fields."""
     places = dict[str, list[Place]]()
-    for what, fields in wanted.items():
+    for what, fields in request.items():
         try:
-            places[what] = [first_of(name, lambda each: _place(path, each, known)) for name in fields]
+            places[what] = [first_of(name, lambda each: _place(path, each, topics)) for name in fields]
         except LogError:
             if what not in optional:
                 raise
@@ -95,13 +95,13 @@ def _places(
     return places
 
 
-def _place(path: Path, name: str, known: Sequence[str]) -> Place:
+def _place(path: Path, name: str, topics: Sequence[str]) -> Place:
     topic, _, inner = name.partition(".")
     if not inner:
         raise LogError(f"{path}: field {name!r} must be a topic and a path, as /odom.pose.pose.position")
-    fit = [topic] if topic in known else fitting(known, topic)
+    fit = [topic] if topic in topics else fitting(topics, topic)
     if not fit:
-        raise missing_field(path, topic, known)
+        raise missing_field(path, topic, topics)
     if len(fit) > 1:
         raise LogError(f"{path}: {topic!r} fits several topics: {', '.join(fit[:5])}; name one in the map")
     return Place(fit[0], inner)
@@ -112,7 +112,7 @@ def _check_fields(
     topic: str,
     message: Any,
     places: dict[str, list[Place]],
-    taken: dict[Place, list[list[float]]],
+    values: dict[Place, list[list[float]]],
     optional: Collection[str],
 ) -> None:
     """Remove the optional quantities that a topic's messages do not contain."""
@@ -122,18 +122,18 @@ def _check_fields(
                 _numbers(path, place, message)
         except LogError:
             del places[what]
-    needed = {place for result in places.values() for place in result}
-    for place in [place for place in taken if place not in needed]:
-        del taken[place]
+    needed_places = {place for result in places.values() for place in result}
+    for place in [place for place in values if place not in needed_places]:
+        del values[place]
 
 
 def _numbers(path: Path, place: Place, message: Any) -> list[float]:
     """Return the numbers in a field."""
     name = f"{place.topic}.{place.inner}"
-    parsed = re.fullmatch(r"([\w.]+)(?:\[(\d+)\])?", place.inner, re.ASCII)
-    if parsed is None:
+    match = re.fullmatch(r"([\w.]+)(?:\[(\d+)\])?", place.inner, re.ASCII)
+    if match is None:
         raise LogError(f"{path}: field {name!r} is no path in a message, as pose.position or data[0]")
-    inner, element = parsed.groups()
+    inner, element = match.groups()
     try:
         value = attrgetter(inner)(message)
         if element is not None:

@@ -32,7 +32,7 @@ class LogReader(Protocol):
     def __call__(
         self,
         path: Path,
-        wanted: Mapping[str, Sequence[str]],
+        request: Mapping[str, Sequence[str]],
         time: "Clock | None",
         optional: Collection[str] = (),
     ) -> tuple[dict[str, Series], list[str]]:
@@ -40,7 +40,7 @@ class LogReader(Protocol):
 
         Args:
             path: The file, or a bag's folder.
-            wanted: Field names for each quantity, in the format's notation. A field may contain several numbers. A
+            request: Field names for each quantity, in the format's notation. A field may contain several numbers. A
                 minus sign may precede a name, and alternatives may follow the name; see :func:`first_of`.
             time: Time field; None for the format's own times.
             optional: Quantities that are left out if the log does not contain them.
@@ -83,11 +83,11 @@ def sign_of(name: str) -> float:
     return -1.0 if name.startswith("-") else 1.0
 
 
-def missing_field(path: Path, name: str, known: Sequence[str]) -> LogError:
+def missing_field(path: Path, name: str, names: Sequence[str]) -> LogError:
     """Return the error for a missing field."""
-    more = f", and {len(known) - MANY} more" if len(known) > MANY else ""
-    near = get_close_matches(name, known, n=1)
-    shown = ["".join(c if c.isprintable() else "\ufffd" for c in each[:80]) for each in dict.fromkeys([*near, *known])][
-        :MANY
-    ]
-    return LogError(f"{path}: no field {name[:80]!r}; {suggestion(name, shown)}{more}")
+    more = f", and {len(names) - MANY} more" if len(names) > MANY else ""
+    near = get_close_matches(name, names, n=1)
+    shown_names = [
+        "".join(c if c.isprintable() else "\ufffd" for c in each[:80]) for each in dict.fromkeys([*near, *names])
+    ][:MANY]
+    return LogError(f"{path}: no field {name[:80]!r}; {suggestion(name, shown_names)}{more}")

@@ -50,13 +50,13 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
         rows = np.arange(first, min(first + CHUNK, len(t) - half))
         v[rows] = _cubics(t, p, pieces, rows, half, tick)[0]
     result = np.isfinite(v[:, 0])
-    said = (
+    remark = (
         f"velocity is the derivative of the position, smoothed over {2000 * half * tick:.0f} ms, centred, without a "
         f"lag; its noise is about {noise:.2g} m/s"
     )
     if jumps.any():
-        said += f"; the position jumps {np.sum(jumps)} times, and what is around is left out"
-    return Series(t[result], v[result]), said
+        remark += f"; the position jumps {np.sum(jumps)} times, and what is around is left out"
+    return Series(t[result], v[result]), remark
 
 
 def _cubics(

@@ -12,7 +12,7 @@ from .on_one_clock import UP, Ticks
 LEAST = 1e-9  # thrust share below which a number is not a command
 
 
-def mass_normalised(
+def normalise_thrust(
     path: Path, spec: Thrust, ticks: Ticks, valid: np.ndarray
 ) -> tuple[np.ndarray, float | None, list[str]]:
     """Return the thrust [m/s^2], the acceleration at full thrust if the log's thrust is a share, and notes.
@@ -23,8 +23,8 @@ def mass_normalised(
     if spec.scale is not None:
         return spec.scale * ticks.thrust, None, []
     if spec.hover is None:
-        felt = ticks.a[valid] + UP
-        along, share = np.sum(felt * ticks.R[valid, :, 2], axis=1), ticks.thrust[valid]
+        specific_force = ticks.a[valid] + UP
+        along, share = np.sum(specific_force * ticks.R[valid, :, 2], axis=1), ticks.thrust[valid]
         largest = float(np.max(share))
         if largest < LEAST:
             raise LogError(
@@ -34,8 +34,8 @@ def mass_normalised(
         if full <= 0.0:
             raise LogError(f"{path}: the more thrust, the less acceleration along its axis; is it the right field?")
         hover = spec.full * STANDARD_GRAVITY / full
-        said = f"{hover:.3f}" if spec.full == 1.0 else f"{hover:.5g}"
-        return full * ticks.thrust, full, [f"thrust map found from the flight: hover at {said}"]
+        number = f"{hover:.3f}" if spec.full == 1.0 else f"{hover:.5g}"
+        return full * ticks.thrust, full, [f"thrust map found from the flight: hover at {number}"]
     hovers = ticks.hover if ticks.hover is not None else np.full(len(ticks.t), float(spec.hover) / spec.full)
     if not np.all(hovers[valid] > 0.01):
         raise LogError(f"{path}: thrust at hover, {spec.hover!r}, is not positive all the time")

@@ -35,12 +35,12 @@ def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
         (lambda _: ~finite, "are not finite"),
         (impossible, "have an impossible time"),
         (late, "are not newer than the one before"),
-        (repeated, "have the time of the one before"),
+        (find_repeats, "have the time of the one before"),
     )
     for rule, words in rules:
         out = rule(series.t)
-        if lost := int(np.sum(out)):
-            notes.append(f"{what}: {lost} of {count} samples {words}, and are left out")
+        if dropouts := int(np.sum(out)):
+            notes.append(f"{what}: {dropouts} of {count} samples {words}, and are left out")
             series = Series(series.t[~out], series.values[~out])
     t = series.t
     if (back := np.flatnonzero(np.diff(t) < 0)).size:
@@ -68,9 +68,9 @@ def impossible(t: np.ndarray) -> np.ndarray:
     out = (t < first - reach) | (t > last + reach) | ((t == 0.0) & (earliest > LATE_S))
     inside = t[~out]
     if np.any(np.diff(inside) < -LATE_S):
-        kept = _longest_rise(inside)
-        newest = np.fmax.accumulate(np.where(kept, inside, -np.inf))
-        out[~out] = ~kept & (np.abs(inside - newest) > LATE_S)
+        rising = _longest_rise(inside)
+        newest = np.fmax.accumulate(np.where(rising, inside, -np.inf))
+        out[~out] = ~rising & (np.abs(inside - newest) > LATE_S)
     return out if np.sum(out) <= most else none
 
 
@@ -80,7 +80,7 @@ def late(t: np.ndarray) -> np.ndarray:
     return np.asarray((t < newest) & (t > newest - LATE_S))
 
 
-def repeated(t: np.ndarray) -> np.ndarray:
+def find_repeats(t: np.ndarray) -> np.ndarray:
     """Return a mask of times that equal the previous one."""
     return np.concatenate([[False], np.diff(t) == 0.0])
 
@@ -92,7 +92,7 @@ def _longest_rise(t: np.ndarray) -> np.ndarray:
         at = bisect_right(ends, x)
         before[k] = places[at - 1] if at else -1
         ends[at : at + 1], places[at : at + 1] = [x], [k]
-    kept, k = np.zeros(len(t), dtype=bool), places[-1]
+    rising, k = np.zeros(len(t), dtype=bool), places[-1]
     while k >= 0:
-        kept[k], k = True, int(before[k])
-    return kept
+        rising[k], k = True, int(before[k])
+    return rising

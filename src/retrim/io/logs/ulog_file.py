@@ -21,7 +21,7 @@ MICROSECOND = 1e-6
 
 
 def read_ulog(
-    path: Path, wanted: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
+    path: Path, request: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
     """Read topics from a ULog; see :class:`~retrim.io.logs.series.LogReader`.
 
@@ -30,14 +30,14 @@ def read_ulog(
     """
     if find_spec("pyulog") is None:
         raise LogError(f"{path}: a ULog needs pyulog: pip install pyulog")
-    log = _parsed(path)
+    log = _parse(path)
     topics = {f"{d.name}#{d.multi_id}" if d.multi_id else d.name: d for d in log.data_list}
     notes = ["the file is damaged; what could be read is used"] if log.file_corruption else []
     if log.dropouts:
-        lost = sum(each.duration for each in log.dropouts) / 1000.0
-        notes.append(f"the logger dropped out {len(log.dropouts)} times, for {lost:.2f} s in all")
+        dropout_s = sum(each.duration for each in log.dropouts) / 1000.0
+        notes.append(f"the logger dropped out {len(log.dropouts)} times, for {dropout_s:.2f} s in all")
     result = dict[str, Series]()
-    for what, fields in wanted.items():
+    for what, fields in request.items():
         try:
             parts = [first_of(name, lambda each: _field(path, each, topics)) for name in fields]
         except LogError:
@@ -65,7 +65,7 @@ def _times(path: Path, topic: Any, time: Clock | None) -> np.ndarray:
     raise LogError(f"{path}: topic {topic.name!r} has no time")
 
 
-def _parsed(path: Path) -> Any:
+def _parse(path: Path) -> Any:
     from pyulog import ULog
 
     try:

@@ -118,10 +118,10 @@ class EnsembleModel(eqx.Module):
 
     def fit(self, state: EnsembleState, rows: Targets) -> tuple[EnsembleState, Float[Array, ""]]:
         """Fit, starting from the previous fit; also return the error before the last step [m/s^2]."""
-        fitted, errors = fit_ensemble(
+        members, errors = fit_ensemble(
             state, rows, optimiser=self._optimiser(), steps=self.steps, spectral_weight=self.spectral_weight
         )
-        return fitted, jnp.sqrt(errors[-1])
+        return members, jnp.sqrt(errors[-1])
 
     def predict(self, state: EnsembleState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the mean of the members [m/s^2]."""
@@ -164,14 +164,14 @@ def fit_ensemble(
     weight = weight / jnp.maximum(jnp.sum(weight), 1.0)
 
     def loss(layers: Any, vectors: Any) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Any]]:
-        data, spectral, moved = jnp.zeros_like(features[0, 0]), jnp.zeros_like(features[0, 0]), []
+        data, spectral, shift = jnp.zeros_like(features[0, 0]), jnp.zeros_like(features[0, 0]), []
         for member, starting in zip(layers, vectors, strict=True):
-            predicted = jax.vmap(lambda f, member=member: _forward(member, f))(features)
-            data += jnp.sum(weight * jnp.sum((rows.a_res - predicted) ** 2, axis=1))
+            predictions = jax.vmap(lambda f, member=member: _forward(member, f))(features)
+            data += jnp.sum(weight * jnp.sum((rows.a_res - predictions) ** 2, axis=1))
             norms = [_spectral(layer.weight, v) for layer, v in zip(member, starting, strict=True)]
-            spectral += sum(squared for squared, _ in norms)
-            moved.append(tuple(v for _, v in norms))
-        return data + spectral_weight * spectral, (data, tuple(moved))
+            spectral += sum(square for square, _ in norms)
+            shift.append(tuple(v for _, v in norms))
+        return data + spectral_weight * spectral, (data, tuple(shift))
 
     def step(carry: Any, _: None) -> Any:
         layers, memory, vectors = carry

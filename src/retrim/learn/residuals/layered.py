@@ -13,7 +13,7 @@ from .rates import RateFit
 from .regression import BLOCK, RegressionModel, RegressionState
 from .targets import Targets
 
-KEPT = 0.9  # share of the evidence that is kept from fit to fit
+DECAY = 0.9  # share of the evidence that is kept from fit to fit
 DOUBT = 1.0  # [m^2/s^4], prior evidence for a share of zero, before any flight
 
 
@@ -65,14 +65,14 @@ class LayeredModel(eqx.Module):
         left = rows.a_res - jax.vmap(lambda x, u: self.first.predict(first, x, u))(rows.x, rows.u)
         foretold = jax.vmap(lambda x, u: self._certain(state.second, x, u))(rows.x, rows.u)
         newest = (jnp.arange(weight.shape[0]) >= weight.shape[0] - BLOCK) & (weight > 0.0)
-        agreed = KEPT * state.agreed + jnp.sum(jnp.where(newest, jnp.sum(left * foretold, axis=1), 0.0))
-        squared = KEPT * state.foretold + jnp.sum(jnp.where(newest, jnp.sum(foretold**2, axis=1), 0.0))
+        agreement = DECAY * state.agreed + jnp.sum(jnp.where(newest, jnp.sum(left * foretold, axis=1), 0.0))
+        square = DECAY * state.foretold + jnp.sum(jnp.where(newest, jnp.sum(foretold**2, axis=1), 0.0))
         rest = Targets(rows.x, rows.u, left, rows.omega, weight > 0.0)
         second, _ = self.second.fit(state.second, rest)
-        fitted = LayeredState(first, second, agreed, squared, _smooth(left, weight))
-        error = left - fitted.share * jax.vmap(lambda x, u: self._certain(second, x, u))(rows.x, rows.u)
+        result = LayeredState(first, second, agreement, square, _smooth(left, weight))
+        error = left - result.share * jax.vmap(lambda x, u: self._certain(second, x, u))(rows.x, rows.u)
         mean_square = jnp.sum(weight * jnp.sum(error**2, axis=1)) / jnp.maximum(jnp.sum(weight), 1e-6)
-        return where(jnp.any(weight > 0.0), fitted, state), jnp.sqrt(mean_square)
+        return where(jnp.any(weight > 0.0), result, state), jnp.sqrt(mean_square)
 
     def predict(self, state: LayeredState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the closed form's prediction plus the used share of the ensemble's [m/s^2]."""
@@ -90,8 +90,8 @@ class LayeredModel(eqx.Module):
     def _certain(self, state: Any, x: State, u: Command) -> Float[Array, "3"]:
         """Return the mean of the members, shrunk where they disagree."""
         members = state.residual.members(x, u)
-        squared = jnp.mean(members, axis=0) ** 2
-        return jnp.mean(members, axis=0) * squared / (squared + jnp.var(members, axis=0) + 1e-9)
+        square = jnp.mean(members, axis=0) ** 2
+        return jnp.mean(members, axis=0) * square / (square + jnp.var(members, axis=0) + 1e-9)
 
 
 def _smooth(left: Float[Array, "n 3"], weight: Float[Array, " n"]) -> Float[Array, ""]:

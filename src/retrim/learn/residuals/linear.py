@@ -64,7 +64,7 @@ class LinearModel(eqx.Module):
         """Return the state without information, which predicts zero; the key is not used."""
         del key
         nothing = jnp.zeros((SIZE, SIZE), dtype=self.prior.dtype)
-        return self._solved(nothing, nothing[:, :3], jnp.zeros((), dtype=jnp.int32))
+        return self._solve(nothing, nothing[:, :3], jnp.zeros((), dtype=jnp.int32))
 
     def fit(self, state: LinearState, rows: Targets) -> tuple[LinearState, Float[Array, ""]]:
         """Add the new rows in ``rows`` (newest last); also return the root mean square error over all valid rows."""
@@ -73,18 +73,18 @@ class LinearModel(eqx.Module):
         new = (age < round(self.every / self.dt)) | (state.fits == 0)
         since = self.dt * age.astype(features.dtype)
         weight = jnp.exp(-since / self.memory) * (rows.valid & new).astype(features.dtype) / self.noise**2
-        kept = jnp.exp(-self.every / self.memory)
-        fitted = self._solved(
-            kept * state.precision + features.T @ (weight[:, None] * features),
-            kept * state.moment + features.T @ (weight[:, None] * rows.a_res),
+        decay = jnp.exp(-self.every / self.memory)
+        result = self._solve(
+            decay * state.precision + features.T @ (weight[:, None] * features),
+            decay * state.moment + features.T @ (weight[:, None] * rows.a_res),
             state.fits + 1,
         )
-        fitted = where(jnp.any(rows.valid), fitted, state)
+        result = where(jnp.any(rows.valid), result, state)
         valid = rows.valid.astype(features.dtype)
-        error = jnp.sum((rows.a_res - features @ (fitted.weights / self.prior[:, None])) ** 2, axis=1)
-        return fitted, jnp.sqrt(jnp.sum(valid * error) / jnp.maximum(jnp.sum(valid), 1.0))
+        error = jnp.sum((rows.a_res - features @ (result.weights / self.prior[:, None])) ** 2, axis=1)
+        return result, jnp.sqrt(jnp.sum(valid * error) / jnp.maximum(jnp.sum(valid), 1.0))
 
-    def _solved(
+    def _solve(
         self, precision: Float[Array, "19 19"], moment: Float[Array, "19 3"], fits: Int[Array, ""]
     ) -> LinearState:
         """Return the state for the given information."""

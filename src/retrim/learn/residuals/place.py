@@ -179,8 +179,8 @@ class PlaceModel(eqx.Module):
         return None if turning is None else turning(state.first)
 
     def _bumps(self, place_map: PlaceMap, p: Float[Array, "rows 3"]) -> Float[Array, "rows m"]:
-        squared = jnp.sum((p[:, None] - place_map.centres[None]) ** 2, axis=2)
-        return jnp.exp(-0.5 * squared / self.length**2) * (place_map.visited >= 0)[None].astype(p.dtype)
+        square = jnp.sum((p[:, None] - place_map.centres[None]) ** 2, axis=2)
+        return jnp.exp(-0.5 * square / self.length**2) * (place_map.visited >= 0)[None].astype(p.dtype)
 
     def _drag(self, first: Any, x: State) -> Float[Array, "3"]:
         """Return the part of the first model that depends on velocity and attitude.
@@ -200,10 +200,10 @@ class PlaceModel(eqx.Module):
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the evidence for the map. Evidence fades with further predictions, not with time."""
         counts = new.astype(forecast.dtype)
-        squared = jnp.sum(counts * jnp.sum(forecast**2, axis=1))
+        square = jnp.sum(counts * jnp.sum(forecast**2, axis=1))
         agreed = jnp.sum(counts * jnp.sum(forecast * remainder, axis=1))
-        remains = jnp.exp(-squared / EVIDENCE)
-        return remains * state.agreement + agreed, remains * state.prediction + squared
+        remains = jnp.exp(-square / EVIDENCE)
+        return remains * state.agreement + agreed, remains * state.prediction + square
 
     def _learn(
         self,

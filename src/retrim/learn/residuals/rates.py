@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ...physics.actuators import lagged
+from ...physics.actuators import apply_lag
 from ...physics.state import Command, where
 from .targets import Targets
 
@@ -71,32 +71,32 @@ class RateModel(eqx.Module):
         counts = rows.valid & (jnp.cumsum(rows.valid) > round(UNSETTLED / self.dt))
         weight = jnp.exp(-self.dt * age / self.memory) * counts.astype(age.dtype)
         taus = jnp.geomspace(SHORTEST, LONGEST, GRID, dtype=age.dtype)
-        missed = rows.omega[None] - jax.vmap(lambda tau: self._followed(rows, tau))(taus)
+        errors = rows.omega[None] - jax.vmap(lambda tau: self._follow(rows, tau))(taus)
         total = jnp.sum(weight)
-        mean = jnp.einsum("n,gni->gi", weight, missed) / jnp.maximum(total, 1e-6)
-        left = jnp.einsum("n,gni->gi", weight, (missed - mean[:, None]) ** 2)
-        variance = jnp.maximum(self.noise**2, jnp.min(_shared(left), axis=0) / jnp.maximum(total, 1.0))
+        mean = jnp.einsum("n,gni->gi", weight, errors) / jnp.maximum(total, 1e-6)
+        left = jnp.einsum("n,gni->gi", weight, (errors - mean[:, None]) ** 2)
+        variance = jnp.maximum(self.noise**2, jnp.min(_share(left), axis=0) / jnp.maximum(total, 1.0))
         shrunk = self.bias_prior**2 / (self.bias_prior**2 + variance / jnp.maximum(total, 1e-6))
         misfit = (left + total * (1.0 - shrunk)[None] * mean**2) / variance[None]
-        misfit = _shared(misfit, 2.0) + (jnp.log(taus[:, None] / self.tau_prior[None]) / self.tau_spread) ** 2
+        misfit = _share(misfit, 2.0) + (jnp.log(taus[:, None] / self.tau_prior[None]) / self.tau_spread) ** 2
         share = jax.nn.softmax(-0.5 * misfit, axis=0)
         tau = jnp.exp(jnp.sum(share * jnp.log(taus)[:, None], axis=0))
         deviation = jnp.sqrt((1.0 - shrunk) * self.bias_prior**2)
-        fitted = RateFit(shrunk * jnp.sum(share * mean, axis=0), deviation, tau)
-        return where(total > 0.0, fitted, self.init())
+        result = RateFit(shrunk * jnp.sum(share * mean, axis=0), deviation, tau)
+        return where(total > 0.0, result, self.init())
 
-    def _followed(self, rows: Targets, tau: Float[Array, ""]) -> Float[Array, "n 3"]:
+    def _follow(self, rows: Targets, tau: Float[Array, ""]) -> Float[Array, "n 3"]:
         """Return the mean rates of each tick if the vehicle followed the commands with a lag and without a bias."""
 
         def tick(acting: Command, u: Command) -> tuple[Command, Float[Array, "3"]]:
-            mean, end = lagged(acting, u, self.dt, tau)
+            mean, end = apply_lag(acting, u, self.dt, tau)
             return end, mean.omega
 
         first = jax.tree.map(lambda leaf: leaf[0], rows.u)
         return lax.scan(tick, Command(first.c, rows.omega[0]), rows.u)[1]
 
 
-def _shared(each: Float[Array, "g 3"], times: float = 1.0) -> Float[Array, "g 3"]:
+def _share(each: Float[Array, "g 3"], times: float = 1.0) -> Float[Array, "g 3"]:
     """Return ``times`` the mean of roll and pitch for both axes, since they share one lag, and yaw unchanged."""
     both = 0.5 * times * (each[:, 0] + each[:, 1])
     return jnp.stack([both, both, each[:, 2]], axis=1)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from ...physics import so3
-from ...physics.actuators import is_followed
+from ...physics.actuators import is_unsaturated
 from ...physics.state import STANDARD_GRAVITY, Command, State, where
 from .rates import RateFit, RateModel
 from .targets import Targets
@@ -105,16 +105,16 @@ class RegressionModel(eqx.Module):
         zero for rows before a change. To find a change, the newest block of rows predicts each older block. The first
         block that the newest one does not explain (at 99.99 %) and all older blocks do not count.
         """
-        fitted, rms, _ = self.fit_weighted(state, rows)
-        return fitted, rms
+        result, rms, _ = self.fit_weighted(state, rows)
+        return result, rms
 
     def fit_weighted(
         self, state: RegressionState, rows: Targets
     ) -> tuple[RegressionState, Float[Array, ""], Float[Array, " n"]]:
         """Fit like :meth:`fit`; also return each row's weight, which is zero for invalid rows and before a change."""
         if self.limits is not None:
-            followed = jax.vmap(partial(is_followed, limits=self.limits))(rows.u)
-            rows = dataclasses.replace(rows, valid=rows.valid & followed)
+            unsaturated = jax.vmap(partial(is_unsaturated, limits=self.limits))(rows.u)
+            rows = dataclasses.replace(rows, valid=rows.valid & unsaturated)
         features = jax.vmap(features_of)(rows.x, rows.u)
         weight = self._weight(features, rows)
         posterior = self._posterior(features, rows.a_res, weight)
@@ -122,39 +122,39 @@ class RegressionModel(eqx.Module):
             posterior = self._posterior(features, rows.a_res, weight * self._tail(features, rows, weight, posterior))
         error = jnp.sum((rows.a_res - features @ posterior.mean) ** 2, axis=1)
         rms = jnp.sqrt(jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1e-6))
-        fitted = RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows))
-        return where(jnp.any(rows.valid), fitted, state), rms, weight
+        result = RegressionState(posterior.mean, posterior.covariance, self.rates.fit(rows))
+        return where(jnp.any(rows.valid), result, state), rms, weight
 
     def _weight(self, features: Float[Array, "n 3 10"], rows: Targets) -> Float[Array, " n"]:
         age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
         valid = rows.valid.astype(rows.a_res.dtype)
         recent = self._posterior(features, rows.a_res, jnp.where(age < BLOCK, valid, 0.0))
-        newer = self._unchanged(recent, features, rows.a_res, valid, age // BLOCK)
+        newer = self._weigh_changes(recent, features, rows.a_res, valid, age // BLOCK)
         return jnp.exp(-self.dt * age.astype(valid.dtype) / self.memory) * valid * newer
 
     def _tail(
-        self, features: Float[Array, "n 3 10"], rows: Targets, weight: Float[Array, " n"], fitted: Normal
+        self, features: Float[Array, "n 3 10"], rows: Targets, weight: Float[Array, " n"], posterior: Normal
     ) -> Float[Array, " n"]:
         """Return the factor of each row's weight: one within the limit, falling with the square of the error beyond."""
-        missed = jnp.sqrt(jnp.sum((rows.a_res - features @ fitted.mean) ** 2, axis=1))
+        errors = jnp.sqrt(jnp.sum((rows.a_res - features @ posterior.mean) ** 2, axis=1))
         count = jnp.sum(weight > 0.0)
-        ordered = jnp.sort(jnp.where(weight > 0.0, missed, jnp.inf))
-        median = jnp.where(count > 0, ordered[jnp.maximum(count // 2, 1) - 1], 0.0)
+        order = jnp.sort(jnp.where(weight > 0.0, errors, jnp.inf))
+        median = jnp.where(count > 0, order[jnp.maximum(count // 2, 1) - 1], 0.0)
         limit = TAIL * jnp.maximum(self.noise, median)
-        return jnp.where(missed > limit, (limit / jnp.maximum(missed, limit)) ** 2, 1.0)
+        return jnp.where(errors > limit, (limit / jnp.maximum(errors, limit)) ** 2, 1.0)
 
     def _posterior(
         self, features: Float[Array, "n 3 10"], target: Float[Array, "n 3"], weight: Float[Array, " n"]
     ) -> Normal:
-        scaled = features * self.prior[None, None]  # parameters of order one: well conditioned in single precision
-        eye = jnp.eye(SIZE, dtype=scaled.dtype)
-        precision = eye + jnp.einsum("n,nik,nil->kl", weight, scaled, scaled) / self.noise**2
+        scaling = features * self.prior[None, None]  # parameters of order one: well conditioned in single precision
+        eye = jnp.eye(SIZE, dtype=scaling.dtype)
+        precision = eye + jnp.einsum("n,nik,nil->kl", weight, scaling, scaling) / self.noise**2
         factor = jax.scipy.linalg.cho_factor(precision)
-        mean = jax.scipy.linalg.cho_solve(factor, jnp.einsum("n,nik,ni->k", weight, scaled, target) / self.noise**2)
+        mean = jax.scipy.linalg.cho_solve(factor, jnp.einsum("n,nik,ni->k", weight, scaling, target) / self.noise**2)
         covariance = jax.scipy.linalg.cho_solve(factor, eye)
         return Normal(self.prior * mean, self.prior[:, None] * covariance * self.prior[None])
 
-    def _unchanged(
+    def _weigh_changes(
         self,
         recent: Normal,
         features: Float[Array, "n 3 10"],
@@ -166,13 +166,13 @@ class RegressionModel(eqx.Module):
         blocks = -(-target.shape[0] // BLOCK)
         count = jax.ops.segment_sum(valid, block, blocks)
         per = jnp.maximum(count, 1.0)
-        missed = jax.ops.segment_sum(valid[:, None] * (target - features @ recent.mean), block, blocks) / per[:, None]
+        errors = jax.ops.segment_sum(valid[:, None] * (target - features @ recent.mean), block, blocks) / per[:, None]
         mean = jax.ops.segment_sum(valid[:, None, None] * features, block, blocks) / per[:, None, None]
         of_row = (self.noise**2 / per)[:, None, None] * jnp.eye(3, dtype=target.dtype)[None]
         expected = jnp.einsum("bik,kl,bjl->bij", mean, recent.covariance, mean) + of_row
-        surprise = jnp.einsum("bi,bij,bj->b", missed, jnp.linalg.inv(expected), missed)
-        explained = (surprise < SURPRISE) | (count == 0)
-        since: Float[Array, " b"] = jnp.cumprod(explained.astype(target.dtype))
+        surprise = jnp.einsum("bi,bij,bj->b", errors, jnp.linalg.inv(expected), errors)
+        is_explained = (surprise < SURPRISE) | (count == 0)
+        since: Float[Array, " b"] = jnp.cumprod(is_explained.astype(target.dtype))
         return since[block]
 
     def predict(self, state: RegressionState, x: State, u: Command) -> Float[Array, "3"]:

@@ -68,7 +68,7 @@ def residual_targets(
         raise ValueError(f"a window of {n} ticks is too short for a delay of {delay_ticks} ticks")
     x = jax.tree.map(lambda leaf: leaf[delay_ticks : delay_ticks + rows], window.x)
     v_next = window.x.v[delay_ticks + 1 :]
-    u, before, known = _acting(window, rows, delay_ticks, nominal.dt)
+    u, before, covered = _acting(window, rows, delay_ticks, nominal.dt)
 
     def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
         x, u, v_next = row
@@ -79,9 +79,9 @@ def residual_targets(
     if a_gt is not None:
         v_next = x.v + nominal.dt * a_gt[delay_ticks : delay_ticks + rows]
     _, a_res = lax.scan(tick, first, (x, u, v_next))
-    omega = jax.vmap(_turned)(x.R, window.x.R[delay_ticks + 1 :]) / nominal.dt
-    settled = _settled(window, nominal.settling_ticks)[:rows]
-    valid = known & _regular(window, nominal.dt, delay_ticks, before) & settled
+    omega = jax.vmap(_turn_between)(x.R, window.x.R[delay_ticks + 1 :]) / nominal.dt
+    has_settled = _mark_settled(window, nominal.settling_ticks)[:rows]
+    valid = covered & _regular(window, nominal.dt, delay_ticks, before) & has_settled
     if consistent is not None:
         valid &= consistent[delay_ticks : delay_ticks + rows]
         a_res = jnp.where(
@@ -106,15 +106,15 @@ def _acting(
     whole = jnp.floor(since)
     before, share = whole.astype(int), since - whole
 
-    def mixed(leaf: Array) -> Array:
+    def mix(leaf: Array) -> Array:
         weight = share.reshape(-1, *(1,) * (leaf.ndim - 1)).astype(leaf.dtype)
         return (1.0 - weight) * leaf[before] + weight * leaf[before + 1]
 
-    acting: Command = jax.tree.map(mixed, window.u)
+    acting: Command = jax.tree.map(mix, window.u)
     return acting, before, (at > -ROUNDING) & window.valid[before]
 
 
-def _turned(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def _turn_between(before: Float[Array, "3 3"], after: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Return the rotation vector from one attitude to another, in the body frame [rad]."""
     return so3.log(so3.mul(before.T, after))
 
@@ -132,6 +132,6 @@ def _regular(window: Window, dt: float, delay_ticks: int, before: Int[Array, " r
     return others[delay_ticks + 1 :] == others[before]
 
 
-def _settled(window: Window, ticks: int | Float[Array, ""]) -> Bool[Array, " n"]:
+def _mark_settled(window: Window, ticks: int | Float[Array, ""]) -> Bool[Array, " n"]:
     """Return whether at least ``ticks`` valid ticks precede this one in the window."""
     return jnp.cumsum(window.valid.astype(window.t.dtype)) > ticks

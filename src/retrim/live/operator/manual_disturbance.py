@@ -74,7 +74,7 @@ class ManualDisturbance:
         return ExternalEffects(*(jnp.asarray(a) for a in parts))
 
 
-class KnobbedPlant:
+class PlantWithKnobs:
     """Plant with knobs that may change in flight. The plant rejects unsupported knobs, and the flight continues."""
 
     def __init__(self, plant: Plant, disturbance: Disturbance) -> None:
@@ -84,9 +84,9 @@ class KnobbedPlant:
             plant: The plant.
             disturbance: Disturbance of the scenario.
         """
-        self.refused = "" if hasattr(plant, "disturb") else "this plant has no knobs"
+        self.refusal = "" if hasattr(plant, "disturb") else "this plant has no knobs"
         """Reason why the last change of the knobs was rejected; empty if it was accepted."""
-        self._plant, self._possible = plant, not self.refused
+        self._plant, self._possible = plant, not self.refusal
         self._knobs, self._left = ManualDisturbance(), 0
         self._scenario = disturbance
         self._turn()
@@ -97,7 +97,7 @@ class KnobbedPlant:
             self._left = round(KICK_S / self._plant.dt)
         self._knobs = knobs
         if self._possible:
-            self.refused = ""
+            self.refusal = ""
         self._turn()
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
@@ -111,7 +111,7 @@ class KnobbedPlant:
         except PlantError as error:
             if not self._possible or self._knobs == ManualDisturbance(kicks=self._knobs.kicks):
                 raise
-            self.refused, self._knobs, self._left = str(error), ManualDisturbance(kicks=self._knobs.kicks), 0
+            self.refusal, self._knobs, self._left = str(error), ManualDisturbance(kicks=self._knobs.kicks), 0
             self._turn()
             done = self._plant.step(u)
         if self._left:
@@ -122,5 +122,5 @@ class KnobbedPlant:
 
     def _turn(self) -> None:
         if self._possible:
-            held = HeldEffects(self._knobs.effects(kicking=self._left > 0))
-            self._plant.disturb(SumOfDisturbances((self._scenario, held)))  # type: ignore[attr-defined]
+            effects = HeldEffects(self._knobs.effects(kicking=self._left > 0))
+            self._plant.disturb(SumOfDisturbances((self._scenario, effects)))  # type: ignore[attr-defined]

@@ -17,8 +17,8 @@ from ...control.condition import describe_condition
 from ...errors import ConfigError, MessageError, excerpt
 from ...learn.screening import describe_counts
 from ...onboard.heartbeat import Heart
-from ...onboard.messages import Sample, last_note, last_sent, pack_note
-from ...onboard.note_fields import FIELDS, plain, read_fields, shown
+from ...onboard.messages import Sample, last_note, last_send_time, pack_note
+from ...onboard.note_fields import FIELDS, format_value, plain, read_fields
 from ...onboard.realtime import ParentWatch
 from ...transport.bus import Bus
 from ...transport.remote import LOOPBACK
@@ -33,7 +33,7 @@ from .scene import Scene
 
 RATE = 20.0  # [Hz]
 TEXT_EVERY = 5  # [refreshes]
-FLOWN_BY = {
+CONTROLLER_TEXTS = {
     "policy": " (network with its updates)",
     "hold": " (the guard, which holds the vehicle, and lands it then)",
     "descend": " (the guard, which lands)",
@@ -58,8 +58,8 @@ class PagePlan:
 HOST = re.compile(r"(?:[\w-]{1,63}\.){0,9}[\w-]{1,63}|(?=.*:)[\da-fA-F:.]{2,45}(?:%\w{1,15})?", re.ASCII)
 
 
-def free_port(host: str, wanted: int) -> int:
-    """Return the first free port of ``host`` among the ten ports from ``wanted`` on.
+def free_port(host: str, preference: int) -> int:
+    """Return the first free port of ``host`` among the ten ports from ``preference`` on.
 
     Raises:
         ConfigError: All ten ports are in use, or ``host`` is not an address of this machine.
@@ -67,22 +67,22 @@ def free_port(host: str, wanted: int) -> int:
     if not HOST.fullmatch(host):
         raise ConfigError(f"--page-host {excerpt(host)}: neither an address nor the name of a host")
     reason = ""
-    for port in range(wanted, min(wanted + 10, 65536)):
+    for port in range(preference, min(preference + 10, 65536)):
         try:
             with socket.create_server((host, port)):
                 return port
         except (OSError, ValueError) as error:  # not every text is a valid host name
             reason = str(getattr(error, "strerror", None) or error)[:160]
-    raise ConfigError(f"page: no free port from {wanted} on at {excerpt(host)} ({reason})")
+    raise ConfigError(f"page: no free port from {preference} on at {excerpt(host)} ({reason})")
 
 
-def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
+def page_address(host: str, port: int, *, is_explicit: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
     """Return the host and port of a page; None if viser is not installed and the page was not requested.
 
     Args:
         host: Address to listen on.
         port: First port to try.
-        demanded: Whether the user explicitly requested a page.
+        is_explicit: Whether the user explicitly requested a page.
         say: Function that is called with messages for the user.
 
     Raises:
@@ -91,7 +91,7 @@ def page_address(host: str, port: int, *, demanded: bool, say: Callable[[str], N
     if not 1 <= port <= 65535:
         raise ConfigError(f"--page-port {port} must be between 1 and 65535")
     if find_spec("viser") is None:
-        if demanded:
+        if is_explicit:
             raise ConfigError("--page needs viser: pip install viser")
         say("no page in the browser: pip install viser brings it")
         return None
@@ -115,14 +115,14 @@ def show(plan: PagePlan) -> None:
     page = _Page(spec, bus, server)
     take_values_only(server, page.refuse)
     bus.publish("ready.page", pack_note("ready", port=server.get_port()))
-    refreshed, heart = 0, Heart(bus, "page")
-    while not parent.gone(1.0 / RATE):
+    refresh_time, heart = 0, Heart(bus, "page")
+    while not parent.has_ended(1.0 / RATE):
         heart.beat()
         try:
-            page.refresh(text=refreshed % TEXT_EVERY == 0)
+            page.refresh(text=refresh_time % TEXT_EVERY == 0)
         except Exception as error:  # the landing button must work even if a refresh fails
             page.refuse(f"{type(error).__name__}: {error}")
-        refreshed += 1
+        refresh_time += 1
     server.stop()
 
 
@@ -132,13 +132,13 @@ class _Page:
     def __init__(self, spec: PageSpec, bus: Bus, server: Any) -> None:
         self._bus, self._lock = bus, threading.Lock()
         self._spec = spec
-        self._refused = 0
+        self._refusals = 0
         self._wishes = dict[str, Any]()
         for name, value in last_note(self._bus, "wish").items():  # from an earlier page process
             with contextlib.suppress(MessageError):
                 self._wishes |= self._possible({name: value})
         self._scene = Scene(server, spec.path, spec.arm, RATE)
-        self._paths, self._followed = spec.paths, ""
+        self._paths, self._reference = spec.paths, ""
         self._panel = Panel(
             server,
             self._turn,
@@ -149,7 +149,7 @@ class _Page:
             tuple(spec.paths),
             spec.mass,
             RATE,
-            _escaped(f"Scenario: {spec.world}."),
+            _escape(f"Scenario: {spec.world}."),
         )
         self._scene.on_pull(self._panel.pull)
         self._tick = -1
@@ -159,18 +159,18 @@ class _Page:
         status, sample = last_note(self._bus, "status"), self._sample()
         if sample is not None and sample.tick != self._tick:
             self._tick = sample.tick
-            felt, estimate = (_drawn(status.get(name, (0.0, 0.0, 0.0))) for name in ("felt", "estimate"))
-            target, R = _drawn(status.get("target", sample.state[:3])), sample.truth[3:12].reshape(3, 3)
+            disturbance, estimate = (_bound_vector(status.get(name, (0.0, 0.0, 0.0))) for name in ("felt", "estimate"))
+            target, R = _bound_vector(status.get("target", sample.state[:3])), sample.truth[3:12].reshape(3, 3)
             if np.abs(R).max() < FAR and np.allclose(R @ R.T, np.eye(3), atol=NO_ROTATION):
-                self._scene.move(_drawn(sample.truth[:3]), R, target, felt, estimate)
+                self._scene.move(_bound_vector(sample.truth[:3]), R, target, disturbance, estimate)
             policies = int(status.get("newest", {}).get("policy", 0))
-            self._panel.note(sample.t, float(np.linalg.norm(_drawn(sample.truth[:3]) - target)), policies)
-        if text and (followed := last_note(self._bus, "followed").get("name", "")) != self._followed:
-            self._followed = followed
-            if followed in self._paths:
-                self._scene.follow(self._paths[followed])
+            self._panel.note(sample.t, float(np.linalg.norm(_bound_vector(sample.truth[:3]) - target)), policies)
+        if text and (reference := last_note(self._bus, "followed").get("name", "")) != self._reference:
+            self._reference = reference
+            if reference in self._paths:
+                self._scene.follow(self._paths[reference])
         if text and status:
-            if last_sent(self._bus, "fallback") > last_sent(self._bus, "setpoint"):
+            if last_send_time(self._bus, "fallback") > last_send_time(self._bus, "setpoint"):
                 status["mode"], status["reason"] = "watchdog", "the process that flew is gone or hangs"
             self._panel.show(
                 _text(status, last_note(self._bus, "ended"), self._learners(), last_note(self._bus, "world"))
@@ -195,11 +195,11 @@ class _Page:
 
     def refuse(self, why: str) -> None:
         """Count a refused input and publish the count with the reason."""
-        self._refused += 1
+        self._refusals += 1
         with contextlib.suppress(MessageError):
-            self._bus.publish(PAGE, pack_note(PAGE, count=self._refused, last=plain(why)))
+            self._bus.publish(PAGE, pack_note(PAGE, count=self._refusals, last=plain(why)))
 
-    def _turn(self, turned: Callable[[ManualDisturbance], ManualDisturbance]) -> ManualDisturbance | None:
+    def _turn(self, change: Callable[[ManualDisturbance], ManualDisturbance]) -> ManualDisturbance | None:
         """Set the knobs relative to their current positions; return the current positions if the change fails.
 
         This method may be called from any thread.
@@ -207,7 +207,7 @@ class _Page:
         with self._lock:
             before = self._knobs()
             try:
-                self._bus.publish("knobs", turned(before).pack())
+                self._bus.publish("knobs", change(before).pack())
             except (MessageError, KeyError, TypeError, ValueError, OverflowError) as error:
                 self.refuse(f"{error}" if isinstance(error, MessageError) else f"knobs: {type(error).__name__}")
                 return before
@@ -233,47 +233,47 @@ class _Page:
         result = read_fields("wish", {name: value for name, value in wish.items() if name in FIELDS["wish"]})
         for name, there in (("method", (*self._spec.methods, "none")), ("reference", tuple(self._spec.paths))):
             if name in result and result[name] not in there:
-                raise MessageError(f"wish: {name} = {shown(result[name])} is not among {', '.join(there)}")
+                raise MessageError(f"wish: {name} = {format_value(result[name])} is not among {', '.join(there)}")
         return result
 
 
 def _text(
-    status: dict[str, Any], ended: dict[str, Any], learners: dict[str, dict[str, Any]], world: dict[str, Any]
+    status: dict[str, Any], end_note: dict[str, Any], learners: dict[str, dict[str, Any]], world: dict[str, Any]
 ) -> str:
-    reason = f": {_escaped(status['reason'])}" if status.get("reason") else ""
+    reason = f": {_escape(status['reason'])}" if status.get("reason") else ""
     mode = status.get("mode", "not known")
-    lines = [f"in control: **{_escaped(mode)}**{reason or _escaped(FLOWN_BY.get(mode, ''))}"]
-    if ended:
-        lines = [f"**flight over**: {_escaped(ended.get('reason', ''))}"]
+    lines = [f"in control: **{_escape(mode)}**{reason or _escape(CONTROLLER_TEXTS.get(mode, ''))}"]
+    if end_note:
+        lines = [f"**flight over**: {_escape(end_note.get('reason', ''))}"]
     versions = status.get("versions", {})
     if "policy" in versions:
         lines.append(f"policy updates in use: {versions['policy']}, rolled back: {len(status.get('given_up', []))}")
     lines.append(f"error {100.0 * status.get('error', 0.0):.1f} cm, missed ticks {status.get('missed', 0)}")
-    felt, estimate = (_arrow(status.get(name, [])) for name in ("felt", "estimate"))
-    lines.append(f"<span style='color:#d64541'>disturbance</span> {felt} m/s²")
+    disturbance, estimate = (_arrow(status.get(name, [])) for name in ("felt", "estimate"))
+    lines.append(f"<span style='color:#d64541'>disturbance</span> {disturbance} m/s²")
     lines.append(f"<span style='color:#3070d6'>estimate</span> {estimate} m/s²")
     for layer, note in learners.items():
         results, took = note.get("learnt", 0), 1e3 * note.get("took", 0.0)
         lines.append(f"{layer} learner: {results} results, last in {took:.0f} ms")
-    if excluded := describe_counts(learners.get("residual", {}).get("excluded", [])):
-        lines.append(f"measurements excluded from the fit: {excluded}")
+    if exclusions := describe_counts(learners.get("residual", {}).get("excluded", [])):
+        lines.append(f"measurements excluded from the fit: {exclusions}")
     for at, stage, cause in status.get("stages", [])[-1:]:
         if stage:
             lines.append(f"since {at:.1f} s {describe_condition(stage, cause)}")
     if not status.get("learning", True):
         lines.append("the policy from take-off is in use, without updates")
     if world.get("knobs_refused"):
-        lines.append(f"knobs refused: {_escaped(world['knobs_refused'])}")
+        lines.append(f"knobs refused: {_escape(world['knobs_refused'])}")
     return "<br>".join(lines)
 
 
-def _drawn(vector: Any) -> np.ndarray:
+def _bound_vector(vector: Any) -> np.ndarray:
     """Return a vector for drawing, with finite and bounded values, whatever values were reported."""
-    drawn: np.ndarray = np.clip(np.nan_to_num(np.asarray(vector, dtype=float)), -FAR, FAR)
-    return drawn
+    bounded_vector: np.ndarray = np.clip(np.nan_to_num(np.asarray(vector, dtype=float)), -FAR, FAR)
+    return bounded_vector
 
 
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     """Return a text with its Markdown markup escaped so that the text is shown literally."""
     return "".join(c if c.isalnum() or c in " ,.:;()'+-/%=" else f"&#{ord(c)};" for c in plain(text))
 

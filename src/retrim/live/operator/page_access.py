@@ -30,7 +30,7 @@ SEALED = {
 
 def page_url(host: str, port: int, token: str) -> str:
     """Return the address, including the token, of a page that listens on ``host``."""
-    return f"http://{_bracketed(_outward() if host in EVERYWHERE else host)}:{port}/{token}"
+    return f"http://{_bracket(_outward() if host in EVERYWHERE else host)}:{port}/{token}"
 
 
 def refusal(
@@ -45,14 +45,14 @@ def refusal(
         host: Address that the page listens on.
         local: Address and port that the request has reached, in the format of a socket.
     """
-    named, origins = headers.get("host", ()), headers.get("origin", ())
-    if len(named) != 1 or named[0].lower() not in _authorities(host, local):
+    hosts, origins = headers.get("host", ()), headers.get("origin", ())
+    if len(hosts) != 1 or hosts[0].lower() not in _authorities(host, local):
         return HTTPStatus.FORBIDDEN
-    given = path.partition("?")[0].split("/")[1:2] if path.startswith("/") else []
-    if not hmac.compare_digest("".join(given).encode("utf-8", "replace"), token.encode()):
+    path_token = path.partition("?")[0].split("/")[1:2] if path.startswith("/") else []
+    if not hmac.compare_digest("".join(path_token).encode("utf-8", "replace"), token.encode()):
         return HTTPStatus.NOT_FOUND
     upgrade = bool(headers.get("upgrade", ()))  # browsers always send the origin of a WebSocket
-    if (upgrade or origins) and origins != (f"http://{named[0].lower()}",):
+    if (upgrade or origins) and origins != (f"http://{hosts[0].lower()}",):
         return HTTPStatus.FORBIDDEN
     return None
 
@@ -72,16 +72,16 @@ def only_for(token: str, host: str) -> Iterator[None]:
     """
     import websockets.asyncio.server as servers
 
-    serve, started = servers.serve, list[bool]()
+    serve, started_servers = servers.serve, list[bool]()
 
-    def guarded(*args: Any, process_request: Any = None, **named: Any) -> Any:
-        started.append(True)
+    def serve_guarded(*args: Any, process_request: Any = None, **options: Any) -> Any:
+        started_servers.append(True)
 
         def answer(connection: Any, request: Any) -> Any:
             headers = {name.lower(): tuple(request.headers.get_all(name)) for name in request.headers}
-            refused = refusal(request.path, headers, token=token, host=host, local=connection.local_address)
-            if refused is not None:
-                response = connection.respond(refused, f"{refused.phrase}\n")
+            reason = refusal(request.path, headers, token=token, host=host, local=connection.local_address)
+            if reason is not None:
+                response = connection.respond(reason, f"{reason.phrase}\n")
             elif process_request is None:
                 response = None
             else:
@@ -92,14 +92,14 @@ def only_for(token: str, host: str) -> Iterator[None]:
                     response.headers[name] = value
             return response
 
-        return serve(*args, process_request=answer, **named)
+        return serve(*args, process_request=answer, **options)
 
-    servers.serve = guarded  # type: ignore[assignment, misc]
+    servers.serve = serve_guarded  # type: ignore[assignment, misc]
     try:
         yield
     finally:
         servers.serve = serve  # type: ignore[misc]
-    if not started:
+    if not started_servers:
         raise PlantError("page: this version of viser cannot be protected by a token; pip install --upgrade viser")
 
 
@@ -108,13 +108,13 @@ def _authorities(host: str, local: tuple[Any, ...]) -> set[str]:
     address, port = ip_address(str(local[0]).partition("%")[0]), int(local[1])
     if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
         address = address.ipv4_mapped
-    names = {_bracketed(str(address))} | ({"localhost"} if address.is_loopback else set())
+    names = {_bracket(str(address))} | ({"localhost"} if address.is_loopback else set())
     if host not in EVERYWHERE:
-        names.add(_bracketed(host.lower()))
+        names.add(_bracket(host.lower()))
     return {f"{name}:{port}" for name in names} | (names if port == 80 else set())
 
 
-def _bracketed(host: str) -> str:
+def _bracket(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 

@@ -72,8 +72,8 @@ class Panel:
             kick = self._gui.add_button_group("kick", tuple(KICKS))
             calm = self._gui.add_button("Calm", hint="all knobs back to nothing")
         for knob in (self._push, self._wind, self._load, self._rotor):
-            knob.on_update(lambda _: self._turned())
-        kick.on_click(lambda event: self._turned(event.target.value))
+            knob.on_update(lambda _: self._turn_knobs())
+        kick.on_click(lambda event: self._turn_knobs(event.target.value))
         calm.on_click(lambda _: self._calm())
         with self._gui.add_folder("Learning"):
             if methods:
@@ -88,15 +88,17 @@ class Panel:
             else:
                 self._gui.add_markdown("This flight does not learn.")
         if len(references) > 1:
-            asked = wishes.get("reference", references[0])
-            chosen = self._choices["reference"] = self._gui.add_dropdown("reference", references, initial_value=asked)
-            chosen.on_update(lambda _: self._choose("reference"))
+            initial = wishes.get("reference", references[0])
+            dropdown = self._choices["reference"] = self._gui.add_dropdown(
+                "reference", references, initial_value=initial
+            )
+            dropdown.on_update(lambda _: self._choose("reference"))
         self._gui.add_button("Land", color="red").on_click(lambda _: wish(land=True))
 
     def pull(self, a: np.ndarray) -> None:
         """Set the acceleration of the mouse pull in the world frame [m/s^2]."""
         self._pull = a
-        self._turned()
+        self._turn_knobs()
 
     def note(self, t: float, error: float, policies: int) -> None:
         """Add the flight time [s], the distance from the target [m] and the number of policies to the history."""
@@ -117,8 +119,8 @@ class Panel:
         if self._setting:
             return
         before = {name: self._choices[name].value for name in names}
-        wished = self._wish(**before)
-        self._set(*((self._choices[name], wished[name]) for name in names))
+        new_wish = self._wish(**before)
+        self._set(*((self._choices[name], new_wish[name]) for name in names))
 
     def _set(self, *values: tuple[Any, Any]) -> None:
         """Set the values of controls without reporting them as user actions."""
@@ -129,11 +131,11 @@ class Panel:
         finally:
             self._setting = False
 
-    def _turned(self, kick: str | None = None) -> None:
+    def _turn_knobs(self, kick: str | None = None) -> None:
         if self._setting:
             return
 
-        def turned(before: ManualDisturbance) -> ManualDisturbance:
+        def turn(before: ManualDisturbance) -> ManualDisturbance:
             push = np.clip(np.asarray(self._push.value, dtype=float) + self._pull, -PUSH, PUSH)
             return ManualDisturbance(
                 (float(push[0]), float(push[1]), float(push[2])),
@@ -144,7 +146,7 @@ class Panel:
                 before.kicks + (kick is not None),
             )
 
-        if (stand := self._tell(turned)) is not None:
+        if (stand := self._tell(turn)) is not None:
             load = min(stand.load, self._load.max)
             self._set(
                 (self._push, stand.push), (self._wind, stand.wind), (self._load, load), (self._rotor, stand.rotor)

@@ -19,7 +19,7 @@ from ..supervisor import Supervisor
 
 LEAD = 0.8 * BEFORE  # [s] between the publication of a table and the start of its transition
 ATTEMPTS = 3
-TOLD = "followed"
+REFERENCE_TOPIC = "followed"
 """Topic with the name of the current reference."""
 
 
@@ -36,14 +36,14 @@ class ReferenceSwitcher:
         """
         self._supervisor, self._work = supervisor, work
         self._vehicle = request.scenario.make_vehicle(request.setup.preset.vehicle)
-        present = request.followed
+        present = request.reference_name
         self._choices = choices(request.setup, present) if REFERENCE in supervisor.spec.controller.parameters else ()
         self.name, self.pieces = present, list[tuple[float, Reference]]()
-        if request.setup.followed is not None:
-            self.pieces = [(0.0, request.setup.followed)]
-        self._version, self._attempts, self._asked, self._next = 0, 0, present, present
+        if request.setup.flight_reference is not None:
+            self.pieces = [(0.0, request.setup.flight_reference)]
+        self._version, self._attempts, self._request, self._next = 0, 0, present, present
         self._coming: tuple[str, Future[tuple[float, Reference]]] | None = None
-        self._sent: tuple[str, float, Reference] | None = None
+        self._pending: tuple[str, float, Reference] | None = None
 
     def ask(self, name: str, t: float) -> list[Event]:
         """Begin a change to a different reference as soon as no other change is pending; return the events.
@@ -54,43 +54,43 @@ class ReferenceSwitcher:
         """
         if name in self._choices:
             self._next = name
-        return self._begun(t)
+        return self._begin(t)
 
     def obey(self, status: Status) -> list[Event]:
         """Publish a completed table, and register a table that control has accepted; return the events."""
         new = list[Event]()
         if self._coming is not None and self._coming[1].done():
-            (name, made), self._coming = self._coming, None
+            (name, reference), self._coming = self._coming, None
             try:
-                at, table = made.result()
+                at, table = reference.result()
             except RetrimError as error:
                 return [Event(status.t, "asked", f"reference {name} cannot be followed: {error}")]
             self._publish(table, at - LEAD)
-            self._sent = name, at, table
-        if self._sent is not None:
-            name, at, table = self._sent
+            self._pending = name, at, table
+        if self._pending is not None:
+            name, at, table = self._pending
             if status.control.get("versions", {}).get(REFERENCE, 0) >= self._version:
-                self.name, self._sent = name, None
+                self.name, self._pending = name, None
                 self.pieces.append((at, table))
-                self._supervisor.bus.publish(TOLD, pack_note(TOLD, name=name))
+                self._supervisor.bus.publish(REFERENCE_TOPIC, pack_note(REFERENCE_TOPIC, name=name))
                 new = [Event(at, "reference", f"it goes over to {name}")]
             elif (t := self._now()) > at:  # control received it too late
-                self._sent = None
+                self._pending = None
                 if self._attempts < ATTEMPTS:
                     self._make(name)
                 else:
                     self._publish(self.pieces[-1][1], t)  # make learners return to the reference in flight
                     new = [Event(status.t, "asked", f"reference {name} cannot be followed: it was not taken")]
-        return new + self._begun(status.t)
+        return new + self._begin(status.t)
 
-    def _begun(self, t: float) -> list[Event]:
-        if self._coming is not None or self._sent is not None or self._next == self._asked:
+    def _begin(self, t: float) -> list[Event]:
+        if self._coming is not None or self._pending is not None or self._next == self._request:
             return []
-        self._asked, self._attempts = self._next, 0
-        if self._asked == self.name:
+        self._request, self._attempts = self._next, 0
+        if self._request == self.name:
             return []
-        self._make(self._asked)
-        return [Event(t, "asked", f"reference {self._asked}")]
+        self._make(self._request)
+        return [Event(t, "asked", f"reference {self._request}")]
 
     def _make(self, name: str) -> None:
         self._attempts += 1

@@ -8,11 +8,11 @@ from typing import Any
 
 from ...config.methods import learning_methods
 from ...errors import MessageError, RetrimError
-from ...io.trained import load_learner_state, save_learner_state
+from ...io.policies import load_learner_state, save_learner_state
 from ...onboard.messages import unpack_note
-from ...onboard.note_fields import shown
+from ...onboard.note_fields import format_value
 from ...runtime.events import Event
-from ..report import learnt_in
+from ..report import collect_learner_state
 from ..session import LiveRequest, learner_state
 from ..status import Status
 from ..supervisor import Supervisor
@@ -32,7 +32,7 @@ class OperatorRequests:
         self._wish: dict[str, Any] = {"method": request.method, "paused": False}
         self._method, self._starts = request.method, 0
         self._versions = {"wish": 0, "knobs": 0}
-        self._turned: tuple[float, float, ManualDisturbance] | None = None
+        self._knob_change: tuple[float, float, ManualDisturbance] | None = None
         """Time on the clock and in the flight [s] of the last change of the knobs, and their positions."""
         self._knobs_before = ManualDisturbance()
         self._work = ThreadPoolExecutor(1)
@@ -44,47 +44,50 @@ class OperatorRequests:
         new = self._knobs(status.t)
         if (wish := self._new("wish")) is not None:
             with contextlib.suppress(MessageError):  # the supervisor counts and reports invalid notes
-                asked = unpack_note(wish, "wish")
-                if "reference" in asked:
-                    new += self.following.ask(asked["reference"], status.t)
-                new += self._ask(asked, status)
-        return new + self._arrived(status.t) + self.following.obey(status)
+                request = unpack_note(wish, "wish")
+                if "reference" in request:
+                    new += self.following.ask(request["reference"], status.t)
+                new += self._ask(request, status)
+        return new + self._report_arrival(status.t) + self.following.obey(status)
 
     def close(self) -> None:
         """Cancel pending operations."""
         self._work.shutdown(wait=False, cancel_futures=True)
 
-    def _ask(self, asked: dict[str, Any], status: Status) -> list[Event]:
-        if asked.get("land"):
+    def _ask(self, request: dict[str, Any], status: Status) -> list[Event]:
+        if request.get("land"):
             self._supervisor.land()
             return [Event(status.t, "asked", "land")]
-        method, paused = asked.get("method", self._wish["method"]), asked.get("paused", self._wish["paused"])
-        now = {"method": method, "paused": paused}
+        method, pause = request.get("method", self._wish["method"]), request.get("paused", self._wish["paused"])
+        now = {"method": method, "paused": pause}
         if now == self._wish or not self._supervisor.spec.layers:
             return []
-        known = tuple(dict.fromkeys((self._request.method, *learning_methods())))
-        if method not in (*known, "none"):
-            return [Event(status.t, "refused", f"method {shown(method)}: there are {', '.join(known)}, none")]
+        methods = tuple(dict.fromkeys((self._request.method, *learning_methods())))
+        if method not in (*methods, "none"):
+            return [Event(status.t, "refused", f"method {format_value(method)}: there are {', '.join(methods)}, none")]
         self._wish = now
-        self._supervisor.learn(paused=paused or method == "none", flown=method != "none")
+        self._supervisor.learn(pause=pause or method == "none", active=method != "none")
         if method != "none" and method != self._method:
             self._method = method
             self._coming = method, self._work.submit(self._start_of, method, status)
-        return [Event(status.t, "asked", f"method {method}" + (", paused" if paused else ""))]
+        return [Event(status.t, "asked", f"method {method}" + (", paused" if pause else ""))]
 
     def _start_of(self, method: str, status: Status) -> Path:
         """Write the policy and the residual in flight in the form that ``method`` learns; return the path."""
         start, trust = self._supervisor.start, self._supervisor.spec.trust
-        state = learnt_in(self._supervisor.bus, status, start, trust) or load_learner_state(start, trust=trust)[0]
+        state = (
+            collect_learner_state(self._supervisor.bus, status, start, trust)
+            or load_learner_state(start, trust=trust)[0]
+        )
         self._starts += 1
         path = self._supervisor.start.parent / f"start-{self._starts}.safetensors"
-        merged = state.policy.policy.merged()
+        policy = state.policy.policy.merged()
         save_learner_state(
-            path, learner_state(self._request, merged, method, state.residual), self._request.setup.preset
+            path, learner_state(self._request, policy, method, state.residual), self._request.setup.preset
         )
         return path
 
-    def _arrived(self, t: float) -> list[Event]:
+    def _report_arrival(self, t: float) -> list[Event]:
         if self._coming is None or not self._coming[1].done():
             return []
         (method, future), self._coming = self._coming, None
@@ -95,19 +98,19 @@ class OperatorRequests:
         return [Event(t, "asked", f"the policy's learner starts again: {method}")]
 
     def _knobs(self, t: float) -> list[Event]:
-        if (turned := self._new("knobs")) is not None:
+        if (knob_message := self._new("knobs")) is not None:
             with contextlib.suppress(MessageError):
-                self._turned = time.monotonic(), t, ManualDisturbance.unpack(turned)
-        if self._turned is None or time.monotonic() - self._turned[0] < SETTLED_S:
+                self._knob_change = time.monotonic(), t, ManualDisturbance.unpack(knob_message)
+        if self._knob_change is None or time.monotonic() - self._knob_change[0] < SETTLED_S:
             return []
-        (_, at, knobs), self._turned = self._turned, None
+        (_, at, knobs), self._knob_change = self._knob_change, None
         before, self._knobs_before = self._knobs_before, knobs
         changed = [name for name in KNOBS if getattr(knobs, name) != getattr(before, name)]
         if knobs.kicks != before.kicks:
             changed.append("kick")
         elif changed and knobs == ManualDisturbance(kick=knobs.kick, kicks=knobs.kicks):
             return [Event(at, "knobs", "all added effects removed")]
-        words = (f"{name} {_shown(getattr(knobs, name))} {UNITS.get(name, '')}".rstrip() for name in changed)
+        words = (f"{name} {_format(getattr(knobs, name))} {UNITS.get(name, '')}".rstrip() for name in changed)
         return [Event(at, "knobs", ", ".join(words))] if changed else []
 
     def _new(self, topic: str) -> bytes | None:
@@ -118,5 +121,5 @@ class OperatorRequests:
         return message.data
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     return " ".join(f"{each:g}" for each in value) if isinstance(value, tuple) else f"{value:g}"

@@ -64,7 +64,7 @@ class Scene:
             pull: Function that takes the acceleration, world [m/s^2].
         """
 
-        async def dragged(event: Any) -> None:  # the server preserves the order of calls for coroutines only
+        async def drag(event: Any) -> None:  # the server preserves the order of calls for coroutines only
             grip, hand = (np.asarray(place, dtype=float) for place in (event.start_position, event.end_position))
             over = event.phase == "end" or grip.shape != (3,) or hand.shape != (3,)
             if over or not np.isfinite([grip, hand]).all():  # an invalid browser message must end a pull, too
@@ -74,7 +74,7 @@ class Scene:
             self._rope.visible, self._rope.points = True, np.stack([grip, hand])[None]
             pull(ROPE * (hand - grip))
 
-        self._grip.on_drag("left")(dragged)
+        self._grip.on_drag("left")(drag)
 
     def follow(self, path: np.ndarray) -> None:
         """Show the current reference, given positions along it in the world frame [m], (n, 3)."""

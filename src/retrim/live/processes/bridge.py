@@ -38,40 +38,40 @@ def carry(plan: BridgePlan) -> None:
 
     Without a supervisor, the function returns when the flight is over.
     """
-    signal.signal(signal.SIGTERM, _ended)  # close the network properly in this case, too
+    signal.signal(signal.SIGTERM, _stop_on_signal)  # close the network properly in this case, too
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True, writes=OUT)
     try:
         bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)
         bus.publish("ready.bridge", pack_note("ready"))
-        said, since, told = (0, 0), time.monotonic(), (0, "")
+        versions, since, refusals = (0, 0), time.monotonic(), (0, "")
         with Pacemaker(bus, "bridge") as heart:
             # A vehicle without a supervisor still lands, and the learners wait for the note about the end.
-            while not (parent.gone() and time.monotonic() > since + (LINGER if said[1] else SILENCE)):
+            while not (parent.has_ended() and time.monotonic() > since + (LINGER if versions[1] else SILENCE)):
                 heart.touch(PATIENCE)
                 if not bridge.step():
                     time.sleep(IDLE)
-                told = _told(bus, network, told)
-                if (now := _said(bus)) != said:
-                    said, since = now, time.monotonic()
+                refusals = _publish_refusals(bus, network, refusals)
+                if (now := _newest_versions(bus)) != versions:
+                    versions, since = now, time.monotonic()
     finally:
         network.close()  # otherwise the threads of the network would keep the process alive
 
 
-def _told(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
+def _publish_refusals(bus: Bus, network: Bus, before: tuple[int, str]) -> tuple[int, str]:
     """Publish any change in the number of refused messages or in the fault that prevents their reception."""
-    now = network.refused, network.fault
+    now = network.refusals, network.fault
     if now != before:
         bus.publish(NETWORK, pack_note(NETWORK, count=now[0], last=now[1] or "a message that was none, forged or old",
                                        fault=now[1]))  # fmt: skip
     return now
 
 
-def _said(bus: Bus) -> tuple[int, int]:
+def _newest_versions(bus: Bus) -> tuple[int, int]:
     """Return the versions of the newest measurement and of the note about the end of the flight."""
-    measured, ended = bus.latest("sample"), bus.latest("ended")
-    return 0 if measured is None else measured.version, 0 if ended is None else ended.version
+    sample, end_note = bus.latest("sample"), bus.latest("ended")
+    return 0 if sample is None else sample.version, 0 if end_note is None else end_note.version
 
 
-def _ended(number: int, frame: FrameType | None) -> None:
+def _stop_on_signal(number: int, frame: FrameType | None) -> None:
     sys.exit(128 + number)

@@ -12,9 +12,9 @@ from ...adapt.learner_state import LearnerState
 from ...compile.trace import numpy_program, plain
 from ...config.families import make_family
 from ...config.setup import Setup
+from ...control.belief_flight import vehicle_estimate
 from ...control.condition import Condition
 from ...control.controller import AbstractController
-from ...control.identified import vehicle_estimate
 from ...control.policy import AbstractPolicy
 from ...errors import ConfigError
 from ...estimation.command_path import PathEstimator
@@ -44,10 +44,10 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
     """
     policy = state.policy.policy.merged()
     parts = eqx.partition((policy, state.residual), eqx.is_array)
-    given = {"policy": parts[0][0], "residual": parts[0][1]}
-    if setup.followed is not None:
-        given[REFERENCE] = setup.followed
-    given |= vehicle_half(setup, setup.controller(state))
+    parameters = {"policy": parts[0][0], "residual": parts[0][1]}
+    if setup.flight_reference is not None:
+        parameters[REFERENCE] = setup.flight_reference
+    parameters |= vehicle_half(setup, setup.controller(state))
 
     def whole(parameters: dict[str, Any]) -> tuple[AbstractPolicy, Any]:
         result: tuple[AbstractPolicy, Any] = eqx.combine((parameters["policy"], parameters["residual"]), parts[1])
@@ -55,14 +55,14 @@ def adaptive_source(setup: Setup, state: LearnerState) -> ControllerSource:
 
     def controller(parameters: dict[str, Any]) -> AbstractController[Any]:
         policy, residual = whole(parameters)
-        made = _on(setup, parameters).controller(LearnerState(PolicyState(policy, ()), residual))
-        return made.follow(parameters[VEHICLE]) if VEHICLE in parameters else made
+        controller = _on(setup, parameters).controller(LearnerState(PolicyState(policy, ()), residual))
+        return controller.follow(parameters[VEHICLE]) if VEHICLE in parameters else controller
 
-    def predicted(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
+    def predict(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
         model = FittedResidual(setup.learner.residual_model, whole(parameters)[1])
         return f_a(*inputs, model(*inputs)).v
 
-    return _source(setup, controller, predicted, given)
+    return _source(setup, controller, predict, parameters)
 
 
 def plain_source(setup: Setup, controller: AbstractController[Any]) -> ControllerSource:
@@ -74,14 +74,14 @@ def plain_source(setup: Setup, controller: AbstractController[Any]) -> Controlle
     half = vehicle_half(setup, controller)
     arrays, fixed = eqx.partition(controller, eqx.is_array)
 
-    def predicted(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
+    def predict(parameters: dict[str, Any], inputs: tuple[State, Command]) -> Any:
         return f_a(*inputs, jnp.zeros_like(inputs[0].p)).v
 
     def whole(parameters: dict[str, Any]) -> AbstractController[Any]:
-        made: AbstractController[Any] = eqx.combine(parameters["policy"], fixed)
-        return made.follow(parameters[VEHICLE]) if VEHICLE in parameters else made
+        controller: AbstractController[Any] = eqx.combine(parameters["policy"], fixed)
+        return controller.follow(parameters[VEHICLE]) if VEHICLE in parameters else controller
 
-    return _source(setup, whole, predicted, {"policy": arrays} | half)
+    return _source(setup, whole, predict, {"policy": arrays} | half)
 
 
 def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str,
     return {VEHICLE: vehicle_estimate(family, first.estimate)}
 
 
-def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str, Any]) -> ControllerSource:
+def _source(setup: Setup, controller: Any, prediction: Any, parameters: dict[str, Any]) -> ControllerSource:
     x, u = State.at(setup.flight_task.home()), Command.hover(setup.flight_task.home().dtype)
     t = jnp.zeros_like(x.p[0])
 
@@ -121,24 +121,24 @@ def _source(setup: Setup, controller: Any, predicted: Any, parameters: dict[str,
         condition = now.condition(after) or Condition(jnp.array(0), jnp.array(0))
         return (u.c, u.omega, condition.stage, condition.cause), after
 
-    def accepted(parameters: Any, inputs: Any) -> Any:
+    def accept(parameters: Any, inputs: Any) -> Any:
         return controller(parameters).accepted(*inputs)
 
     programs = {
         "init": numpy_program(init, parameters, x),
         "decide": numpy_program(decide, parameters, (memory, t, t, x)),
-        "accepted": numpy_program(accepted, parameters, (memory, u)),
+        "accepted": numpy_program(accept, parameters, (memory, u)),
         "target": numpy_program(lambda parameters, t: _on(setup, parameters).flight_task.target(t), parameters, t),
-        "predicted": numpy_program(predicted, parameters, (x, u)),
+        "predicted": numpy_program(prediction, parameters, (x, u)),
     }
     # sorted, since JAX flattens dictionaries in the order of their keys
-    named = {half: {n: plain(a) for n, a in wire.names(parameters[half]).items()} for half in sorted(parameters)}
+    names = {half: {n: plain(a) for n, a in wire.names(parameters[half]).items()} for half in sorted(parameters)}
     digest = hashlib.sha256()
     for program in programs.values():
         digest.update(program.text.encode())
-    for half, arrays in named.items():
+    for half, arrays in names.items():
         digest.update(f"{half} {[(n, a.shape, a.dtype.name) for n, a in arrays.items()]}".encode())
-    return ControllerSource(**programs, parameters=named, base=digest.hexdigest()[:16], dtype=np.dtype(x.p.dtype))
+    return ControllerSource(**programs, parameters=names, base=digest.hexdigest()[:16], dtype=np.dtype(x.p.dtype))
 
 
 def _on(setup: Setup, parameters: dict[str, Any]) -> Setup:

@@ -40,10 +40,10 @@ def learn_for_all(plan: FleetPlan) -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.nice(NICE)
     enable_compile_cache()
-    fleet, parent, looked, done = FleetLearner(), ParentWatch(plan.parent), 0.0, set[str]()
-    while not parent.gone():
-        if time.monotonic() - looked > LOOK_EVERY:
-            looked = time.monotonic()
+    fleet, parent, last_look, done = FleetLearner(), ParentWatch(plan.parent), 0.0, set[str]()
+    while not parent.has_ended():
+        if time.monotonic() - last_look > LOOK_EVERY:
+            last_look = time.monotonic()
             _look(fleet, plan.folder, done)
         if not fleet.step():
             time.sleep(CHECK_EVERY)

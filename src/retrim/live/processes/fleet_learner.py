@@ -28,7 +28,7 @@ class FleetLearner:
         """Initialise without vehicles; ``clock`` returns the time [s]."""
         self._members: dict[str, _Member] = {}
         self._clock, self._setups = clock, dict[tuple[str, str | None], Setup]()
-        self._taken_back = dict[Any, int]()
+        self._rollbacks = dict[Any, int]()
         self._compiled = set[tuple[Any, int, bool]]()
         self._bases = dict[Any, PolicyState]()
         self._key = random.key(0)
@@ -39,20 +39,20 @@ class FleetLearner:
         """Loops by the name of the vehicle and layer; the loop that has waited longest comes first."""
         return {name: member.loop for name, member in self._members.items()}
 
-    def add(self, name: str, plan: LearnerPlan, bus: Bus, wanted: Callable[[], bool] = lambda: True) -> None:
+    def add(self, name: str, plan: LearnerPlan, bus: Bus, is_active: Callable[[], bool] = lambda: True) -> None:
         """Add a vehicle and layer to learn for.
 
         Args:
             name: Name of the vehicle and layer.
             plan: Plan of the learner.
             bus: Bus of the flight.
-            wanted: Function that is called before each publication; it returns False if the vehicle has left.
+            is_active: Function that is called before each publication; it returns False if the vehicle has left.
         """
         loop = LearnerLoop(plan, bus, self._clock, self._setup_of)
         loop.catch_up()
         low_rank = loop.new_worker().low_rank
         base = "" if low_rank is None else tree_digest(low_rank.base)
-        self._members[name] = _Member(loop, base, wanted)
+        self._members[name] = _Member(loop, base, is_active)
 
     def drop(self, name: str) -> None:
         """Stop learning for a vehicle and layer."""
@@ -88,8 +88,8 @@ class FleetLearner:
                 continue
             updates = self._learn(kind, [members[name].loop for name in windows], list(windows.values()))
             for name, update in zip(windows, updates, strict=True):
-                if members[name].wanted():
-                    members[name].loop.learnt(update)
+                if members[name].is_active():
+                    members[name].loop.publish_update(update)
                 self._members[name] = self._members.pop(name)  # move to the end of the queue
             done += len(windows)
         return done
@@ -100,9 +100,9 @@ class FleetLearner:
         if workers[0].low_rank is None or len(members) < 2:
             return learn_together(workers, windows)
         backs = sum(member.loop.rolled_back for member in members)
-        if backs != self._taken_back.get(kind, backs):
+        if backs != self._rollbacks.get(kind, backs):
             self._bases.pop(kind, None)  # control has rolled back a policy: continue from the policy in flight
-        self._taken_back[kind] = backs
+        self._rollbacks[kind] = backs
         before = self._bases.get(kind) or shared_base(workers[0])
         self._key, key = random.split(self._key)
         base = learn_base(workers, windows, before, key)
@@ -134,7 +134,7 @@ class _Member(NamedTuple):
     loop: LearnerLoop
     base: str
     """Digest of the base of the worker's low-rank policy; empty for other workers."""
-    wanted: Callable[[], bool]
+    is_active: Callable[[], bool]
 
     @property
     def kind(self) -> tuple[str, int, str]:

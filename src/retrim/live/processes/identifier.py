@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 from ...adapt.vehicles import PIECE
 from ...config.families import declared_vehicle, make_family
 from ...config.presets import Preset
-from ...control.identified import vehicle_estimate
+from ...control.belief_flight import vehicle_estimate
 from ...control.vehicle_report import REPORTS, VehicleEstimate, VehicleReport
 from ...errors import ConfigError, MessageError
 from ...estimation.command_path import PathEstimator
 from ...estimation.command_path import PathState as EstimatorState
-from ...io.trained import load_learner_state
+from ...io.policies import load_learner_state
 from ...onboard.heartbeat import Pacemaker
 from ...onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, pack_note
 from ...onboard.realtime import ParentWatch
@@ -76,7 +76,7 @@ class IdentifierLoop:
         self._estimator, self._declared = PathEstimator.of(preset.dt), declared_vehicle(preset)
         self._state: EstimatorState | None = None
         self._rows: deque[np.ndarray] = deque()
-        self._known, self._newest, self._taken, self._t, self._due = 0, -1.0, 0, 0.0, -np.inf
+        self._flight_version, self._newest, self._row_count, self._t, self._due = 0, -1.0, 0, 0.0, -np.inf
         self._published: np.ndarray | None = None
         self._reports: list[tuple[float, str]] = []
         message = bus.latest(f"parameters.{VEHICLE}")
@@ -91,7 +91,7 @@ class IdentifierLoop:
             self._take(row)
         assert self._state is not None
         jax.block_until_ready(_vehicle(self._family, self._state))
-        self._state, self._taken, self._t = None, 0, 0.0
+        self._state, self._row_count, self._t = None, 0, 0.0
 
     def step(self) -> bool:
         """Process some of the new rows; return whether there were new rows."""
@@ -106,10 +106,10 @@ class IdentifierLoop:
         return True
 
     def _look(self) -> None:
-        message = self.bus.latest("flight", self._known)
+        message = self.bus.latest("flight", self._flight_version)
         if message is None:
             return
-        self._known = message.version
+        self._flight_version = message.version
         with contextlib.suppress(MessageError):
             rows = FlightRows.unpack(message.data).rows
             new = rows[rows[:, 0] > self._newest]
@@ -122,8 +122,8 @@ class IdentifierLoop:
         x, u = state_of(row[MEASURED], dtype), Command.of(jnp.asarray(row[COMMAND], dtype))
         state = self._estimator.init(x) if self._state is None else self._state
         self._state = _measure(self._estimator, state, t, x, age, u)
-        self._t, self._taken = float(row[1]), self._taken + 1
-        if self._taken % PIECE == 0:
+        self._t, self._row_count = float(row[1]), self._row_count + 1
+        if self._row_count % PIECE == 0:
             self._state = _estimate(self._estimator, self._state)
 
     def _conclude(self, t: float) -> None:
@@ -149,7 +149,7 @@ def _measure(
 
 @eqx.filter_jit
 def _estimate(estimator: PathEstimator, s: EstimatorState) -> EstimatorState:
-    return estimator.estimated(s)
+    return estimator.estimate_path(s)
 
 
 @eqx.filter_jit
@@ -166,7 +166,7 @@ def identify(plan: IdentifierPlan) -> None:
     loop.warm_up()
     bus.publish("ready.identifier", pack_note("ready", base=plan.base))
     with contextlib.suppress(KeyboardInterrupt), Pacemaker(bus, "identifier") as heart:
-        while not parent.gone() and bus.latest("ended") is None:
+        while not parent.has_ended() and bus.latest("ended") is None:
             heart.touch(ALLOWANCE)
             if not loop.step():
                 time.sleep(CHECK_EVERY)

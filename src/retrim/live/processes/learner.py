@@ -23,7 +23,7 @@ from ...adapt.workers import make_worker
 from ...config.presets import Preset
 from ...config.setup import Setup
 from ...errors import MessageError
-from ...io.trained import load_learner_state
+from ...io.policies import load_learner_state
 from ...learn.window import Window
 from ...onboard.heartbeat import Pacemaker
 from ...onboard.messages import COMMAND, MEASURED, FlightRows, Parameters, last_note, pack_note
@@ -38,7 +38,7 @@ from ...transport.bus import Bus
 from ...transport.shared_memory import SharedMemoryBus
 from ..states import state_of
 from .controllers import parameter_groups
-from .published_updates import active_update, keep, learnt_from, newest_update
+from .published_updates import active_learner_state, active_update, keep, newest_update
 
 CHECK_EVERY = 0.005  # [s]
 LOOKING, COMPUTING = 5.0, 60.0  # [s], longest time to read the bus and to compute an update
@@ -94,12 +94,12 @@ class LearnerLoop:
         self.worker = self.new_worker()
         """Worker that continues from the parameters in flight."""
         self._last_tick, self._new_ticks, self._began = -1, 0, float("-inf")
-        self._known: dict[str, int] = {}
-        self._learnt = 0
+        self._versions: dict[str, int] = {}
+        self._update_count = 0
         self.rolled_back = 0
         """Number of times control rolled back a policy."""
         self._pending: tuple[int, PolicyUpdate, float] | None = None
-        self._flown: list[tuple[int, Update]] = []
+        self._history: list[tuple[int, Update]] = []
 
     def new_worker(self) -> Worker:
         """Return a worker that starts from the learned state before the flight."""
@@ -124,7 +124,7 @@ class LearnerLoop:
             and (result := active_update(self.bus, self.state, "policy", self._status())) is not None
             and result[0] > self.plan.floor
         ):
-            self._flown = [result]
+            self._history = [result]
             self.worker.receive(result[1])
 
     def step(self) -> bool:
@@ -132,7 +132,7 @@ class LearnerLoop:
         window = self.due()
         if window is None:
             return False
-        self.learnt(self.worker.learn(window))
+        self.publish_update(self.worker.learn(window))
         return True
 
     def due(self) -> Window | None:
@@ -143,21 +143,21 @@ class LearnerLoop:
             self._take_residual()
             self._judge()
         waits = self._pending is not None or not self._new_ticks or self._clock() - self._began < self.every
-        if waits or not self._wanted():
+        if waits or not self._is_active():
             return None
         self._began, self._new_ticks = self._clock(), 0
         return self._buffer.window()
 
-    def learnt(self, update: Update) -> None:
+    def publish_update(self, update: Update) -> None:
         """Publish an update learned from the window of :meth:`due`, if control still accepts updates."""
-        self._learnt += 1
+        self._update_count += 1
         topic, took = f"learner.{self.plan.layer}", self._clock() - self._began
-        excluded = list(update.excluded if isinstance(update, ResidualUpdate) else NOTHING)
-        note = pack_note(topic, learnt=self._learnt, took=took, until=update.computed_from, excluded=excluded)
+        exclusions = list(update.excluded if isinstance(update, ResidualUpdate) else NOTHING)
+        note = pack_note(topic, learnt=self._update_count, took=took, until=update.computed_from, excluded=exclusions)
         self.bus.publish(topic, note)
         if self.plan.layer == "policy" and self._judge():
             return  # control has since rolled back the policy from which the update was trained
-        if self._wanted():
+        if self._is_active():
             self._publish(update)
 
     def _look(self) -> None:
@@ -177,13 +177,13 @@ class LearnerLoop:
 
     def _follow(self) -> None:
         """Learn on the new reference if the flight has changed its reference."""
-        followed = self.setup.followed
-        if followed is None or (message := self._fresh(f"parameters.{REFERENCE}")) is None:
+        reference = self.setup.flight_reference
+        if reference is None or (message := self._fresh(f"parameters.{REFERENCE}")) is None:
             return
         with contextlib.suppress(MessageError):
-            result = Parameters.unpack(message, wire.names(followed), half=REFERENCE, base=self.plan.base, after=0)
+            result = Parameters.unpack(message, wire.names(reference), half=REFERENCE, base=self.plan.base, after=0)
             leaves = jax.device_put(list(result.arrays.values()))
-            self.setup = self.setup.on(jax.tree.unflatten(jax.tree.structure(followed), leaves))
+            self.setup = self.setup.on(jax.tree.unflatten(jax.tree.structure(reference), leaves))
             self.worker.follow(self.setup.learner)
 
     def _publish(self, update: Update) -> None:
@@ -193,10 +193,10 @@ class LearnerLoop:
             return
         topic = f"parameters.{layer}"
         before = self.bus.latest(topic)
-        known = self._status().get("newest", {}).get(layer, 0)  # a new bus may lack the version in control
-        version = max(0 if before is None else before.version, known) + 1
-        parent = self._flown[-1][0] if self._flown else 0
-        whole = self._learnt_by(update)
+        newest_version = self._status().get("newest", {}).get(layer, 0)  # a new bus may lack the version in control
+        version = max(0 if before is None else before.version, newest_version) + 1
+        parent = self._history[-1][0] if self._history else 0
+        whole = self._learner_state_of(update)
         arrays = wire.names(parameter_groups(whole.policy.policy.merged(), whole.residual)[layer])
         keep(self.bus, layer, version, update, self._status())
         result = Parameters(layer, version, self.plan.base, update.computed_from, arrays, parent)
@@ -206,7 +206,7 @@ class LearnerLoop:
         else:
             self.worker.receive(update)
 
-    def _learnt_by(self, update: Update) -> LearnerState:
+    def _learner_state_of(self, update: Update) -> LearnerState:
         if isinstance(update, PolicyUpdate):
             return LearnerState(update.state, self.state.residual)
         assert isinstance(update, ResidualUpdate)
@@ -215,29 +215,29 @@ class LearnerLoop:
     def _judge(self) -> bool:
         """Continue from an accepted policy or, after a rollback, the last valid one; return True after a rollback."""
         status = self._status()
-        given_up, back = status.get("given_up", []), False
-        while self._flown and self._flown[-1][0] in given_up:
-            self._flown.pop()
+        withdrawals, back = status.get("given_up", []), False
+        while self._history and self._history[-1][0] in withdrawals:
+            self._history.pop()
             back = True
         if back:
             self.rolled_back += 1
-            self.worker.receive(self._flown[-1][1] if self._flown else _start(self.state))
+            self.worker.receive(self._history[-1][1] if self._history else _start(self.state))
         if self._pending is None:
             return back
-        version, update, published = self._pending
-        if version in given_up:
+        version, update, publish_time = self._pending
+        if version in withdrawals:
             self._pending = None
         elif status.get("newest", {}).get("policy", 0) >= version:
             self.worker.receive(update)
-            self._flown, self._pending = [*self._flown[-REMEMBERED:], (version, update)], None
-        elif self._clock() - published > VERDICT:
+            self._history, self._pending = [*self._history[-REMEMBERED:], (version, update)], None
+        elif self._clock() - publish_time > VERDICT:
             self._pending = None  # the policy was corrupted in transit, or control no longer accepts policies
         return back
 
     def _status(self) -> dict[str, Any]:
         return last_note(self.bus, "status")
 
-    def _wanted(self) -> bool:
+    def _is_active(self) -> bool:
         """Return whether learning is active and control accepts updates, which it does only in policy mode."""
         return self._status().get("mode", "policy") == "policy" and not last_note(self.bus, "learning").get(
             "paused", False
@@ -245,26 +245,26 @@ class LearnerLoop:
 
     def _take_residual(self) -> None:
         """Pass the newest residual fit to the worker unless the worker already has it."""
-        result = newest_update(self.bus, self.state, "residual", after=self._known.get("fit", 0))
+        result = newest_update(self.bus, self.state, "residual", after=self._versions.get("fit", 0))
         if result is not None:
-            self._known["fit"] = result[0]
+            self._versions["fit"] = result[0]
             self.worker.receive(result[1])
 
     def _fresh(self, topic: str) -> bytes | None:
-        message = self.bus.latest(topic, self._known.get(topic, 0))
+        message = self.bus.latest(topic, self._versions.get(topic, 0))
         if message is None:
             return None
-        self._known[topic] = message.version
+        self._versions[topic] = message.version
         return message.data
 
     def leave(self, folder: Path, patience: float = 3.0) -> None:
         """Write the flight's last learned state once updates are no longer accepted, or after ``patience`` [s]."""
         until = self._clock() + patience
-        while self._wanted() and self.bus.latest("ended") is None and self._clock() < until:
+        while self._is_active() and self.bus.latest("ended") is None and self._clock() < until:
             time.sleep(CHECK_EVERY)
-        learnt, outlet = learnt_from(self.bus, self.state, self._status()), Outlet(folder)
-        if learnt is not None:
-            outlet.write("what was learnt", partial(write_state, learnt, self.setup.preset))
+        learner_state, outlet = active_learner_state(self.bus, self.state, self._status()), Outlet(folder)
+        if learner_state is not None:
+            outlet.write("what was learnt", partial(write_state, learner_state, self.setup.preset))
         for fault in outlet.faults:
             print(fault, file=sys.stderr)
 
@@ -284,15 +284,15 @@ def learn(plan: LearnerPlan) -> None:
     loop.catch_up()
     bus.publish(f"ready.{plan.layer}", pack_note("ready", base=plan.base, device=jax.devices()[0].platform))
     with Pacemaker(bus, plan.layer) as heart:
-        while not parent.gone() and bus.latest("ended") is None:
+        while not parent.has_ended() and bus.latest("ended") is None:
             heart.touch(LOOKING)
             window = loop.due()
             if window is None:
                 time.sleep(CHECK_EVERY)
                 continue
             heart.touch(COMPUTING)
-            loop.learnt(loop.worker.learn(window))
+            loop.publish_update(loop.worker.learn(window))
     if plan.layer == "policy" and plan.out is not None:
-        while not parent.gone(LOOKING):  # the supervisor writes the learned state and ends this process
+        while not parent.has_ended(LOOKING):  # the supervisor writes the learned state and ends this process
             pass
         loop.leave(plan.out)

@@ -22,7 +22,7 @@ from ...runkit.compile_cache import enable_compile_cache
 from ...runkit.flying import FLOOR
 from ...transport.bus import Bus
 from ...transport.shared_memory import SharedMemoryBus
-from ..operator.manual_disturbance import KnobbedPlant, ManualDisturbance
+from ..operator.manual_disturbance import ManualDisturbance, PlantWithKnobs
 from ..states import state_of, vector_of
 
 ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
@@ -55,31 +55,31 @@ def simulate(plan: PlantPlan) -> None:
     x0 = state_of(plan.x0, jnp.zeros(0).dtype)
     try:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
-            knobbed = KnobbedPlant(plant, plan.scenario.make_disturbance(plan.vehicle, seed=plan.seed))
+            knob_plant = PlantWithKnobs(plant, plan.scenario.make_disturbance(plan.vehicle, seed=plan.seed))
             for load in (0.0, 0.01):  # compile and run every program
                 plant.reset(x0)
-                knobbed.turn(ManualDisturbance(load=load))
+                knob_plant.turn(ManualDisturbance(load=load))
                 for _ in range(5):
-                    knobbed.step(Command.hover(x0.p.dtype))
-            knobbed.turn(ManualDisturbance())
+                    knob_plant.step(Command.hover(x0.p.dtype))
+            knob_plant.turn(ManualDisturbance())
             measurement = plant.reset(x0)
-            refused = be_punctual(plan.priority, set(plan.cores))
-            bus.publish("ready.plant", pack_note("ready", refused=refused))
+            refusals = be_punctual(plan.priority, set(plan.cores))
+            bus.publish("ready.plant", pack_note("ready", refused=refusals))
             epoch = wait_for_take_off(bus, parent)
             if epoch is None:
                 return
-            reason = _flown(plan, knobbed, bus, parent, measurement, epoch)
+            reason = _fly(plan, knob_plant, bus, parent, measurement, epoch)
     except PlantError as error:
         reason = f"plant lost: {error}"
     bus.publish("ended", pack_note("ended", reason=reason))
 
 
-def _flown(
-    plan: PlantPlan, plant: KnobbedPlant, bus: Bus, parent: ParentWatch, measurement: Measurement, epoch: float
+def _fly(
+    plan: PlantPlan, plant: PlantWithKnobs, bus: Bus, parent: ParentWatch, measurement: Measurement, epoch: float
 ) -> str:
     """Simulate the flight; return the reason for its end."""
-    tick, late, held, unanswered, turned = 0, 0, 0, 0, 0
-    u = accepted = as_numpy(Command.hover()).astype(float)
+    tick, late, holds, silent_ticks, knob_version = 0, 0, 0, 0, 0
+    u = accepted_command = as_numpy(Command.hover()).astype(float)
     while True:
         sleep_until(epoch + tick * plan.dt)
         now = time.monotonic()
@@ -90,34 +90,34 @@ def _flown(
             measurement.age,
             vector_of(measurement.x),
             vector_of(measurement.true_state),
-            accepted,
+            accepted_command,
         )
         bus.publish("sample", sample.pack())
         if not np.isfinite(sample.truth).all() or sample.truth[2] < FLOOR:
             return CRASHED
         setpoint = answer(bus, tick, epoch + (tick + SHARE) * plan.dt)
-        unanswered = 0 if setpoint is not None else unanswered + 1
+        silent_ticks = 0 if setpoint is not None else silent_ticks + 1
         if setpoint is None:
-            held += 1  # like a vehicle, keep the last command
-            if unanswered * plan.dt > ALONE and parent.gone():
+            holds += 1  # like a vehicle, keep the last command
+            if silent_ticks * plan.dt > ALONE and parent.has_ended():
                 return "nobody commands, and the supervisor is gone"
-        elif setpoint.landed:
+        elif setpoint.is_final:
             return setpoint.ending(float(sample.truth[2]))
         else:
             u = setpoint.u
-        if (asked := bus.latest("knobs", turned)) is not None:
-            turned = asked.version
+        if (message := bus.latest("knobs", knob_version)) is not None:
+            knob_version = message.version
             with contextlib.suppress(MessageError):
-                plant.turn(ManualDisturbance.unpack(asked.data))
+                plant.turn(ManualDisturbance.unpack(message.data))
         dtype = measurement.x.p.dtype
-        measurement, taken = plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))
-        accepted, tick = as_numpy(taken).astype(float), tick + 1
+        measurement, accepted_u = plant.step(Command(jnp.asarray(u[0], dtype), jnp.asarray(u[1:], dtype)))
+        accepted_command, tick = as_numpy(accepted_u).astype(float), tick + 1
         behind = time.monotonic() - (epoch + tick * plan.dt)
         if behind > 0:
             late += 1
             epoch += max(0.0, behind - plan.dt)  # the simulation falls behind rather than skipping time
         if tick % 25 == 0:
-            bus.publish("world", pack_note("world", late=late, held=held, knobs_refused=plant.refused))
+            bus.publish("world", pack_note("world", late=late, held=holds, knobs_refused=plant.refusal))
 
 
 def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
@@ -131,7 +131,7 @@ def answer(bus: Bus, tick: int, until: float) -> Setpoint | None:
                 result = Setpoint.unpack(message.data)
             except MessageError:
                 continue
-            if result.tick == tick or result.landed:
+            if result.tick == tick or result.is_final:
                 return result
         if time.monotonic() >= until:
             return None

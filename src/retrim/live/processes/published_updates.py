@@ -29,9 +29,9 @@ def keep(bus: Bus, layer: str, version: int, update: Update, status: dict[str, A
         update: Update to publish.
         status: Last status of the control process.
     """
-    held = [_version(bus.latest(slot(layer, i))) for i in range(SLOTS)]
-    place, flown = version % SLOTS, max(filter(_flies(layer, status), held), default=0)
-    if flown and held[place] == flown:
+    versions = [_version(bus.latest(slot(layer, i))) for i in range(SLOTS)]
+    place, active = version % SLOTS, max(filter(_flies(layer, status), versions), default=0)
+    if active and versions[place] == active:
         place = (place + 1) % SLOTS
     bus.publish(slot(layer, place), version.to_bytes(PREFIX, "little") + pack_update(update))
 
@@ -53,7 +53,7 @@ def active_update(bus: Bus, state: LearnerState, layer: str, status: dict[str, A
     return _newest(bus, state, layer, _flies(layer, status))
 
 
-def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> LearnerState | None:
+def active_learner_state(bus: Bus, state: LearnerState, status: dict[str, Any]) -> LearnerState | None:
     """Return the last learned state that was used in flight; None if no update was used.
 
     Args:
@@ -73,19 +73,19 @@ def learnt_from(bus: Bus, state: LearnerState, status: dict[str, Any]) -> Learne
 def _flies(layer: str, status: dict[str, Any]) -> Callable[[int], bool]:
     """Return a function that checks whether control has accepted a version and has not rolled that version back."""
     newest = status.get("newest", {}).get(layer, 0)
-    given_up = status.get("given_up", []) if layer == "policy" else []
-    return lambda version: version <= newest and version not in given_up
+    withdrawals = status.get("given_up", []) if layer == "policy" else []
+    return lambda version: version <= newest and version not in withdrawals
 
 
 def _version(message: Message | None) -> int:
     return 0 if message is None else int.from_bytes(message.data[:PREFIX], "little")
 
 
-def _newest(bus: Bus, state: LearnerState, layer: str, wanted: Callable[[int], bool]) -> tuple[int, Update] | None:
+def _newest(bus: Bus, state: LearnerState, layer: str, condition: Callable[[int], bool]) -> tuple[int, Update] | None:
     result: list[tuple[int, Update]] = []
     for i in range(SLOTS):
         message = bus.latest(slot(layer, i))
-        if message is None or not wanted(version := _version(message)):
+        if message is None or not condition(version := _version(message)):
             continue
         with contextlib.suppress(MessageError):
             result.append((version, unpack_update(message.data[PREFIX:], state, source=layer)))

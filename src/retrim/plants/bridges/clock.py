@@ -4,7 +4,7 @@ from collections import deque
 
 import numpy as np
 
-KEPT = 10  # exchanges
+MEMORY = 10  # exchanges
 ENOUGH = 3  # smallest number of exchanges for an estimate of the rate
 APART = 0.03  # [s], smallest standard deviation of the exchange times for an estimate of the rate
 SLIP = 3e-3  # [s], largest deviation in excess of the error bound by the round trip
@@ -21,23 +21,26 @@ class RemoteClock:
     """
 
     def __init__(self) -> None:
-        self._exchanges: deque[tuple[float, float, float]] = deque(maxlen=KEPT)
+        self._exchanges: deque[tuple[float, float, float]] = deque(maxlen=MEMORY)
         self._line: tuple[float, float] | None = None
         self._rate = 1.0
 
-    def exchanged(self, asked: float, remote: float, answered: float) -> None:
+    def record_exchange(self, request_time: float, remote: float, answer_time: float) -> None:
         """Record one exchange.
 
         Args:
-            asked: Time of the request, on our clock [s].
+            request_time: Time of the request, on our clock [s].
             remote: Time in the answer, on the other clock [s].
-            answered: Arrival time of the answer, on our clock [s].
+            answer_time: Arrival time of the answer, on our clock [s].
         """
-        known = self.here(remote) if len(self._exchanges) >= ENOUGH else None
-        slipped = known is not None and abs(0.5 * (asked + answered) - known) > 0.5 * (answered - asked) + SLIP
-        if slipped or (self._exchanges and remote < self._exchanges[-1][0]):
+        remote_time = self.here(remote) if len(self._exchanges) >= ENOUGH else None
+        clock_slips = (
+            remote_time is not None
+            and abs(0.5 * (request_time + answer_time) - remote_time) > 0.5 * (answer_time - request_time) + SLIP
+        )
+        if clock_slips or (self._exchanges and remote < self._exchanges[-1][0]):
             self._exchanges.clear()  # the other machine stalled or restarted
-        self._exchanges.append((remote, 0.5 * (asked + answered), answered - asked))
+        self._exchanges.append((remote, 0.5 * (request_time + answer_time), answer_time - request_time))
         x, y, trips = np.array(self._exchanges).T
         weights = (trips + JITTER) ** -2
         weights /= weights.sum()
@@ -62,14 +65,14 @@ class ArrivalClock:
     """
 
     def __init__(self) -> None:
-        self._arrived: deque[tuple[float, float]] = deque()
+        self._arrivals: deque[tuple[float, float]] = deque()
 
-    def arrived(self, remote: float, now: float) -> None:
+    def record_arrival(self, remote: float, now: float) -> None:
         """Record a message with its time on the other clock and its arrival time on our clock [s]."""
-        while self._arrived and now - self._arrived[0][0] > WINDOW_S:
-            self._arrived.popleft()
-        self._arrived.append((now, now - remote))
+        while self._arrivals and now - self._arrivals[0][0] > WINDOW_S:
+            self._arrivals.popleft()
+        self._arrivals.append((now, now - remote))
 
     def here(self, remote: float) -> float | None:
         """Return the time on our clock at time ``remote`` on the other clock [s]; None before the first message."""
-        return remote + min(offset for _, offset in self._arrived) if self._arrived else None
+        return remote + min(offset for _, offset in self._arrivals) if self._arrivals else None

@@ -66,10 +66,10 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         try:
             link.start_logs(ANSWERS_S, keep_on)
         except PlantError as error:
-            raise PlantError(f"{self.address}: {error}{link.said()}") from error
+            raise PlantError(f"{self.address}: {error}{link.console_text()}") from error
         able = crtp.CAN_ARM | crtp.ARMED
         if not self.until(lambda: bool(link.reading and self._is(able)), READY_S, keep_on):
-            raise PlantError(f"{self.address}: it cannot be armed in {READY_S:g} s{link.said()}")
+            raise PlantError(f"{self.address}: it cannot be armed in {READY_S:g} s{link.console_text()}")
         if not self._is(crtp.FLYING):
             self._stands_still(keep_on)
 
@@ -84,12 +84,12 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         ready = lambda: self._is(crtp.ARMED) and self._is(crtp.CAN_FLY)  # noqa: E731
         arming = insisting(lambda: link.send(crtp.arm(True, link.version)), ready, AGAIN_S)
         if not self.until(arming, ARM_S, keep_on):
-            raise PlantError(f"{self.address}: the Crazyflie refuses to be armed{link.said()}")
+            raise PlantError(f"{self.address}: the Crazyflie refuses to be armed{link.console_text()}")
         if not self._is(crtp.FLYING):
             rise = crtp.take_off(float(place[2]), heading, RISE_S)
             rising = insisting(lambda: link.send(rise), lambda: self._is(crtp.FLYING), AGAIN_S)
             if not self.until(rising, ARM_S, keep_on):
-                raise PlantError(f"{self.address}: the Crazyflie does not take off{link.said()}")
+                raise PlantError(f"{self.address}: the Crazyflie does not take off{link.console_text()}")
             self.until(lambda: False, RISE_S, keep_on)
 
         def go() -> None:
@@ -98,8 +98,10 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
 
         patience = GO_S + float(np.linalg.norm(place - self.reading().p)) / SPEED
         if not self.until(insisting(go, self.staying(place), 0.5 * GO_S), patience, keep_on):
-            at, wanted = (each.round(2).tolist() for each in (self.reading().p, place))
-            raise PlantError(f"{self.address}: it is at {at} m after {patience:.0f} s, not at {wanted}{link.said()}")
+            at, target = (each.round(2).tolist() for each in (self.reading().p, place))
+            raise PlantError(
+                f"{self.address}: it is at {at} m after {patience:.0f} s, not at {target}{link.console_text()}"
+            )
         link.thrusts.clear()
         self.hold(time.monotonic() + THRUST_S)
         self.thrust.learn(link.thrusts)
@@ -113,13 +115,13 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         link = self.link
         link.pump(0.0)
         now = time.monotonic()
-        if now - link.heard > LOST_S:
+        if now - link.last_message > LOST_S:
             raise PlantError(f"the link has been silent for {LOST_S:g} s; a Crazyflie stops its motors then")
         for bit, what in WRONG.items():
             if self._is(bit):
-                raise PlantError(f"the Crazyflie says that it {what}{link.said()}")
+                raise PlantError(f"the Crazyflie says that it {what}{link.console_text()}")
         if self._flies and not self._is(crtp.ARMED):
-            raise PlantError(f"the Crazyflie is not armed any more{link.said()}")
+            raise PlantError(f"the Crazyflie is not armed any more{link.console_text()}")
         return self.reading().at(now)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
@@ -150,14 +152,14 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         reading = link.reading
         assert reading is not None
         until = time.monotonic() + LANDING_S
-        while time.monotonic() < min(until, link.heard + LOST_S):
+        while time.monotonic() < min(until, link.last_message + LOST_S):
             height = reading.p[2] - self._floor
             if height < GROUND:
                 break
             link.send(crtp.relax())
             link.send(crtp.land(self._floor, max(1.0, height / SPEED)))
-            asked = time.monotonic()
-            while time.monotonic() < min(until, asked + 1.5 + height / SPEED) and height > 0.5 * GROUND:
+            last_order = time.monotonic()
+            while time.monotonic() < min(until, last_order + 1.5 + height / SPEED) and height > 0.5 * GROUND:
                 link.pump(time.monotonic() + 0.05)
                 height = (link.reading or reading).p[2] - self._floor
             reading = link.reading or reading
@@ -175,12 +177,12 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         first = self.reading().p
         wanders = 0.0
 
-        def wandered() -> bool:
+        def is_away() -> bool:
             nonlocal wanders
             wanders = max(wanders, float(np.abs(self.reading().p - first).max()))
             return False
 
-        self.until(wandered, STILL_S, keep_on)
+        self.until(is_away, STILL_S, keep_on)
         if wanders > WANDERS:
             raise PlantError(
                 f"{self.address}: the Crazyflie stands, and its estimate wandered by {wanders:.2f} m in {STILL_S:g} s; "

@@ -38,9 +38,9 @@ class CrazyflieLink:
         """
         self._endpoint, self._to = endpoint, to
         self._clock, self._trips = ArrivalClock(), deque[float](maxlen=20)
-        self._remote_ms, self._logged_at = 0, -math.inf
+        self._remote_ms, self._log_time = 0, -math.inf
         self._echo_due = 0.0
-        self._awaited: Packet | None = None
+        self._request: Packet | None = None
         self._answer: bytes | None = None
         self.version = 0
         """Version of the Crazyflie's protocol; 0 until it is requested."""
@@ -50,7 +50,7 @@ class CrazyflieLink:
         """Thrust commands from the Crazyflie's controller, 0 to 65535."""
         self.console = ""
         """End of the Crazyflie's console output."""
-        self.heard = -math.inf
+        self.last_message = -math.inf
         """Time of the last valid packet, on the monotonic clock [s]."""
         self.ignored = 0
         """Number of packets that were damaged, implausible or from other senders."""
@@ -78,14 +78,14 @@ class CrazyflieLink:
         Raises:
             PlantError: The Crazyflie does not answer, or the flight was given up.
         """
-        self._awaited, self._answer = question._replace(body=question.body[:same]), None
+        self._request, self._answer = question._replace(body=question.body[:same]), None
         asking = insisting(lambda: self.send(question), lambda: self._answer is not None, AGAIN_S)
         try:
             if not wait_until(asking, patience, keep_on, self.pump) or self._answer is None:
                 raise PlantError(f"the Crazyflie does not answer on port {question.port} in {patience:g} s")
             return self._answer
         finally:
-            self._awaited = None
+            self._request = None
 
     def start_logs(self, patience: float, keep_on: KeepOn) -> None:
         """Request states and statuses for the duration of the connection.
@@ -98,11 +98,11 @@ class CrazyflieLink:
         blocks = {STATES: (crtp.STATE_LOG, STATE_S), STATUSES: (crtp.STATUS_LOG, STATUS_S)}
         numbers = self._numbers({name for log, _ in blocks.values() for name in log}, patience, keep_on)
         for block, (log, period) in blocks.items():
-            made = crtp.new_block(block, [(kind, numbers[name]) for name, kind in log.items()])
-            for order in (*made, crtp.start_block(block, period)):
-                refused = self.ask(order, 2, patience, keep_on)[0]
-                if refused:
-                    raise PlantError(f"the Crazyflie refuses a block of its log: error {refused}")
+            block_request = crtp.new_block(block, [(kind, numbers[name]) for name, kind in log.items()])
+            for order in (*block_request, crtp.start_block(block, period)):
+                error_code = self.ask(order, 2, patience, keep_on)[0]
+                if error_code:
+                    raise PlantError(f"the Crazyflie refuses a block of its log: error {error_code}")
 
     def stop_logs(self) -> None:
         """Ask the Crazyflie to stop sending log messages."""
@@ -112,19 +112,19 @@ class CrazyflieLink:
         """Close the port."""
         self._endpoint.close()
 
-    def _numbers(self, wanted: set[str], patience: float, keep_on: KeepOn) -> dict[str, int]:
+    def _numbers(self, names: set[str], patience: float, keep_on: KeepOn) -> dict[str, int]:
         """Return the numbers of the wanted variables from the Crazyflie's table of contents."""
         about = self.ask(Packet(crtp.LOG, crtp.TOC, bytes([crtp.INFO])), 1, patience, keep_on)
         length, result = int.from_bytes(about[:2], "little"), dict[str, int]()
         for number in range(length):
-            asked = bytes([crtp.ITEM]) + struct.pack("<H", number)
-            item = self.ask(Packet(crtp.LOG, crtp.TOC, asked), 3, patience, keep_on)
+            request = bytes([crtp.ITEM]) + struct.pack("<H", number)
+            item = self.ask(Packet(crtp.LOG, crtp.TOC, request), 3, patience, keep_on)
             name = item[1:].rstrip(b"\0").replace(b"\0", b".").decode(errors="replace")
-            if name in wanted:
+            if name in names:
                 result[name] = number
-            if len(result) == len(wanted):
+            if len(result) == len(names):
                 return result
-        raise PlantError(f"the Crazyflie logs no {', '.join(sorted(wanted - set(result)))}; its firmware is too old")
+        raise PlantError(f"the Crazyflie logs no {', '.join(sorted(names - set(result)))}; its firmware is too old")
 
     def _chores(self, now: float) -> None:
         if now >= self._echo_due:
@@ -137,11 +137,11 @@ class CrazyflieLink:
             self.ignored += 1
             return
         try:
-            self._understand(crtp.unpacked(data), now)
+            self._understand(crtp.unpack(data), now)
         except MessageError:
             self.ignored += 1
             return
-        self.heard = now
+        self.last_message = now
 
     def _understand(self, packet: Packet, now: float) -> None:
         port, channel, body = packet
@@ -151,23 +151,23 @@ class CrazyflieLink:
                 raise MessageError("an echo of nothing that was said")
             self._trips.append(trip)
         elif port == crtp.LOG and channel == crtp.DATA:
-            self._logged(body, now)
+            self._read_log(body, now)
         elif port == crtp.CONSOLE and channel == 0:
             self.console = (self.console + body.decode(errors="replace"))[-300:]
         elif (
-            (asked := self._awaited) is not None
-            and (port, channel) == asked[:2]
-            and body.startswith(asked.body)
-            and len(body) > len(asked.body)
+            (request := self._request) is not None
+            and (port, channel) == request[:2]
+            and body.startswith(request.body)
+            and len(body) > len(request.body)
         ):
-            self._answer = body[len(asked.body) :]
+            self._answer = body[len(request.body) :]
 
-    def _logged(self, body: bytes, now: float) -> None:
+    def _read_log(self, body: bytes, now: float) -> None:
         if len(body) < 4:
             raise MessageError("a log without a time")
         block, ms, values = body[0], int.from_bytes(body[1:4], "little"), body[4:]
         on = (ms - self._remote_ms + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
-        if self.reading is not None and not -LATE_S < 1e-3 * on < now - self._logged_at + EARLY_S:
+        if self.reading is not None and not -LATE_S < 1e-3 * on < now - self._log_time + EARLY_S:
             raise MessageError("a log of another time")
         if block == STATES:
             self._take_state(crtp.state_of(values), self._remote_ms + on, now)
@@ -179,18 +179,18 @@ class CrazyflieLink:
 
     def _take_state(self, x: crtp.StateRow, ms: int, now: float) -> None:
         """Process a state, or refuse it if it is implausibly far from a recent state."""
-        last, since = self.reading, now - self._logged_at
+        last, since = self.reading, now - self._log_time
         if last is not None and since < LEAPS_S and abs(x.p - last.p).max() > LEAP + FASTEST * since:
             raise MessageError("a state that is far from the last one")
-        self._clock.arrived(1e-3 * ms, now)
+        self._clock.record_arrival(1e-3 * ms, now)
         here = self._clock.here(1e-3 * ms)
         assert here is not None
         stamp = here - 0.5 * min(self._trips, default=0.0)
         if ms > self._remote_ms or last is None:  # skip states that arrive out of order
-            self._remote_ms, self._logged_at = ms, now
+            self._remote_ms, self._log_time = ms, now
             self.reading = Reading(stamp, *x)
 
-    def said(self) -> str:
+    def console_text(self) -> str:
         """Return the Crazyflie's console output as a suffix for an error message."""
         words = " ".join(self.console.split())
         return f"; it said: {words}" if words else ""

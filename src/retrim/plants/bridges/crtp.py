@@ -49,7 +49,7 @@ class Packet(NamedTuple):
         return bytes([self.port << 4 | 3 << 2 | self.channel]) + self.body
 
 
-def unpacked(data: bytes) -> Packet:
+def unpack(data: bytes) -> Packet:
     """Return the packet in a datagram.
 
     Raises:
@@ -105,8 +105,8 @@ def arm(yes: bool, version: int) -> Packet:
 
 def new_block(number: int, variables: list[tuple[str, int]]) -> list[Packet]:
     """Return the orders that create a log block from the types and numbers of its variables."""
-    listed = [struct.pack("<BH", LOG_TYPES[kind], item) for kind, item in variables]
-    parts = [b"".join(listed[k : k + LISTED]) for k in range(0, len(listed), LISTED)]
+    items = [struct.pack("<BH", LOG_TYPES[kind], item) for kind, item in variables]
+    parts = [b"".join(items[k : k + LISTED]) for k in range(0, len(items), LISTED)]
     return [Packet(LOG, CONTROL, bytes([APPEND if k else CREATE, number]) + part) for k, part in enumerate(parts)]
 
 
@@ -177,7 +177,7 @@ def status_values(status: Status) -> bytes:
     return _STATUS.pack(*status)
 
 
-def attitude_of(packed: int) -> np.ndarray:
+def attitude_of(word: int) -> np.ndarray:
     """Return an attitude, body to world, from 32 bits: the largest element's index, and the other signs and magnitudes.
 
     Raises:
@@ -185,9 +185,9 @@ def attitude_of(packed: int) -> np.ndarray:
     """
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
-    largest, q = packed >> 30, np.zeros(4)
+    largest, q = word >> 30, np.zeros(4)
     for k, i in enumerate(i for i in (3, 2, 1, 0) if i != largest):
-        bits = packed >> 10 * k
+        bits = word >> 10 * k
         q[i] = (-1.0 if bits >> 9 & 1 else 1.0) * (bits & _BITS) / _BITS * _HALF
     rest = 1.0 - float(q @ q)
     if rest < 0.24:  # the largest of four elements is at least half the length
@@ -202,8 +202,8 @@ def quaternion_of(R: np.ndarray) -> int:
     from scipy.spatial.transform import Rotation  # local for the same reason
 
     q = Rotation.from_matrix(R).as_quat()
-    packed = largest = int(np.argmax(np.abs(q)))
+    word = largest = int(np.argmax(np.abs(q)))
     q = -q if q[largest] < 0.0 else q
     for i in (i for i in range(4) if i != largest):
-        packed = packed << 10 | int(q[i] < 0.0) << 9 | min(_BITS, round(_BITS * abs(float(q[i])) / _HALF))
-    return packed
+        word = word << 10 | int(q[i] < 0.0) << 9 | min(_BITS, round(_BITS * abs(float(q[i])) / _HALF))
+    return word

@@ -87,7 +87,7 @@ class SerialEndpoint:
             self._line = serial.Serial(device, baud, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:
             raise PlantError(f"serial:{device}:{baud} cannot be opened: {error}") from error
-        self._lost = (serial.SerialException, OSError)
+        self._link_errors = (serial.SerialException, OSError)
 
     def fileno(self) -> int:
         """Return the line's descriptor."""
@@ -97,13 +97,13 @@ class SerialEndpoint:
         """Return received data; the sender is ``"line"``."""
         try:
             data = self._line.read(4096)
-        except self._lost:
+        except self._link_errors:
             return None
         return (bytes(data), "line") if data else None
 
     def send(self, data: bytes, to: Any) -> None:
         """Write to the line."""
-        with contextlib.suppress(*self._lost):
+        with contextlib.suppress(*self._link_errors):
             self._line.write(data)
 
     def close(self) -> None:

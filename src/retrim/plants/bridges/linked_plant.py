@@ -17,7 +17,7 @@ class VehicleLink(Protocol):
 
     reading: Reading | None
     """Newest state; None until the first one arrives."""
-    heard: float
+    last_message: float
     """Time of the last received message, on the monotonic clock [s]."""
 
 

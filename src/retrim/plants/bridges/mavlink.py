@@ -23,7 +23,7 @@ SET_MODE, ARM_DISARM = 176, 400  # MAV_CMD
 STREAMS = {"ODOMETRY": 100.0, "ATTITUDE_TARGET": 25.0, "HIL_STATE_QUATERNION": 50.0}  # [Hz]
 UNUSED = ("HIGHRES_IMU", "ATTITUDE", "ALTITUDE", "VFR_HUD", "SERVO_OUTPUT_RAW", "HIL_ACTUATOR_CONTROLS")
 # [s], limits for the first message and for readiness; time after which arming is tried even if PX4 is not ready
-HEARD_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0
+LISTENS_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0
 SWITCH_S, ARM_S, GO_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
 ASK_AGAIN_S = 1.0  # [s]
 LOST_S = 2.0  # [s] of silence, after which the autopilot's failsafe has long taken over
@@ -58,8 +58,8 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         address_of(self.address)
         self.thrust = ThrustScale(0.0, 1.0)
         """Scale of thrust commands; its range is the motors' full thrust."""
-        self._engaged = False
-        self._place, self._heading, self._told = np.zeros(3), 0.0, -math.inf
+        self._is_engaged = False
+        self._place, self._heading, self._last_note = np.zeros(3), 0.0, -math.inf
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Connect to PX4, and wait until it can be armed."""
@@ -71,9 +71,9 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
                 endpoint.close()
                 raise
         link = self._link
-        if not self.until(lambda: link.system is not None, HEARD_S, keep_on):
+        if not self.until(lambda: link.system is not None, LISTENS_S, keep_on):
             raise PlantError(
-                f"{self.address}: no autopilot was heard there in {HEARD_S:g} s; is it on, and does it send there?"
+                f"{self.address}: no autopilot was heard there in {LISTENS_S:g} s; is it on, and does it send there?"
             )
         if link.autopilot != PX4:
             raise PlantError(f"{self.address}: autopilot {link.autopilot} answers; only PX4 ({PX4}) is known")
@@ -83,9 +83,9 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
             link.stream(message, 1.0)
         began = time.monotonic()
         # With motion capture instead of GPS, PX4 does not report that it can be armed, although it can.
-        known = lambda: link.reading is not None and (link.ready or time.monotonic() - began > UNREADY_S)  # noqa: E731
-        if not self.until(known, READY_S, keep_on):
-            raise PlantError(f"{self.address}: no position in {READY_S:g} s{self._said()}")
+        is_ready = lambda: link.reading is not None and (link.ready or time.monotonic() - began > UNREADY_S)  # noqa: E731
+        if not self.until(is_ready, READY_S, keep_on):
+            raise PlantError(f"{self.address}: no position in {READY_S:g} s{self._status_text()}")
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Let PX4 fly to a position, and identify PX4's thrust command at hover."""
@@ -95,12 +95,12 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         self._heading = heading_of(x.R) if yaw is None else yaw
         self.hold(time.monotonic() + 0.5)  # PX4 needs a setpoint before the mode change
         self._ask(self._offboard, SET_MODE, (1.0, *map(float, OFFBOARD)), SWITCH_S, keep_on, "offboard mode")
-        self._engaged = True
+        self._is_engaged = True
         self._ask(lambda: link.armed, ARM_DISARM, (1.0,), ARM_S, keep_on, "to be armed")
         if not self.until(self.staying(self._place, self._tell), GO_S, keep_on):
             raise PlantError(
                 f"the autopilot is at {self.reading().p.round(2).tolist()} m after {GO_S:g} s, not at "
-                f"{self._place.round(2).tolist()}{self._said()}"
+                f"{self._place.round(2).tolist()}{self._status_text()}"
             )
         link.thrusts.clear()
         self.hold(time.monotonic() + THRUST_S)
@@ -117,12 +117,12 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
         link = self.link
         link.pump(0.0)
         now, x, truth = time.monotonic(), self.reading(), link.truth
-        if now - link.heard > LOST_S:
+        if now - link.last_message > LOST_S:
             raise PlantError(f"the link has been silent for {LOST_S:g} s; the autopilot does what its failsafe says")
-        if self._engaged and not (self._offboard() and link.armed):
-            raise PlantError(f"the autopilot has left offboard mode, for mode {link.mode}{self._said()}")
-        told = None if truth is None or now - truth.stamp > LOST_S else truth.at(now)
-        return x.at(now)._replace(truth=told)
+        if self._is_engaged and not (self._offboard() and link.armed):
+            raise PlantError(f"the autopilot has left offboard mode, for mode {link.mode}{self._status_text()}")
+        fresh_truth = None if truth is None or now - truth.stamp > LOST_S else truth.at(now)
+        return x.at(now)._replace(truth=fresh_truth)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
         """Send thrust and body rates."""
@@ -141,16 +141,16 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
             return
         try:
             link.pump(0.0)
-            if self._engaged and link.mode[0] == OFFBOARD[0] and link.armed:
+            if self._is_engaged and link.mode[0] == OFFBOARD[0] and link.armed:
 
                 def order() -> None:
                     if link.mode[0] == OFFBOARD[0]:
                         link.command(SET_MODE, 1.0, *map(float, LAND))
 
-                over = lambda: not link.armed or time.monotonic() - link.heard > LOST_S  # noqa: E731
+                over = lambda: not link.armed or time.monotonic() - link.last_message > LOST_S  # noqa: E731
                 wait_until(insisting(order, over, ASK_AGAIN_S), LANDING_S, lambda: True, link.pump)
         finally:
-            self._engaged = False
+            self._is_engaged = False
             link.close()
 
     def _offboard(self) -> bool:
@@ -158,8 +158,8 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
 
     def _tell(self) -> None:
         """Send the position setpoint periodically."""
-        if time.monotonic() - self._told >= TELL_EVERY_S:
-            self._told = time.monotonic()
+        if time.monotonic() - self._last_note >= TELL_EVERY_S:
+            self._last_note = time.monotonic()
             self.link.fly_to(self._place, self._heading)
 
     def _ask(
@@ -167,17 +167,17 @@ class MavlinkPlant(LinkedPlant[MavlinkLink]):
     ) -> None:
         """Repeat a command until its effect is visible."""
 
-        def obeyed() -> bool:
+        def is_obedient() -> bool:
             self._tell()
             return done()
 
-        asking = insisting(lambda: self.link.command(number, *parameters), obeyed, ASK_AGAIN_S)
+        asking = insisting(lambda: self.link.command(number, *parameters), is_obedient, ASK_AGAIN_S)
         if not self.until(asking, patience, keep_on):
-            raise PlantError(f"{self.address}: the autopilot refuses {what}{self._said()}")
+            raise PlantError(f"{self.address}: the autopilot refuses {what}{self._status_text()}")
 
-    def _said(self) -> str:
-        ignored = f"; ignored: {'; '.join(self.link.notes)}" if self.link.notes else ""
-        return ignored + (f"; it said: {'; '.join(self.link.texts)}" if self.link.texts else "")
+    def _status_text(self) -> str:
+        remark = f"; ignored: {'; '.join(self.link.notes)}" if self.link.notes else ""
+        return remark + (f"; it said: {'; '.join(self.link.texts)}" if self.link.texts else "")
 
     @property
     def notes(self) -> Sequence[str]:

@@ -65,7 +65,7 @@ class MavlinkLink:
         """The autopilot's thrust commands to its motors, as shares of the full thrust."""
         self.texts: deque[str] = deque(maxlen=20)
         """Text messages from the autopilot."""
-        self.heard = -math.inf
+        self.last_message = -math.inf
         """Time of the autopilot's last message, on the monotonic clock [s]."""
         self.ignored = 0
         """Number of messages that were damaged, implausible or from other senders."""
@@ -85,9 +85,9 @@ class MavlinkLink:
 
     def command(self, number: int, *parameters: float) -> None:
         """Send COMMAND_LONG; the first answer only confirms arrival, and the autopilot's state shows the effect."""
-        padded = (*parameters, *([0.0] * (7 - len(parameters))))
+        values = (*parameters, *([0.0] * (7 - len(parameters))))
         if self.system is not None:
-            self._send(self._sender.command_long_encode(*self.system, number, 0, *padded))
+            self._send(self._sender.command_long_encode(*self.system, number, 0, *values))
 
     def stream(self, message: str, rate: float) -> None:
         """Request a message at a rate [Hz]."""
@@ -173,8 +173,8 @@ class MavlinkLink:
         except Exception:  # a parser may raise any error on malicious bytes
             self._parser, messages, self.ignored = self._fresh(), [], self.ignored + 1
         for message in messages:
-            if self._known(message, peer):
-                self.heard = now
+            if self._is_valid(message, peer):
+                self.last_message = now
                 take = self._takes.get(message.get_type())
                 if take is not None:
                     try:
@@ -184,7 +184,7 @@ class MavlinkLink:
             else:
                 self.ignored += 1
 
-    def _known(self, message: Any, peer: Any) -> bool:
+    def _is_valid(self, message: Any, peer: Any) -> bool:
         """Return whether a message is intact and from the autopilot; the first autopilot that sends is selected."""
         kind = message.get_type()
         if kind == "BAD_DATA" or kind.startswith("UNKNOWN"):
@@ -206,7 +206,7 @@ class MavlinkLink:
         if message.tc1 == 0:  # a request from the autopilot
             self._send(self._sender.timesync_encode(int(now * 1e9), message.ts1))
         elif 0.0 <= (trip := now - 1e-9 * message.ts1) < 1.0:
-            self._clock.exchanged(now - trip, 1e-9 * message.tc1, now)
+            self._clock.record_exchange(now - trip, 1e-9 * message.tc1, now)
 
     def _odometry(self, message: Any, now: float) -> None:
         frame, child = message.frame_id, message.child_frame_id

@@ -41,15 +41,15 @@ def insisting(order: Callable[[], object], done: KeepOn, every: float) -> KeepOn
         done: Returns whether the condition holds; called before each order.
         every: Time between two orders [s].
     """
-    given = -math.inf
+    last_order = -math.inf
 
-    def obeyed() -> bool:
-        nonlocal given
+    def is_obedient() -> bool:
+        nonlocal last_order
         if done():
             return True
-        if time.monotonic() - given > every:
-            given = time.monotonic()
+        if time.monotonic() - last_order > every:
+            last_order = time.monotonic()
             order()
         return False
 
-    return obeyed
+    return is_obedient

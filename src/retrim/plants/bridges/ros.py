@@ -16,7 +16,7 @@ from .ros_link import ODOMETRY, POSE, RosLink
 from .vehicle_state import VehicleState
 
 MASTER, NAMESPACE = "127.0.0.1:11311", "/mavros"
-HEARD_S, GO_S = 10.0, 120.0  # [s], limits for the first state, and for the flight to the start
+WAIT_S, GO_S = 10.0, 120.0  # [s], limits for the first state, and for the flight to the start
 LOST_S = 1.0  # [s] of silence
 ADDRESS = re.compile(r"(?P<master>[\w.-]+:\d{1,5})(?P<namespace>(/\w+)*)")
 HEADING = math.radians(20.0)
@@ -56,9 +56,9 @@ class RosPlant(LinkedPlant[RosLink]):
             except ConfigError as error:
                 raise PlantError(str(error)) from error
         link = self._link
-        if not self.until(lambda: link.reading is not None, HEARD_S, keep_on):
+        if not self.until(lambda: link.reading is not None, WAIT_S, keep_on):
             raise PlantError(
-                f"{self.address}: neither {self.namespace}/{ODOMETRY} nor {self.namespace}/{POSE} came in {HEARD_S:g} s"
+                f"{self.address}: neither {self.namespace}/{ODOMETRY} nor {self.namespace}/{POSE} came in {WAIT_S:g} s"
             )
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
@@ -86,7 +86,7 @@ class RosPlant(LinkedPlant[RosLink]):
     def read(self) -> VehicleState:
         """Return the newest state."""
         now, link = time.monotonic(), self.link
-        if now - link.heard > LOST_S:
+        if now - link.last_message > LOST_S:
             raise PlantError(f"no state has come for {LOST_S:g} s; who else flies the vehicle has it back")
         return self.reading().at(now)
 

@@ -55,8 +55,8 @@ def attitude_target() -> Any:
     Raises:
         ConfigError: genpy is not installed.
     """
-    made = system_module("genpy.dynamic").generate_dynamic("mavros_msgs/AttitudeTarget", ATTITUDE_TARGET)
-    return made["mavros_msgs/AttitudeTarget"]
+    message_class = system_module("genpy.dynamic").generate_dynamic("mavros_msgs/AttitudeTarget", ATTITUDE_TARGET)
+    return message_class["mavros_msgs/AttitudeTarget"]
 
 
 class RosLink:
@@ -77,7 +77,7 @@ class RosLink:
         self._clock, self._odometry_at, self._stamp = ArrivalClock(), -math.inf, 0.0
         self._one_at_a_time = threading.Lock()
         self.reading: Reading | None = None
-        self.heard = -math.inf
+        self.last_message = -math.inf
         """Time of the last valid state, on the monotonic clock [s]."""
         self.ignored = 0
         """Number of invalid states."""
@@ -110,11 +110,11 @@ class RosLink:
     def _alone(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
         """Return a callback that waits for the callbacks of other topics, which run in other threads."""
 
-        def taken(message: Any) -> None:
+        def take_message(message: Any) -> None:
             with self._one_at_a_time:
                 take(message)
 
-        return taken
+        return take_message
 
     def _odometry(self, message: Any) -> None:
         """Process nav_msgs/Odometry: pose in its frame, twist in its child frame (the body, unless both are equal)."""
@@ -151,11 +151,11 @@ class RosLink:
 
     def _take(self, stamp: float, p: np.ndarray, R: np.ndarray, v: np.ndarray, omega: np.ndarray) -> None:
         now = time.monotonic()
-        self._clock.arrived(stamp, now)
+        self._clock.record_arrival(stamp, now)
         here = self._clock.here(stamp)
         assert here is not None
-        if self.reading is None or here >= self.reading.stamp or now - self.heard > FRESH_S:
-            self.reading, self.heard, self._stamp = Reading(here, p, R, v, omega), now, stamp
+        if self.reading is None or here >= self.reading.stamp or now - self.last_message > FRESH_S:
+            self.reading, self.last_message, self._stamp = Reading(here, p, R, v, omega), now, stamp
 
 
 def _pose(pose: Any) -> tuple[np.ndarray, np.ndarray] | None:

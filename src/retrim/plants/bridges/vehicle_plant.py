@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import PlantError
 from ...physics.state import STANDARD_GRAVITY, Command, State
-from ..plant import Measurement, Plant, as_numpy, check_command, limited
+from ..plant import Measurement, Plant, as_numpy, check_command, limit_command
 from .frames import heading_of
 from .polling import KeepOn, wait_until
 from .vehicle_state import VehicleState
@@ -36,7 +36,7 @@ class VehiclePlant(Plant, abc.ABC):
         """
         self.dt = dt
         self.low, self.high = low, high
-        self.lost: float | None = None
+        self.lost_time: float | None = None
         """Time that a simulated vehicle lost because this machine was busy [s]; None for other vehicles."""
         self._tick: int | None = None
         self._began = 0.0
@@ -89,9 +89,9 @@ class VehiclePlant(Plant, abc.ABC):
 
     def send(self, u: np.ndarray) -> np.ndarray:
         """Clip a command [c, omega], send it immediately, and return the command that the vehicle accepts."""
-        taken = self.transmit(np.clip(u, self.low, self.high))
-        self._thrust = float(taken[0])
-        return taken
+        transmission = self.transmit(np.clip(u, self.low, self.high))
+        self._thrust = float(transmission[0])
+        return transmission
 
     def now(self) -> VehicleState:
         """Return the newest state, extrapolated to the current time; its age is the time that was not extrapolated.
@@ -99,7 +99,7 @@ class VehiclePlant(Plant, abc.ABC):
         Raises:
             PlantError: See :meth:`read`.
         """
-        return self.read().carried_on(self._thrust)
+        return self.read().extrapolate(self._thrust)
 
     @abc.abstractmethod
     def wait(self, until: float) -> None:
@@ -147,27 +147,31 @@ class VehiclePlant(Plant, abc.ABC):
         else:
             self.take_off(np.asarray(x0.p, dtype=float), heading_of(np.asarray(x0.R, dtype=float)))
         self._tick, self._began, self._thrust = 0, time.monotonic(), STANDARD_GRAVITY
-        return self._measured()
+        return self._measure()
 
     def step(self, u: Command) -> tuple[Measurement, Command]:
         """Send a command, and return the measurement at the end of the tick."""
-        wanted = check_command(u, type(self).__name__)
+        command = check_command(u, type(self).__name__)
         if self._tick is None:
             raise PlantError(f"{type(self).__name__}: not flying; call reset first")
-        within = limited(u, wanted, self.low, self.high)
-        sent = as_numpy(within).astype(float)
-        taken = self.send(sent)
-        accepted = within if np.allclose(taken, sent, atol=1e-6) else Command.of(jnp.asarray(taken, wanted.dtype))
+        within = limit_command(u, command, self.low, self.high)
+        limited_u = as_numpy(within).astype(float)
+        transmission = self.send(limited_u)
+        accepted_command = (
+            within
+            if np.allclose(transmission, limited_u, atol=1e-6)
+            else Command.of(jnp.asarray(transmission, command.dtype))
+        )
         self._tick = max(self._tick + 1, int((time.monotonic() - self._began) / self.dt))
         self.wait(self._began + self._tick * self.dt)
-        return self._measured(), accepted
+        return self._measure(), accepted_command
 
     def stop(self) -> None:
         """Let the autopilot land the vehicle."""
         self._tick = None
         self.land()
 
-    def _measured(self) -> Measurement:
+    def _measure(self) -> Measurement:
         now = self.now()
         assert self._tick is not None
         dtype = jnp.result_type(float)

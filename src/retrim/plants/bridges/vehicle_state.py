@@ -24,15 +24,15 @@ class VehicleState(NamedTuple):
     """Time since the state was valid [s]."""
     truth: "VehicleState | None" = None
     """True state, if a simulator behind the autopilot reports it."""
-    carried: float = 0.0
+    extrapolation: float = 0.0
     """Extrapolated time [s]; the reported state is older than ``age`` by this amount."""
 
     @property
     def news(self) -> float:
         """Age of the state that the vehicle reported [s]."""
-        return self.age + self.carried
+        return self.age + self.extrapolation
 
-    def carried_on(self, c: float) -> "VehicleState":
+    def extrapolate(self, c: float) -> "VehicleState":
         """Return the state extrapolated to the current time with constant thrust, gravity and body rates.
 
         The extrapolation is limited to 50 ms; the new age is the time beyond this limit.
@@ -49,11 +49,11 @@ class VehicleState(NamedTuple):
 
         h = min(self.age, LONGEST_S)
         a = c * self.R[:, 2] - np.array([0.0, 0.0, STANDARD_GRAVITY])
-        turned = Rotation.from_rotvec(h * self.omega).as_matrix()
-        truth = None if self.truth is None else self.truth.carried_on(c)
+        rotation = Rotation.from_rotvec(h * self.omega).as_matrix()
+        truth = None if self.truth is None else self.truth.extrapolate(c)
         return self._replace(
-            p=self.p + h * self.v + 0.5 * h * h * a, R=self.R @ turned, v=self.v + h * a, truth=truth,
-            age=self.age - h, carried=self.carried + h,
+            p=self.p + h * self.v + 0.5 * h * h * a, R=self.R @ rotation, v=self.v + h * a, truth=truth,
+            age=self.age - h, extrapolation=self.extrapolation + h,
         )  # fmt: skip
 
 

@@ -12,10 +12,10 @@ from jax import lax, random
 from retrim.config import Setup, changed, load
 from retrim.config.families import prior_belief
 from retrim.control.actuator_tracking import ActuatorTracking
+from retrim.control.belief_flight import IdentifiedFlight
 from retrim.control.controller import AbstractController
 from retrim.control.excitation import Excitation
 from retrim.control.finite_controller import FiniteController
-from retrim.control.identified import IdentifiedFlight
 from retrim.control.integral import IntegralAction
 from retrim.control.near_target import NearTarget
 from retrim.control.vehicle_report import VehicleEstimate
@@ -38,22 +38,22 @@ SHORT = {"num_updates": 10, "num_envs": 2, "horizon": 20, "hidden_sizes": (16, 1
 class Weak(AbstractController[Command]):
     """A soft hover that needs no policy; its memory contains its last inputs."""
 
-    told: ActuatorState = dataclasses.field(default_factory=lambda: ActuatorState.at(Command.hover()))
+    actuators: ActuatorState = dataclasses.field(default_factory=lambda: ActuatorState.at(Command.hover()))
     member: Member = dataclasses.field(
         default_factory=lambda: Member(family().path(jnp.zeros(4)), PathBelief.unknown())
     )
 
     def init(self, x):
-        return self.told, self.member
+        return self.actuators, self.member
 
     def __call__(self, memory, t, x):
         wobble = jnp.stack([jnp.sin(7.0 * t), jnp.cos(5.0 * t), jnp.sin(3.0 * t)])
         level = jnp.stack([-x.R[2, 1], x.R[2, 0], 0.0 * t])
         pull = -2.0 * (x.p[2] - 1.0) - 2.0 * x.v[2] + 0.5 * jnp.sin(11.0 * t)
-        return Command(9.81 + pull, 2.0 * level + wobble), (self.told, self.member)
+        return Command(9.81 + pull, 2.0 * level + wobble), (self.actuators, self.member)
 
     def with_actuators(self, actuators):
-        return dataclasses.replace(self, told=actuators)
+        return dataclasses.replace(self, actuators=actuators)
 
     def with_vehicle(self, member):
         return dataclasses.replace(self, member=member)
@@ -74,12 +74,12 @@ def simulation(delay, lag, *, damping=1.0, gain=1.0, lift=0.0):
     limits = (small().command_min, small().command_max)
     response = ActuatorResponse.of(0.03, lag, inverse_damping=1.0 / damping, thrust_gain=gain)
 
-    def lifted(t, x):
+    def lift_by(t, x):
         push = jnp.where(t >= 2.0, lift, 0.0) * jnp.array([0.0, 0.0, 1.0], x.p.dtype)
         return dataclasses.replace(ExternalEffects.calm(x.p.dtype), push=push.astype(x.p.dtype))
 
     model = SecondOrderQuadrotor(response, jnp.array(1.0), jnp.array(0.3), limits, DT)
-    return Simulation(model, lifted, None, random.key(0), jnp.array(delay))
+    return Simulation(model, lift_by, None, random.key(0), jnp.array(delay))
 
 
 @eqx.filter_jit
@@ -152,19 +152,19 @@ def test_belief_and_gain_never_jump(x0):
     assert np.abs(np.diff(np.asarray(memory.gain))).max() <= 1.0 * DT + 1e-5
 
 
-@pytest.mark.parametrize("sensed", [True, False])
-def test_the_tracked_rates_are_those_of_the_vehicle(x0, sensed):
+@pytest.mark.parametrize("rates_sensed", [True, False])
+def test_the_tracked_rates_are_those_of_the_vehicle(x0, rates_sensed):
     """Exactly, where the path is known; with a gyroscope, at once, where it is not."""
-    known = CommandPath.of(0.03, ActuatorResponse.of(0.03, 0.1, inverse_damping=1.0))
-    path = known if not sensed else CommandPath.of(0.0, ActuatorResponse.of(0.03, 0.01))
+    model = CommandPath.of(0.03, ActuatorResponse.of(0.03, 0.1, inverse_damping=1.0))
+    path = model if not rates_sensed else CommandPath.of(0.0, ActuatorResponse.of(0.03, 0.01))
     plant = simulation(0.03, 0.1)
 
-    true, memory = fly(plant, ActuatorTracking(Weak(), path, DT), x0, 100, senses=sensed)
-    told, _ = memory.inner
+    true, memory = fly(plant, ActuatorTracking(Weak(), path, DT), x0, 100, senses=rates_sensed)
+    message, _ = memory.inner
     R = np.asarray(true.R)
     turn = np.einsum("kji,kjl->kil", R[:-1], R[1:])
     mean = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
-    omega = np.asarray(told.command.omega)
+    omega = np.asarray(message.command.omega)
     np.testing.assert_allclose(0.5 * (omega[:-1] + omega[1:]), mean / (2.0 * DT), atol=0.06)
 
 
@@ -179,13 +179,13 @@ def test_controllers_around_another_one_pass_the_vehicle_on(wrap, x0):
     }
     outer = makers.get(wrap, wrap)(Weak())
     member = Member(family().path(jnp.ones(4)), PathBelief.between(jnp.ones(4), jnp.ones(4)))
-    found = outer.with_vehicle(member)
-    inner = next(getattr(found, name) for name in ("inner", "base") if hasattr(found, name))
+    result = outer.with_vehicle(member)
+    inner = next(getattr(result, name) for name in ("inner", "base") if hasattr(result, name))
     np.testing.assert_array_equal(inner.member.belief.centre, np.ones(4))
     if wrap != "tracking":  # it tells the controller inside itself
-        told = outer.with_actuators(ActuatorState.at(Command(jnp.array(5.0), jnp.ones(3))))
-        inner = next(getattr(told, name) for name in ("inner", "base") if hasattr(told, name))
-        assert float(inner.told.command.c) == 5.0
+        message = outer.with_actuators(ActuatorState.at(Command(jnp.array(5.0), jnp.ones(3))))
+        inner = next(getattr(message, name) for name in ("inner", "base") if hasattr(message, name))
+        assert float(inner.actuators.command.c) == 5.0
 
 
 def test_a_vehicle_file_is_believed_within_a_factor_of_two():
@@ -222,8 +222,8 @@ def test_the_observer_is_as_fast_as_the_vehicle_permits(as_a_user):
 
     def tau(low, high):
         belief = PathBelief.between(jnp.array(low), jnp.array(high))
-        found = flight.follow(VehicleEstimate(belief, jnp.array(1.0)))._flying(belief)
-        return float(found.inner.observer.tau)
+        result = flight.follow(VehicleEstimate(belief, jnp.array(1.0)))._flying(belief)
+        return float(result.inner.observer.tau)
 
     fast, slow = [-1.0] * 4, [1.0] * 4
     assert tau(fast, fast) == pytest.approx(0.015)

@@ -16,7 +16,7 @@ from retrim.cli.arguments import (
     with_residual,
 )
 from retrim.config.registry import describe_user_error
-from retrim.io.trained import load_policy, save_policy
+from retrim.io.policies import load_policy, save_policy
 
 SEVEN_INCH = Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml"
 
@@ -26,11 +26,11 @@ def test_a_preset_is_that_of_the_task_with_what_was_asked_on_top(tmp_path):
     assert training_preset("hover", "hover/fast") == load("hover/fast")
     overlay = tmp_path / "a.toml"
     overlay.write_text("delay_ticks = 2\n[pretrain]\nnum_updates = 7\nnum_envs = 3\n[adapt]\nnum_updates = 9\n")
-    found = training_preset("hover", config=overlay, num_updates=5, num_envs=None, residual="zero", vehicle="large")
-    assert (found.delay_ticks, found.pretrain.num_updates, found.pretrain.num_envs) == (2, 5, 3)
-    assert (found.adapt.num_updates, found.adapt.residual, found.vehicle) == (9, "zero", "large")
-    tracked = training_preset("track", reference="circle")
-    assert tracked == changed(load("track/retrim"), track={"reference": "circle"})
+    result = training_preset("hover", config=overlay, num_updates=5, num_envs=None, residual="zero", vehicle="large")
+    assert (result.delay_ticks, result.pretrain.num_updates, result.pretrain.num_envs) == (2, 5, 3)
+    assert (result.adapt.num_updates, result.adapt.residual, result.vehicle) == (9, "zero", "large")
+    track_preset = training_preset("track", reference="circle")
+    assert track_preset == changed(load("track/retrim"), track={"reference": "circle"})
     assert training_preset("hover", vehicle=str(SEVEN_INCH)).vehicle.mass == pytest.approx(1.2)
     with pytest.raises(ConfigError, match="--reference circle: a hover policy follows none"):
         training_preset("hover", reference="circle")
@@ -45,40 +45,45 @@ def test_the_reference_of_a_flight_is_one_that_the_policy_can_follow():
     assert [reference_of_flight(one, name) for name in (None, "star", "figure8")] == ["star", "star", "figure8"]
     assert [reference_of_flight(blind, name) for name in (None, "circle")] == ["circle", "circle"]
     assert reference_of_flight(family, "circle") == "circle"
-    for preset, name, said in (
+    for preset, name, text in (
         (load("hover/fast"), "circle", "a hover policy follows none"),
         (family, None, "say which to fly"),
         (blind, "star", "does not see its reference, and was trained on circle"),
     ):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=text):
             reference_of_flight(preset, name)
 
 
 def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
-    trained = load("track/retrim")
-    free = changed(trained, adapt={"num_updates": 3}, delay_ticks=0)
-    assert same_policy(trained, free, Path("a.toml")) is free
-    for changes, said in (
+    trained_policy = load("track/retrim")
+    free = changed(trained_policy, adapt={"num_updates": 3}, delay_ticks=0)
+    assert same_policy(trained_policy, free, Path("a.toml")) is free
+    for changes, text in (
         ({"vehicle": "large"}, "vehicle = 'large', but the policy was trained with 'small'"),
         ({"dt": 0.01}, "dt = 0.01, but the policy was trained with 0.02"),
         ({"command_history": 1}, "command_history = 1, but the policy was trained with 2"),
         ({"pretrain": {"num_updates": 3}}, r"\[pretrain\] cannot change for a policy that is trained"),
         ({"track": {"observation": "both"}}, "track.observation = 'both', but the policy was trained with 'flat'"),
     ):
-        with pytest.raises(ConfigError, match=rf"a\.toml: {said}"):
-            same_policy(trained, dataclasses.replace(trained, **_whole(trained, changes)), Path("a.toml"))
+        with pytest.raises(ConfigError, match=rf"a\.toml: {text}"):
+            same_policy(
+                trained_policy, dataclasses.replace(trained_policy, **_whole(trained_policy, changes)), Path("a.toml")
+            )
 
 
 def test_a_flight_may_excite_a_vehicle_but_not_change_its_family():
-    trained = load("hover/any")
-    excited = changed(trained, family={"excitation": True})
-    assert same_policy(trained, excited, Path("a.toml")) is excited
-    for other, said in (
-        (changed(trained, family={"delay": (0.0, 0.05)}), "family = "),
-        (dataclasses.replace(trained, axes="world"), "axes = 'world', but the policy was trained with 'heading'"),
+    trained_policy = load("hover/any")
+    excitation = changed(trained_policy, family={"excitation": True})
+    assert same_policy(trained_policy, excitation, Path("a.toml")) is excitation
+    for other, text in (
+        (changed(trained_policy, family={"delay": (0.0, 0.05)}), "family = "),
+        (
+            dataclasses.replace(trained_policy, axes="world"),
+            "axes = 'world', but the policy was trained with 'heading'",
+        ),
     ):
-        with pytest.raises(ConfigError, match=rf"a\.toml: {said}"):
-            same_policy(trained, other, Path("a.toml"))
+        with pytest.raises(ConfigError, match=rf"a\.toml: {text}"):
+            same_policy(trained_policy, other, Path("a.toml"))
 
 
 def _whole(preset, changes):
@@ -101,9 +106,9 @@ def test_a_residual_is_another_one_but_not_in_a_flight_that_goes_on(key):
 
 def test_where_a_flight_takes_place_is_its_scenario():
     preset = load("track/preview")
-    found = FlightArguments("wind=3", "simple", "figure8", "large", "mocap", 0.01, 0.04).scenario(preset)
-    assert (found.disturbance, found.plant, found.reference) == ("wind=3", "simple", "figure8")
-    assert (found.vehicle, found.sensors, found.thrust_error, found.delay) == ("large", "mocap", 0.01, 0.04)
+    result = FlightArguments("wind=3", "simple", "figure8", "large", "mocap", 0.01, 0.04).scenario(preset)
+    assert (result.disturbance, result.plant, result.reference) == ("wind=3", "simple", "figure8")
+    assert (result.vehicle, result.sensors, result.thrust_error, result.delay) == ("large", "mocap", 0.01, 0.04)
     assert FlightArguments().scenario(load("hover/fast")).disturbance == "large"
     assert FlightArguments(plant="mavlink:udp:127.0.0.1:14550").scenario(load("hover/fast")).disturbance == "none"
 
@@ -111,8 +116,8 @@ def test_where_a_flight_takes_place_is_its_scenario():
 def test_weights_are_of_a_policy_or_of_an_earlier_flight(tmp_path, key):
     preset = brief_preset()
     save_policy(tmp_path / "policy.safetensors", Setup.from_preset(preset).new_policy(key), preset)
-    weights, found, state = load_inputs(tmp_path, None)
-    assert (found, state) == (preset, None)
+    weights, result, state = load_inputs(tmp_path, None)
+    assert (result, state) == (preset, None)
     assert weights.layers[0].weight.shape == load_policy(tmp_path)[0].layers[0].weight.shape
     with pytest.raises(ConfigError, match="give either --policy FILE or --resume FILE"):
         load_inputs(None, None)
@@ -126,10 +131,10 @@ def test_a_mistake_in_a_module_of_ones_own_is_told_in_a_line(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine_that_fails.py").write_text("def wind():\n    return 1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ZeroDivisionError) as caught:
+    with pytest.raises(ZeroDivisionError) as error:
         __import__("mine_that_fails").wind()
-    said = describe_user_error(caught.value, ["retrim", "fly"])
-    assert said.startswith(f"{tmp_path / 'mine_that_fails.py'}, line 2: ZeroDivisionError: division by zero")
+    text = describe_user_error(error.value, ["retrim", "fly"])
+    assert text.startswith(f"{tmp_path / 'mine_that_fails.py'}, line 2: ZeroDivisionError: division by zero")
     with pytest.raises(KeyError) as ours:
         {}["x"]
     assert describe_user_error(ours.value, ["retrim", "fly", "--starts", "1"]) is None

@@ -12,10 +12,10 @@ from jax import random
 
 from helpers import brief_preset
 from live_helpers import TOPICS, plan
-from live_processes import DT, level, moved
+from live_processes import DT, level, move
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
-from retrim.io.trained import save_learner_state
+from retrim.io.policies import save_learner_state
 from retrim.live.live_options import choices, paths
 from retrim.live.operator import reference_switcher as following
 from retrim.live.operator.reference_switcher import ReferenceSwitcher
@@ -29,7 +29,7 @@ from retrim.onboard.messages import COLUMNS, FlightRows, Parameters, Sample, las
 from retrim.onboard.topics import REFERENCE
 from retrim.physics import State
 from retrim.tasks.shapes import circle, figure8
-from retrim.tasks.transition import spliced, transition_between
+from retrim.tasks.transition import splice, transition_between
 from retrim.transport import wire
 from retrim.transport.in_process import InProcessBus
 
@@ -40,7 +40,7 @@ AT = 1.4  # [s]
 
 
 @pytest.fixture(scope="module")
-def made():
+def origin():
     """A set-up on the circle, what it starts from, and the controller."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(brief_preset("track/retrim"), "circle")
@@ -49,8 +49,8 @@ def made():
 
 
 @pytest.fixture(scope="module")
-def table(made):
-    return transition_between(made[0].followed, figure8(), AT, made[0].vehicle)
+def table(origin):
+    return transition_between(origin[0].flight_reference, figure8(), AT, origin[0].vehicle)
 
 
 def message(table, controller, version=1, computed_from=AT - 0.8):
@@ -64,15 +64,15 @@ class Flight:
     def __init__(self, controller):
         self.bus = InProcessBus(ROOM)
         self.loop = ControlLoop(plan(controller, delay_ticks=0), self.bus)
-        self.x, self.tick, self.issued = level(np.array([0.0, 0.0, 1.0])), 0, []
+        self.x, self.tick, self.commands = level(np.array([0.0, 0.0, 1.0])), 0, []
 
     def until(self, t):
         while self.tick * DT < t - 1e-9:
-            now, u = time.monotonic(), self.issued[-1] if self.issued else np.array([9.81, 0.0, 0.0, 0.0])
+            now, u = time.monotonic(), self.commands[-1] if self.commands else np.array([9.81, 0.0, 0.0, 0.0])
             self.bus.publish("sample", Sample(self.tick, self.tick * DT, now, 0.0, self.x, self.x, u).pack())
-            self.issued.append(self.loop.tick(now).u)
+            self.commands.append(self.loop.tick(now).u)
             self.loop.idle()
-            self.x = moved(self.x, self.issued[-1])
+            self.x = move(self.x, self.commands[-1])
             self.tick += 1
 
     @property
@@ -84,48 +84,48 @@ class Flight:
 # ---- the process that flies
 
 
-def test_what_is_followed_is_a_parameter_of_the_controller(made, table):
-    one, other = Flight(made[2]), Flight(made[2])
+def test_what_is_followed_is_a_parameter_of_the_controller(origin, table):
+    one, other = Flight(origin[2]), Flight(origin[2])
     for flight in (one, other):
         flight.until(0.7)
-    other.bus.publish("parameters.reference", message(table, made[2]))
+    other.bus.publish("parameters.reference", message(table, origin[2]))
     for flight in (one, other):
         flight.until(0.96)  # what is seen 0.4 s ahead is still the old one
-    np.testing.assert_allclose(one.issued, other.issued, atol=0.02)
+    np.testing.assert_allclose(one.commands, other.commands, atol=0.02)
     for t in (0.9, 2.0, 3.3, 20.0):
         np.testing.assert_allclose(other.loop.pilot.target(t), table(jnp.array(t)).p, atol=1e-9)
-        np.testing.assert_allclose(one.loop.pilot.target(t), made[0].flight_task.target(jnp.array(t)), atol=1e-9)
+        np.testing.assert_allclose(one.loop.pilot.target(t), origin[0].flight_task.target(jnp.array(t)), atol=1e-9)
     assert other.status["versions"] == {"policy": 0, "residual": 0, REFERENCE: 1}
     assert other.status["swaps"] == []  # nothing was learnt
 
 
-def test_it_stays_whether_learning_is_flown_or_not(made, table):
-    flight = Flight(made[2])
+def test_it_stays_whether_learning_is_flown_or_not(origin, table):
+    flight = Flight(origin[2])
     flight.until(0.7)
     flight.loop.intake.open = False
-    flight.bus.publish("parameters.reference", message(table, made[2]))
+    flight.bus.publish("parameters.reference", message(table, origin[2]))
     flight.until(0.8)
-    wanted = np.asarray(table(jnp.array(9.0)).p)
-    for learnt in (False, True, False):
-        flight.loop.intake.open = learnt
-        np.testing.assert_allclose(flight.loop.pilot.target(9.0), wanted, atol=1e-9)
+    expected = np.asarray(table(jnp.array(9.0)).p)
+    for learner_state in (False, True, False):
+        flight.loop.intake.open = learner_state
+        np.testing.assert_allclose(flight.loop.pilot.target(9.0), expected, atol=1e-9)
         assert flight.status["versions"][REFERENCE] == 1
 
 
-def test_one_that_comes_too_late_would_jump_and_is_refused(made, table):
-    flight = Flight(made[2])
+def test_one_that_comes_too_late_would_jump_and_is_refused(origin, table):
+    flight = Flight(origin[2])
     flight.until(AT)
-    flight.bus.publish("parameters.reference", message(table, made[2]))
+    flight.bus.publish("parameters.reference", message(table, origin[2]))
     flight.until(AT + 0.1)
     assert flight.status["refused"] == {"late reference": 1}
-    np.testing.assert_allclose(flight.loop.pilot.target(9.0), made[0].flight_task.target(jnp.array(9.0)), atol=1e-9)
+    np.testing.assert_allclose(flight.loop.pilot.target(9.0), origin[0].flight_task.target(jnp.array(9.0)), atol=1e-9)
 
 
 # ---- the learner
 
 
-def test_the_learner_learns_on_it_without_compiling_again(made, table, tmp_path):
-    setup, state, controller = made
+def test_the_learner_learns_on_it_without_compiling_again(origin, table, tmp_path):
+    setup, state, controller = origin
     start = tmp_path / "start.safetensors"
     save_learner_state(start, state, setup.preset)
     bus = InProcessBus(ROOM)
@@ -149,7 +149,7 @@ def test_the_learner_learns_on_it_without_compiling_again(made, table, tmp_path)
 # ---- who asks
 
 
-class Told(Supervisor):
+class RecordingSupervisor(Supervisor):
     """Has a bus and no processes; the plant's time, which is control's, is ``behind`` the wall's [s]."""
 
     def __init__(self, spec, behind):
@@ -163,10 +163,10 @@ class Told(Supervisor):
         return t
 
 
-def asked(made, folder, fence=3.0, behind=0.0):
-    setup, state, _ = made
+def ask(result, folder, fence=3.0, behind=0.0):
+    setup, state, _ = result
     request = LiveRequest(setup, state.policy.policy, Scenario(reference="circle"), "full", 60.0, 0, fence, folder)
-    supervisor = Told(live_spec(request), behind)
+    supervisor = RecordingSupervisor(live_spec(request), behind)
     return ReferenceSwitcher(request, supervisor, ThreadPoolExecutor(1)), supervisor
 
 
@@ -176,7 +176,7 @@ def status(supervisor, version=0):
     return Status(t, {"versions": {REFERENCE: version}}, {}, {}, {}, None, [], False, 0, None)
 
 
-def obeyed(follows, supervisor, done, version=0):
+def poll_requests(follows, supervisor, done, version=0):
     """Events until ``done``."""
     events, until = [], time.monotonic() + 60.0
     while not done() and time.monotonic() < until:
@@ -185,86 +185,95 @@ def obeyed(follows, supervisor, done, version=0):
     return events
 
 
-def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(made, tmp_path):
-    follows, supervisor = asked(made, tmp_path)
+def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(origin, tmp_path):
+    follows, supervisor = ask(origin, tmp_path)
     assert follows.ask("circle", 1.0) == follows.ask("module:name", 1.0) == []  # followed already; not offered
     assert [event.note for event in follows.ask("figure8", 1.0)] == ["reference figure8"]
     assert follows.ask("star", 1.0) == []  # one at a time: it is asked for again below
     bus = supervisor.bus
-    assert obeyed(follows, supervisor, lambda: bus.latest("parameters.reference") is not None) == []
+    assert poll_requests(follows, supervisor, lambda: bus.latest("parameters.reference") is not None) == []
     assert len(follows.pieces) == 1
     controller = supervisor.spec.controller
-    found = Parameters.unpack(
+    result = Parameters.unpack(
         bus.latest("parameters.reference").data, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base,
         after=0,
     )  # fmt: skip
-    assert found.computed_from <= time.monotonic() - supervisor.epoch
-    assert obeyed(follows, supervisor, lambda: len(follows.pieces) > 1, 1) == [
+    assert result.computed_from <= time.monotonic() - supervisor.epoch
+    assert poll_requests(follows, supervisor, lambda: len(follows.pieces) > 1, 1) == [
         "reference: it goes over to figure8", "asked: reference star",
     ]  # fmt: skip
     assert follows.name == last_note(bus, "followed")["name"] == "figure8"
     at, table = follows.pieces[-1]
     t = at + 12.0
-    wanted = figure8()(jnp.array(12.0)).p
-    np.testing.assert_allclose(table(jnp.array(t)).p, wanted, atol=1e-3)
+    expected = figure8()(jnp.array(12.0)).p
+    np.testing.assert_allclose(table(jnp.array(t)).p, expected, atol=1e-3)
 
-    whole = made[0].on(spliced(follows.pieces))  # what its errors are measured by
-    x = State.at(wanted)
+    whole = origin[0].on(splice(follows.pieces))  # what its errors are measured by
+    x = State.at(expected)
     assert float(whole.flight_task.error(jnp.array(t), x)) < 1e-3
     assert float(whole.flight_task.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
 
 
-def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(made, tmp_path):
+def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(origin, tmp_path):
     """A table is made for the time of the plant; by the wall's it would be of a time to come, and then too late."""
-    follows, supervisor = asked(made, tmp_path, behind=5.0)
+    follows, supervisor = ask(origin, tmp_path, behind=5.0)
     follows.ask("figure8", 10.0)
     began = supervisor.fly()
     bus = supervisor.bus
-    obeyed(follows, supervisor, lambda: bus.latest("parameters.reference") is not None)
+    poll_requests(follows, supervisor, lambda: bus.latest("parameters.reference") is not None)
     controller = supervisor.spec.controller
     data = bus.latest("parameters.reference").data
-    found = Parameters.unpack(data, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=0)
-    assert began <= found.computed_from <= supervisor.fly()
+    result = Parameters.unpack(data, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=0)
+    assert began <= result.computed_from <= supervisor.fly()
     assert follows.obey(status(supervisor)) == []
     assert follows._attempts == 1
-    obeyed(follows, supervisor, lambda: len(follows.pieces) > 1, 1)
-    assert follows.pieces[-1][0] == pytest.approx(found.computed_from + following.LEAD)
+    poll_requests(follows, supervisor, lambda: len(follows.pieces) > 1, 1)
+    assert follows.pieces[-1][0] == pytest.approx(result.computed_from + following.LEAD)
 
 
-def test_what_leaves_the_fence_or_is_not_taken_is_told(made, tmp_path, monkeypatch):
-    follows, supervisor = asked(made, tmp_path, fence=0.5)
+def test_what_leaves_the_fence_or_is_not_taken_is_told(origin, tmp_path, monkeypatch):
+    follows, supervisor = ask(origin, tmp_path, fence=0.5)
     follows.ask("figure8", 1.0)
-    (told,) = obeyed(follows, supervisor, lambda: follows._coming is None)
-    assert "reference figure8 cannot be followed: it passes" in told
-    assert "--fence" in told
+    (message,) = poll_requests(follows, supervisor, lambda: follows._coming is None)
+    assert "reference figure8 cannot be followed: it passes" in message
+    assert "--fence" in message
     assert supervisor.bus.latest("parameters.reference") is None
     assert follows.ask("figure8", 2.0) == []  # a page repeats what it wishes
 
     monkeypatch.setattr(following, "LEAD", 0.05)
     follows.ask("star", 2.0)
-    events = obeyed(follows, supervisor, lambda: follows._attempts == 3 and follows._coming is follows._sent is None)
+    events = poll_requests(
+        follows, supervisor, lambda: follows._attempts == 3 and follows._coming is follows._pending is None
+    )
     assert events == ["asked: reference star cannot be followed: it was not taken"]
     assert follows.name == "circle"
     last, controller = supervisor.bus.latest("parameters.reference").data, supervisor.spec.controller
     back = Parameters.unpack(last, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=3)
-    np.testing.assert_array_equal(back.arrays["rows"], made[0].followed.rows)  # learners go back to what is flown
+    np.testing.assert_array_equal(
+        back.arrays["rows"], origin[0].flight_reference.rows
+    )  # learners go back to what is flown
 
 
-def test_only_who_sees_its_reference_has_a_choice(made):
-    assert choices(made[0], "circle") == ("circle", "figure8", "lissajous", "star")
-    assert choices(made[0], "my.csv") == ("my.csv", "circle", "figure8", "lissajous", "star")
+def test_only_who_sees_its_reference_has_a_choice(origin):
+    assert choices(origin[0], "circle") == ("circle", "figure8", "lissajous", "star")
+    assert choices(origin[0], "my.csv") == ("my.csv", "circle", "figure8", "lissajous", "star")
     assert choices(Setup.from_preset("track/blind"), "figure8") == ()
     assert choices(Setup.from_preset("track/paper"), "figure8") == ("figure8", "circle", "lissajous", "star")
     assert choices(Setup.from_preset("hover/retrim"), "") == ()
-    drawn = paths(("circle", "star"), 20.0)
-    np.testing.assert_allclose(drawn["circle"][-1], circle()(jnp.array(19.95)).p, atol=1e-9)
-    assert drawn["star"].shape == (400, 3)
+    pictures = paths(("circle", "star"), 20.0)
+    np.testing.assert_allclose(pictures["circle"][-1], circle()(jnp.array(19.95)).p, atol=1e-9)
+    assert pictures["star"].shape == (400, 3)
 
 
-def test_a_set_up_on_another_reference_is_the_same_but_for_it(made, table):
-    other = made[0].on(table)
-    assert other.followed is table
-    assert other.env is made[0].env
-    assert dataclasses.replace(other, flight_task=made[0].flight_task, learner=made[0].learner).preset == made[0].preset
-    back = other.on(made[0].followed)
-    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back.flight_task), jax.tree.leaves(made[0].flight_task))
+def test_a_set_up_on_another_reference_is_the_same_but_for_it(origin, table):
+    other = origin[0].on(table)
+    assert other.flight_reference is table
+    assert other.env is origin[0].env
+    assert (
+        dataclasses.replace(other, flight_task=origin[0].flight_task, learner=origin[0].learner).preset
+        == origin[0].preset
+    )
+    back = other.on(origin[0].flight_reference)
+    jax.tree.map(
+        np.testing.assert_array_equal, jax.tree.leaves(back.flight_task), jax.tree.leaves(origin[0].flight_task)
+    )

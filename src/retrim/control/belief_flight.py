@@ -81,14 +81,14 @@ class BeliefFlight(AbstractController[BeliefState]):
         dt = self.dt
         belief = memory.belief.towards(self.estimate.belief, PACE * dt)
         caution = memory.caution.after(x, dt) if self.watches else memory.caution
-        wanted = caution.gain(self.estimate.gain.astype(x.p.dtype))
-        gain = memory.gain + jnp.clip(wanted - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
-        u, inner = self._flying(caution.applied(belief))(memory.inner, t, x)
+        level = caution.gain(self.estimate.gain.astype(x.p.dtype))
+        gain = memory.gain + jnp.clip(level - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
+        u, inner = self._flying(caution.apply(belief))(memory.inner, t, x)
         return Command(u.c / gain, u.omega), BeliefState(belief, gain, inner, caution)
 
     def accepted(self, memory: BeliefState, u: Command) -> BeliefState:
         """Remember the accepted command."""
-        inner = self._flying(memory.caution.applied(memory.belief)).accepted(
+        inner = self._flying(memory.caution.apply(memory.belief)).accepted(
             memory.inner, Command(u.c * memory.gain, u.omega)
         )
         return dataclasses.replace(memory, inner=inner)

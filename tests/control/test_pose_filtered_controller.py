@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, first_order, random_state, replaced
+from helpers import GOAL, first_order, random_state, replace_fields
 from retrim import ConfigError, Setup
 from retrim.config.baselines import baseline_request
 from retrim.config.methods import MethodRequest
 from retrim.control.baselines import BASELINES
 from retrim.control.pose_filtered import PoseFilteredController
 from retrim.physics import Command, PointMass, State, so3
-from retrim.physics.actuators import Lagged
+from retrim.physics.actuators import LaggedModel
 from retrim.physics.state import STANDARD_GRAVITY
 
 DT, TAU = 0.02, jnp.array(0.033)
@@ -28,16 +28,16 @@ def setup():
         return Setup.from_preset("vision/retrim")
 
 
-def made(setup, name, **changed):
+def make(setup, name, **changes):
     """The baseline as tables fly it from keypoints."""
     controller = MethodRequest(setup, None).by_state(BASELINES[name].controller(baseline_request(setup)))
     assert isinstance(controller, PoseFilteredController)
-    return replaced(controller, observation=replaced(controller.observation, **changed))
+    return replace_fields(controller, observation=replace_fields(controller.observation, **changes))
 
 
 @pytest.mark.parametrize("name", ["geometric-i", "indi"])
 def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(setup, name):
-    controller, model = made(setup, name), Lagged(PointMass(DT), first_order(TAU))
+    controller, model = make(setup, name), LaggedModel(PointMass(DT), first_order(TAU))
     x0 = State(jnp.array([0.3, -0.2, 1.2]), jnp.eye(3), jnp.zeros(3))
 
     def tick(carry, k):
@@ -58,7 +58,7 @@ def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(setup, name):
 
 def test_it_sees_nothing_but_points(setup):
     """With no point seen, its commands follow from the filter and the clock, wherever the vehicle is."""
-    blind, seeing = (made(setup, "geometric-i", dropout=jnp.array(missed)) for missed in (1.0, 0.0))
+    blind, seeing = (make(setup, "geometric-i", dropout=jnp.array(error)) for error in (1.0, 0.0))
     memory = blind.init(HERE)
     call = eqx.filter_jit(lambda controller, x: controller(memory, jnp.array(0.0), x)[0].vector())
     np.testing.assert_array_equal(call(blind, HERE), call(blind, ELSEWHERE))
@@ -67,25 +67,25 @@ def test_it_sees_nothing_but_points(setup):
 
 def test_an_inertial_unit_does_not_tell_the_attitude(setup, key):
     """The same reading in the body frame gives the same command, however the vehicle that it is on is turned."""
-    blind = made(setup, "indi", dropout=jnp.array(1.0))
-    memory, felt = blind.init(HERE), random.normal(key, (3,)) + jnp.array([0.0, 0.0, STANDARD_GRAVITY])
+    blind = make(setup, "indi", dropout=jnp.array(1.0))
+    memory, specific_force = blind.init(HERE), random.normal(key, (3,)) + jnp.array([0.0, 0.0, STANDARD_GRAVITY])
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY])
     call = eqx.filter_jit(lambda omega, a, x: blind.with_inertial(omega, a)(memory, jnp.array(0.0), x)[0].vector())
     omega = jnp.array([0.3, -0.1, 0.2])
-    turned = [random_state(k, 0.5) for k in random.split(key, 2)]
-    one, other = (call(omega, so3.act(x.R, felt) + gravity, x) for x in turned)
+    rotation = [random_state(k, 0.5) for k in random.split(key, 2)]
+    one, other = (call(omega, so3.act(x.R, specific_force) + gravity, x) for x in rotation)
     np.testing.assert_allclose(one, other, rtol=1e-9)
     assert np.any(np.abs(np.asarray(call(2.0 * omega, gravity, HERE)) - np.asarray(one)) > 1e-3)
 
 
 def test_accepted_commands_and_ages_reach_the_controller_inside(setup):
-    controller = made(setup, "geometric-i")
+    controller = make(setup, "geometric-i")
     _, memory = eqx.filter_jit(controller)(controller.init(HERE), jnp.array(0.0), HERE)
     u = Command(jnp.array(7.0), jnp.array([1.0, -2.0, 0.5]))
-    accepted = controller.accepted(memory, u)
-    assert eqx.tree_equal(accepted.last, u)
-    assert eqx.tree_equal(accepted.inner, controller.inner.accepted(memory.inner, u))
-    assert not eqx.tree_equal(accepted.inner, memory.inner)
+    accepted_command = controller.accepted(memory, u)
+    assert eqx.tree_equal(accepted_command.last, u)
+    assert eqx.tree_equal(accepted_command.inner, controller.inner.accepted(memory.inner, u))
+    assert not eqx.tree_equal(accepted_command.inner, memory.inner)
     assert float(controller.with_age(0.015).inner.prediction.age) == pytest.approx(0.015)
 
 

@@ -15,7 +15,7 @@ FRD_OF_FLU = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class Flown:
+class Flight:
     """World ENU, body forward-left-up."""
 
     t: np.ndarray
@@ -28,7 +28,7 @@ class Flown:
     omega: np.ndarray
 
 
-def flown(seconds=30.0, dt=0.02, wind=(0.0, 0.0, 0.0), gain=1.0, seed=0, size=1.0):
+def fly_once(seconds=30.0, dt=0.02, wind=(0.0, 0.0, 0.0), gain=1.0, seed=0, size=1.0):
     """A lively flight: sums of sines, thrust as flatness says, heading that turns; ``wind`` is a constant push."""
     rng = np.random.default_rng(seed)
     t = dt * np.arange(round(seconds / dt) + 1)
@@ -39,27 +39,27 @@ def flown(seconds=30.0, dt=0.02, wind=(0.0, 0.0, 0.0), gain=1.0, seed=0, size=1.
     p = np.sum(size * np.sin(angle), axis=2) + np.array([0.0, 0.0, 2.0])
     v = np.sum(size * waves * np.cos(angle), axis=2)
     a = np.sum(-size * waves**2 * np.sin(angle), axis=2)
-    felt = a + G - np.array(wind)
-    R = _attitudes(felt, 0.6 * np.sin(0.9 * t))
-    turned = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec() / dt
-    c = np.linalg.norm(felt, axis=1) / gain
-    return Flown(t, p, R, v, a, c, np.concatenate([turned, turned[-1:]]))
+    specific_force = a + G - np.array(wind)
+    R = _attitudes(specific_force, 0.6 * np.sin(0.9 * t))
+    rotation = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec() / dt
+    c = np.linalg.norm(specific_force, axis=1) / gain
+    return Flight(t, p, R, v, a, c, np.concatenate([rotation, rotation[-1:]]))
 
 
-def _attitudes(felt, yaw):
-    z = felt / np.linalg.norm(felt, axis=1, keepdims=True)
+def _attitudes(specific_force, yaw):
+    z = specific_force / np.linalg.norm(specific_force, axis=1, keepdims=True)
     ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
     y = np.cross(z, ahead)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 
-def columns(flight: Flown) -> dict[str, np.ndarray]:
+def columns(flight: Flight) -> dict[str, np.ndarray]:
     """The columns of a CSV file, by name."""
     q = Rotation.from_matrix(flight.R).as_quat()
     parts = {"p": flight.p, "v": flight.v, "q": q, "w": flight.omega}
-    named = {f"{name}{'xyzw'[i]}": x[:, i].copy() for name, x in parts.items() for i in range(x.shape[1])}
-    return {"t": flight.t.copy(), **named, "c": flight.c.copy()}
+    names = {f"{name}{'xyzw'[i]}": x[:, i].copy() for name, x in parts.items() for i in range(x.shape[1])}
+    return {"t": flight.t.copy(), **names, "c": flight.c.copy()}
 
 
 MAP = """
@@ -97,13 +97,13 @@ def write_map(path: Path, text: str = MAP, **changes: str) -> Path:
             lines.append(f"[{table}]")
         at = lines.index(f"[{table}]") + 1
         end = next((i for i in range(at, len(lines)) if lines[i].startswith("[")), len(lines))
-        kept = [line for line in lines[at:end] if not line.startswith(f"{key} =")]
-        text = "\n".join([*lines[:at], *kept, f"{key} = {value}", *lines[end:]])
+        rest = [line for line in lines[at:end] if not line.startswith(f"{key} =")]
+        text = "\n".join([*lines[:at], *rest, f"{key} = {value}", *lines[end:]])
     path.write_text(text)
     return path
 
 
-def turned_frames(flight: Flown) -> Flown:
+def turned_frames(flight: Flight) -> Flight:
     """The same flight in NED and forward-right-down."""
     W, B = NED_OF_ENU, FRD_OF_FLU
     return dataclasses.replace(

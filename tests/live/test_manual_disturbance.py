@@ -8,17 +8,17 @@ import pytest
 
 from retrim.config.scenario import Scenario
 from retrim.errors import MessageError, PlantError
-from retrim.live.operator.manual_disturbance import KICK_S, KnobbedPlant, ManualDisturbance
+from retrim.live.operator.manual_disturbance import KICK_S, ManualDisturbance, PlantWithKnobs
 from retrim.onboard.messages import pack_note
 from retrim.physics import Command, State
 from retrim.plants.plant import Measurement, Plant, as_numpy
 
 
-def knobbed(plant="simple", **scenario):
+def add_knobs(plant="simple", **scenario):
     scenario = Scenario(plant=plant, **scenario)
-    made = scenario.make("small")
-    made.reset(None)
-    return KnobbedPlant(made, scenario.make_disturbance("small"))
+    setup = scenario.make("small")
+    setup.reset(None)
+    return PlantWithKnobs(setup, scenario.make_disturbance("small"))
 
 
 def speeds(plant, ticks):
@@ -47,31 +47,31 @@ def test_a_knob_that_is_turned_too_far_is_refused(fields):
 
 
 def test_a_push_is_an_acceleration_and_ends_with_the_knob():
-    plant, still = knobbed(), knobbed()
+    plant, still = add_knobs(), add_knobs()
     plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
-    pushed = speeds(plant, 10) - speeds(still, 10)
-    np.testing.assert_allclose(pushed[-1], [0.2, 0.0, 0.0], atol=0.01)
+    with_push = speeds(plant, 10) - speeds(still, 10)
+    np.testing.assert_allclose(with_push[-1], [0.2, 0.0, 0.0], atol=0.01)
     plant.turn(ManualDisturbance())
     after = speeds(plant, 10)[:, 0]
     np.testing.assert_allclose(after, after[0], atol=0.02)
 
 
 def test_knobs_come_on_top_of_the_disturbance():
-    both, alone = knobbed(disturbance="push=1"), knobbed(disturbance="push=1")
+    both, alone = add_knobs(disturbance="push=1"), add_knobs(disturbance="push=1")
     both.turn(ManualDisturbance(push=(-1.0, 0.0, 0.0)))
     difference = speeds(both, 10)[-1] - speeds(alone, 10)[-1]
     np.testing.assert_allclose(difference, [-0.2, 0.0, 0.0], atol=0.01)
 
 
 def test_a_kick_ends_by_itself_and_comes_once():
-    plant, still = knobbed(), knobbed()
-    kicked = ManualDisturbance(kick=(8.0, 0.0, 0.0), kicks=1)
-    plant.turn(kicked)
-    gained = (speeds(plant, 30) - speeds(still, 30))[:, 0]
-    assert abs(int(np.argmax(gained)) - (round(KICK_S / 0.02) - 1)) <= 1  # from then on, drag slows it down
-    np.testing.assert_allclose(gained.max(), 8.0 * KICK_S, rtol=0.1)
+    plant, still = add_knobs(), add_knobs()
+    kick = ManualDisturbance(kick=(8.0, 0.0, 0.0), kicks=1)
+    plant.turn(kick)
+    gain = (speeds(plant, 30) - speeds(still, 30))[:, 0]
+    assert abs(int(np.argmax(gain)) - (round(KICK_S / 0.02) - 1)) <= 1  # from then on, drag slows it down
+    np.testing.assert_allclose(gain.max(), 8.0 * KICK_S, rtol=0.1)
     before = speeds(plant, 1)[0, 0]
-    plant.turn(kicked)  # the same message again, as after another knob was turned
+    plant.turn(kick)  # the same message again, as after another knob was turned
     assert abs(speeds(plant, 5)[-1, 0] - before) < 0.2
 
 
@@ -79,18 +79,18 @@ def test_a_kick_ends_by_itself_and_comes_once():
     "knobs", [ManualDisturbance(load=0.05), ManualDisturbance(rotor=0.7), ManualDisturbance(wind=(4.0, 0.0, 0.0))]
 )
 def test_every_knob_moves_the_vehicle(knobs):
-    plant, still = knobbed(), knobbed()
+    plant, still = add_knobs(), add_knobs()
     plant.turn(knobs)
     assert np.abs(speeds(plant, 15) - speeds(still, 15)).max() > 0.02
 
 
 def test_a_plant_that_does_not_know_an_effect_flies_on():
-    plant, still = knobbed("rotorpy"), knobbed("rotorpy")
+    plant, still = add_knobs("rotorpy"), add_knobs("rotorpy")
     plant.turn(ManualDisturbance(load=0.1, push=(1.0, 0.0, 0.0)))
     np.testing.assert_array_equal(speeds(plant, 5), speeds(still, 5))
-    assert "cannot carry a load" in plant.refused
+    assert "cannot carry a load" in plant.refusal
     plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
-    assert plant.refused == ""
+    assert plant.refusal == ""
     assert speeds(plant, 5)[-1, 0] - speeds(still, 5)[-1, 0] > 0.05
 
 
@@ -109,9 +109,9 @@ def test_a_plant_without_knobs_says_so_and_its_errors_are_its_own():
         def stop(self):
             pass
 
-    plant = KnobbedPlant(Bare(), Scenario().make_disturbance())
+    plant = PlantWithKnobs(Bare(), Scenario().make_disturbance())
     plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
-    assert plant.refused == "this plant has no knobs"
+    assert plant.refusal == "this plant has no knobs"
     assert plant.step(Command.hover(jnp.zeros(0).dtype))[0].t == 0.0
     with pytest.raises(PlantError, match="too much"):
         plant.step(Command.of(jnp.array([30.0, 0.0, 0.0, 0.0])))

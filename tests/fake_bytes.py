@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from made_up_log import G, turned_frames
+from fake_log import G, turned_frames
 
 SIZES = {"float": "f", "uint64_t": "Q", "uint8_t": "B", "bool": "?"}
 
@@ -24,8 +24,8 @@ def ulog(topics, stamps) -> bytes:
 
     out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
     for name, fields in topics.items():
-        written = ";".join(f"{kind} {field}" for field, (kind, _) in fields.items())
-        out.append(message("F", f"{name}:uint64_t timestamp;{written};".encode()))
+        paths = ";".join(f"{kind} {field}" for field, (kind, _) in fields.items())
+        out.append(message("F", f"{name}:uint64_t timestamp;{paths};".encode()))
     out += [message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(topics)]
     for i, (name, fields) in enumerate(topics.items()):
         own = stamps[name] if isinstance(stamps, dict) else stamps
@@ -47,11 +47,11 @@ def px4_topics(flight):
     thrust = np.stack([up, up, -0.5 * flight.c / G[2]], axis=1)
     place = {axis: ("float", ned.p[:, i]) for i, axis in enumerate("xyz")}
     speed = {f"v{axis}": ("float", ned.v[:, i]) for i, axis in enumerate("xyz")}
-    told = {axis: ("float", ned.omega[:, i]) for i, axis in enumerate(("roll", "pitch", "yaw"))}
+    message = {axis: ("float", ned.omega[:, i]) for i, axis in enumerate(("roll", "pitch", "yaw"))}
     return {
         "vehicle_local_position": {**place, **speed},
         "vehicle_attitude": {"q": ("float[4]", q)},
-        "vehicle_rates_setpoint": {**told, "thrust_body": ("float[3]", thrust)},
+        "vehicle_rates_setpoint": {**message, "thrust_body": ("float[3]", thrust)},
         "vehicle_angular_velocity": {"xyz": ("float[3]", ned.omega)},
     }, np.round(1e6 * (flight.t + 3.0)).astype(int)
 
@@ -90,11 +90,11 @@ def bag2(path: Path, definitions, messages, typestore=None) -> Path:
         store.register(get_types_from_msg(text, name))
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         topics = {}
-        for topic, kind, received, fields in messages:
+        for topic, kind, arrival, fields in messages:
             if topic not in topics:
                 topics[topic] = bag.add_connection(topic, kind, typestore=store)
-            made = fields if not isinstance(fields, dict) else store.types[kind](**fields)
-            bag.write(topics[topic], int(received), store.serialize_cdr(made, kind))
+            setup = fields if not isinstance(fields, dict) else store.types[kind](**fields)
+            bag.write(topics[topic], int(arrival), store.serialize_cdr(setup, kind))
     return path
 
 
@@ -113,6 +113,6 @@ def px4_messages(flight, *, old=False, clock=None, jitter=0.0, folder="/fmu/{}/"
         odometry = {"timestamp": us + 300, "timestamp_sample": us, "q": q[k], **state}
         lift = np.array([0.0, 0.0, -0.5 * flight.c[k] / G[2]], dtype=np.float32)
         rates = dict(zip(("roll", "pitch", "yaw"), map(float, w), strict=True))
-        told = {"timestamp": us if clock is None else clock(t), **rates, "thrust_body": lift}
+        message = {"timestamp": us if clock is None else clock(t), **rates, "thrust_body": lift}
         yield folder.format("out") + "vehicle_odometry", "px4_msgs/msg/VehicleOdometry", last, odometry
-        yield folder.format("in") + "vehicle_rates_setpoint", "px4_msgs/msg/VehicleRatesSetpoint", last + 100, told
+        yield folder.format("in") + "vehicle_rates_setpoint", "px4_msgs/msg/VehicleRatesSetpoint", last + 100, message

@@ -33,23 +33,23 @@ def states(setup):
     """A learner state of each method with numbers in every leaf: weights, moments and counters."""
     policy = setup.new_policy(random.key(4))
 
-    def filled(leaf):
+    def fill(leaf):
         numbers = np.random.default_rng(leaf.size).normal(size=leaf.shape)
         return jnp.asarray(numbers if jnp.issubdtype(leaf.dtype, jnp.floating) else 37 + leaf, dtype=leaf.dtype)
 
     with jax.numpy_dtype_promotion("standard"):
         each = {"full": policy, "lora": setup.low_rank(policy, random.key(5))}
-        made = {k: setup.learner.init(p, random.key(6)) for k, p in each.items()}
-        return {k: with_limits(policy, jax.tree.map(filled, state)) for k, state in made.items()}
+        result = {k: setup.learner.init(p, random.key(6)) for k, p in each.items()}
+        return {k: with_limits(policy, jax.tree.map(fill, state)) for k, state in result.items()}
 
 
 def with_limits(policy, tree):
     """A tree whose policies have the command limits of ``policy``."""
 
-    def limited(part):
+    def limit(part):
         return policy.with_params(part.layers) if isinstance(part, Policy) else part
 
-    return jax.tree.map(limited, tree, is_leaf=lambda part: isinstance(part, Policy))
+    return jax.tree.map(limit, tree, is_leaf=lambda part: isinstance(part, Policy))
 
 
 def preset_with(preset, **values):
@@ -84,8 +84,8 @@ def test_round_trip_is_exact(tmp_path, setup):
     path = tmp_path / "deep" / "policy.safetensors"
     save_policy(path, policy, setup.preset)
     for place in (path, path.parent):
-        found, preset = load_policy(place)
-        jax.tree.map(np.testing.assert_array_equal, found, policy)
+        result, preset = load_policy(place)
+        jax.tree.map(np.testing.assert_array_equal, result, policy)
         assert preset == setup.preset
 
 
@@ -119,8 +119,8 @@ def test_a_policy_is_read_without_its_preset(tmp_path):
     path = tmp_path / "policy.safetensors"
     for about in ({}, {"preset": "of another version"}):
         write_policy(path, policy, about)
-        found, header = read_policy(path)
-        jax.tree.map(np.testing.assert_array_equal, found, policy)
+        result, header = read_policy(path)
+        jax.tree.map(np.testing.assert_array_equal, result, policy)
         assert header.get("preset") == about.get("preset")
         with pytest.raises(CheckpointError, match=r"policy\.safetensors, header, preset"):
             load_policy(path)
@@ -142,10 +142,10 @@ def test_a_header_that_lies_is_refused_even_with_a_checksum(tmp_path, setup, val
 def test_what_was_learnt_comes_back_bit_for_bit(tmp_path, setup, states, method):
     path = tmp_path / "deep" / "learner_state.safetensors"
     save_learner_state(path, states[method], setup.preset)
-    found, preset = load_learner_state(path)
+    result, preset = load_learner_state(path)
     assert preset == setup.preset
-    assert jax.tree.structure(found) == jax.tree.structure(states[method])
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(states[method]), strict=True):
+    assert jax.tree.structure(result) == jax.tree.structure(states[method])
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(states[method]), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
 
@@ -277,7 +277,7 @@ def test_files_say_which_release_wrote_them(tmp_path, setup, states):
 
 
 @pytest.mark.parametrize(
-    ("told", "newer"),
+    ("message", "newer"),
     [
         ("99.0", True),
         ("99.0.1rc1", True),
@@ -288,16 +288,18 @@ def test_files_say_which_release_wrote_them(tmp_path, setup, states):
         ("é.1", False),
     ],
 )
-def test_a_key_of_a_newer_release_is_told_as_such(tmp_path, setup, told, newer):
+def test_a_key_of_a_newer_release_is_told_as_such(tmp_path, setup, message, newer):
     policy = setup.new_policy(random.key(4))
-    about = {"preset": preset_with(setup.preset, more=3), "architecture": architecture(policy), "version": told}
+    about = {"preset": preset_with(setup.preset, more=3), "architecture": architecture(policy), "version": message}
     (tmp_path / "p").write_bytes(wire.pack(policy, kind="policy", about=about))
-    wanted = (
-        rf"written by a newer release \({told}; this one is .*more: unknown key" if newer else "preset: more: unknown"
+    expected = (
+        rf"written by a newer release \({message}; this one is .*more: unknown key"
+        if newer
+        else "preset: more: unknown"
     )
-    with pytest.raises(CheckpointError, match=wanted) as caught:
+    with pytest.raises(CheckpointError, match=expected) as error:
         load_policy(tmp_path / "p")
-    assert ("newer release" in str(caught.value)) == newer
+    assert ("newer release" in str(error.value)) == newer
     whole = about | {"preset": dump(setup.preset)}
     (tmp_path / "p").write_bytes(wire.pack(policy, kind="policy", about=whole))
     assert load_policy(tmp_path / "p")[1] == setup.preset

@@ -8,7 +8,7 @@ class Wire:
     """What is sent is kept; what the other end says to it is put into the inbox, at once if ``answer`` returns some."""
 
     def __init__(self):
-        self.inbox, self.sent, self.answer = deque(), [], lambda data: None
+        self.inbox, self.packets, self.answer = deque(), [], lambda data: None
         self._read, self._write = os.pipe()
 
     def fileno(self):
@@ -18,7 +18,7 @@ class Wire:
         return self.inbox.popleft() if self.inbox else None
 
     def send(self, data, to):
-        self.sent.append((data, to))
+        self.packets.append((data, to))
         if (answer := self.answer(data)) is not None:
             self.inbox.append((answer, to))
 

@@ -21,30 +21,30 @@ def log(seconds=10.0, *, terminated=False, events=(), t=None):
     return Log(t, states, states, np.tile([9.81, 0.0, 0.0, 0.0], (n, 1)), DT, terminated, tuple(events))
 
 
-def flight(error, *, spec=None, flown=None, steady_seconds=2.0, cross=None, **of_log):
+def flight(error, *, spec=None, flight=None, steady_seconds=2.0, cross=None, **of_log):
     """A flight with this error: a number, or one for each row of the log."""
-    flown = log(**of_log) if flown is None else flown
-    error = np.broadcast_to(np.asarray(error, dtype=float), flown.t.shape)
+    flight = log(**of_log) if flight is None else flight
+    error = np.broadcast_to(np.asarray(error, dtype=float), flight.t.shape)
     spec = FlightSpec(Scenario("large"), "base", 0) if spec is None else spec
-    return Flight(spec, "small", flown, error, "steady_error_m", steady_seconds, cross)
+    return Flight(spec, "small", flight, error, "steady_error_m", steady_seconds, cross)
 
 
 class Watching(Silent):
     """Keeps what progress was told, as titles, shares and texts, and hands each share on."""
 
     def __init__(self, then=lambda share: None):
-        self.told, self._then = [], then
+        self.messages, self._then = [], then
 
     def progress(self, title):
         def advance(share, text):
-            self.told.append((title, share, text))
+            self.messages.append((title, share, text))
             self._then(share)
 
         return contextlib.nullcontext(advance)
 
     @property
     def shares(self):
-        return [share for _, share, _ in self.told]
+        return [share for _, share, _ in self.messages]
 
 
 class Imaginary:
@@ -52,14 +52,14 @@ class Imaginary:
 
     def __init__(self, error):
         """``error`` of a specification [m]: a number, one for each row of the log, or None for a crash."""
-        self._error, self.trained, self.flown = error, [], []
+        self._error, self.trainings, self.flights = error, [], []
 
     def train(self, preset, seeds, run, reporter):
-        self.trained.append((preset, tuple(seeds)))
+        self.trainings.append((preset, tuple(seeds)))
         return Study(preset, {seed: f"policy {seed}" for seed in seeds}, tuple(0.001 * (1 + s) for s in seeds))
 
     def fly(self, study, scenarios, run, reporter, *, methods=("base", "full"), starts, seconds, keep=True):
-        self.flown.append((study, tuple(scenarios), tuple(methods), starts, seconds))
+        self.flights.append((study, tuple(scenarios), tuple(methods), starts, seconds))
         specs = [
             FlightSpec(scenario, method, start, seed)
             for scenario in scenarios for method in methods for seed in study.policies for start in range(starts)

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from live_processes import moved
+from live_processes import move
 from retrim import PlantError
 from retrim.plants.bridges.vehicle_plant import VehiclePlant
 from retrim.plants.bridges.vehicle_state import VehicleState
@@ -45,10 +45,10 @@ class PointVehicle(VehiclePlant):
         if self.lost_after is not None and self.reads > self.lost_after:
             raise PlantError("the link has been silent")
         while self.flying and self.at < time.monotonic():
-            self.x, self.at = moved(self.x, self.u, self.push), self.at + 0.02
+            self.x, self.at = move(self.x, self.u, self.push), self.at + 0.02
         R = self.x[3:12].reshape(3, 3)
-        told = VehicleState(self.x[:3], R, self.x[12:], self.u[1:], 0.0)
-        return told._replace(truth=told)
+        message = VehicleState(self.x[:3], R, self.x[12:], self.u[1:], 0.0)
+        return message._replace(truth=message)
 
     def transmit(self, u):
         if not self.flying:

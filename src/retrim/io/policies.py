@@ -60,7 +60,7 @@ def load_policy(path: str | Path, *, trust: Collection[str] = ()) -> tuple[Abstr
     """
     policy, header = read_policy(path, lambda header: _network_like(header, str(path), trust))
     setup = _setup(header, architecture(policy), str(path), trust)
-    check_policy(policy, source=str(path), observation=np.asarray(_seen_at_rest(setup)))
+    check_policy(policy, source=str(path), observation=np.asarray(_observe_at_rest(setup)))
     return policy, setup.preset
 
 
@@ -104,7 +104,7 @@ def load_learner_state(path: str | Path, *, trust: Collection[str] = ()) -> tupl
     except (MessageError, ConfigError) as error:
         raise CheckpointError(str(error)) from error
     check_size(state, source=str(path), largest=MOST)
-    check_policy(state.policy.policy.merged(), source=str(path), observation=np.asarray(_seen_at_rest(setup)))
+    check_policy(state.policy.policy.merged(), source=str(path), observation=np.asarray(_observe_at_rest(setup)))
     if not np.isfinite(np.asarray(_command_at_rest(setup.controller(state), setup.flight_task.home()))).all():
         raise CheckpointError(f"{path}: its command at hover is not finite; what was learnt cannot be flown")
     return state, setup.preset
@@ -142,8 +142,10 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
             ) from error
         raise CheckpointError(str(error)) from error
     if absent := missing_defaults(preset, header["preset"]):
-        shown = ", ".join(f"{name} = {value!r}" for name, value in absent.items())
-        LOG.warning(one_line(f"{source}: written by an earlier release; defaults are taken for what it lacks: {shown}"))
+        defaults = ", ".join(f"{name} = {value!r}" for name, value in absent.items())
+        LOG.warning(
+            one_line(f"{source}: written by an earlier release; defaults are taken for what it lacks: {defaults}")
+        )
     expected = "-".join(map(str, (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)))
     if preset.pretrain.network != "mlp":
         expected = architecture(_shapes(setup))
@@ -152,14 +154,14 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
     return setup
 
 
-def _seen_at_rest(setup: Setup) -> Float[Array, " o"]:
+def _observe_at_rest(setup: Setup) -> Float[Array, " o"]:
     """Return the observation for a vehicle that has been at rest at home."""
-    seen: Float[Array, " o"] = _observed(setup.env.task.observation, setup.env.task.home())
-    return seen
+    observation_at_rest: Float[Array, " o"] = _observe(setup.env.task.observation, setup.env.task.home())
+    return observation_at_rest
 
 
 @eqx.filter_jit
-def _observed(observation: AbstractObservation[Any], home: Float[Array, "3"]) -> Float[Array, " o"]:
+def _observe(observation: AbstractObservation[Any], home: Float[Array, "3"]) -> Float[Array, " o"]:
     return observation.at_rest(State.at(home))
 
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from retrim.live.child_processes import watched
+from retrim.live.child_processes import watch_flight
 from retrim.live.events import LiveEvents
 from retrim.live.status import Status
 from retrim.runtime.events import Event
@@ -16,45 +16,45 @@ class Flying:
     """Ends a moment after it was told to land."""
 
     def __init__(self):
-        self.began, self.landed, self.finished = time.monotonic(), None, False
+        self.began, self.landing_time, self.finished = time.monotonic(), None, False
 
     def take_off(self):
         self.began = time.monotonic()
 
     def land(self):
-        self.landed = self.landed or time.monotonic()
+        self.landing_time = self.landing_time or time.monotonic()
 
     @property
     def landing(self):
-        return self.landed is not None
+        return self.landing_time is not None
 
     def finish(self):
         self.finished = True
 
     def watch(self):
-        over = self.landing and time.monotonic() > self.landed + 0.2
+        over = self.landing and time.monotonic() > self.landing_time + 0.2
         t = time.monotonic() - self.began
         control = {"mode": "policy", "swaps": [[0.1, "policy", 1, 0.1]]}
         return Status(t, control, {}, {}, {}, "landed" if over else None, [], False, 0, None)
 
 
-def shown_by(show, seconds=0.3, stop=None):
+def show_for(show, seconds=0.3, stop=None):
     flight, stop = Flying(), stop or threading.Event()
-    status = inspect.unwrap(watched)(flight, seconds, LiveEvents(), show, stop)
+    status = inspect.unwrap(watch_flight)(flight, seconds, LiveEvents(), show, stop)
     assert flight.finished
-    assert status.ended == "landed"
+    assert status.end_reason == "landed"
     return flight, stop
 
 
 def test_all_events_are_shown_once_and_the_end_too():
-    seen, times = list[Event](), []
+    observation, times = list[Event](), []
 
     def show(status, new):
-        seen.extend(new)
-        times.append(status.ended)
+        observation.extend(new)
+        times.append(status.end_reason)
 
-    shown_by(show)
-    assert [event.kind for event in seen] == ["policy"]
+    show_for(show)
+    assert [event.kind for event in observation] == ["policy"]
     assert times[-1] == "landed"
 
 
@@ -85,15 +85,15 @@ def test_what_is_ignored_of_a_vehicle_is_told_once():
 
 
 def test_a_terminal_that_stands_still_stops_nobody():
-    blocked, stop = threading.Event(), threading.Event()
+    blocker, stop = threading.Event(), threading.Event()
     threading.Timer(0.3, stop.set).start()
     began = time.monotonic()
     try:
-        flight, _ = shown_by(lambda status, new: blocked.wait(30.0), seconds=1000.0, stop=stop)
-        assert 0.2 < flight.landed - began < 1.0
+        flight, _ = show_for(lambda status, new: blocker.wait(30.0), seconds=1000.0, stop=stop)
+        assert 0.2 < flight.landing_time - began < 1.0
         assert time.monotonic() - began < 5.0
     finally:
-        blocked.set()
+        blocker.set()
 
 
 @pytest.mark.parametrize("error", [BrokenPipeError, SystemExit])
@@ -101,6 +101,6 @@ def test_when_nobody_reads_any_more_it_lands(error):
     def show(status, new):
         raise error
 
-    flight, stop = shown_by(show, seconds=1000.0)
+    flight, stop = show_for(show, seconds=1000.0)
     assert stop.is_set()
     assert flight.landing

@@ -27,36 +27,36 @@ def test_a_layer_in_both_layouts_is_that_layer(use_bias, key):
     both = eqx.filter_jit(jax.value_and_grad(lambda both: cost(with_transposed_copy(both[0]), both[1])))
     plain = eqx.filter_jit(jax.value_and_grad(lambda both: cost(*both)))
     x = random.normal(key, (4, 5))
-    for found, wanted in zip(jax.tree.leaves(both((layer, x))), jax.tree.leaves(plain((layer, x))), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-13)
+    for result, expected in zip(jax.tree.leaves(both((layer, x))), jax.tree.leaves(plain((layer, x))), strict=True):
+        np.testing.assert_allclose(result, expected, rtol=1e-13)
 
 
 def test_stacked_layers_are_laid_out_each(key):
     """As an ensemble is made and called."""
-    made = eqx.filter_vmap(lambda key: eqx.nn.MLP(4, 2, 3, 1, key=key))(random.split(key, 5))
+    setup = eqx.filter_vmap(lambda key: eqx.nn.MLP(4, 2, 3, 1, key=key))(random.split(key, 5))
 
     @eqx.filter_jit
-    def members(made, x):
-        return eqx.filter_vmap(lambda one, x: one(x), in_axes=(eqx.if_array(0), None))(made, x)
+    def members(setup, x):
+        return eqx.filter_vmap(lambda one, x: one(x), in_axes=(eqx.if_array(0), None))(setup, x)
 
     x = random.normal(key, (4,))
-    np.testing.assert_allclose(members(with_transposed_copy(made), x), members(made, x), rtol=1e-14)
+    np.testing.assert_allclose(members(with_transposed_copy(setup), x), members(setup, x), rtol=1e-14)
 
 
 def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
     """Whatever holds them; a layer of scalars has no matrix, and one that derives from a layer may be another."""
 
-    class Doubled(eqx.nn.Linear):
+    class DoubleLinear(eqx.nn.Linear):
         def __call__(self, x, *, key=None):
             return 2.0 * super().__call__(x)
 
     scalar = eqx.nn.Linear("scalar", 3, key=key)
     tree = {"deep": [eqx.nn.Linear(2, 2, key=key), jnp.ones(3)], "scalar": scalar, "word": "w"}
-    assert type(with_transposed_copy(Doubled(2, 2, key=key))) is Doubled
-    laid = with_transposed_copy(tree)
-    assert isinstance(laid["deep"][0], TransposedLinear)
-    assert laid["deep"][1] is tree["deep"][1]
-    assert (laid["scalar"], laid["word"]) == (scalar, "w")
+    assert type(with_transposed_copy(DoubleLinear(2, 2, key=key))) is DoubleLinear
+    copies = with_transposed_copy(tree)
+    assert isinstance(copies["deep"][0], TransposedLinear)
+    assert copies["deep"][1] is tree["deep"][1]
+    assert (copies["scalar"], copies["word"]) == (scalar, "w")
 
 
 def test_no_product_of_a_scan_reads_a_matrix_across_its_rows(key):
@@ -67,19 +67,19 @@ def test_no_product_of_a_scan_reads_a_matrix_across_its_rows(key):
     program = jax.make_jaxpr(lambda policy, x0: policy_gradient(policy, env, x0))(policy, draw_starts(env.task, key, 3))
     products = [
         (eqn.params["dimension_numbers"], [each.aval.shape for each in eqn.invars])
-        for scan in found("scan", program.jaxpr)
-        for eqn in found("dot_general", scan.params["jaxpr"].jaxpr)
+        for scan in find("scan", program.jaxpr)
+        for eqn in find("dot_general", scan.params["jaxpr"].jaxpr)
     ]
     of_layers = [axes for (axes, _), shapes in products if len(shapes[1]) == 2 and set(shapes[1]) <= {23, 8, 4, 19, 3}]
     assert len(of_layers) >= 2 * 3 + 2 * 2 * 3  # each layer, forward and backward
     assert set(of_layers) == {((1,), (0,))}
 
 
-def found(name, jaxpr):
+def find(name, jaxpr):
     """Equations of a name, in a program and in all that it calls."""
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == name:
             yield eqn
         for inner in jax.tree.leaves(list(eqn.params.values())):  # programs have no leaves of their own
             if isinstance(inner, (Jaxpr, ClosedJaxpr)):
-                yield from found(name, getattr(inner, "jaxpr", inner))
+                yield from find(name, getattr(inner, "jaxpr", inner))

@@ -58,12 +58,12 @@ def station(address, over):
                 return
 
 
-def flown_while(lost, folder, controller):  # noqa: F811
-    """Fly with learners at a ground station, and lose ``lost`` after a second; return the last status, the events, and
+def fly_while(gap, folder, controller):  # noqa: F811
+    """Fly with learners at a ground station, and lose ``gap`` after a second; return the last status, the events, and
     who flew at each tick before the landing."""
     address, over = Address("zenoh", "127.0.0.1", unused_port(), shared=KEY), threading.Event()
     page = PageSpec("127.0.0.1", free_port("127.0.0.1", 18180), "drill", HOME[None].repeat(2, 0), (), 0.06, 0.19)
-    changes = {"learners": address, "seconds": SECONDS, "page": page if lost == "bridge and page" else None}
+    changes = {"learners": address, "seconds": SECONDS, "page": page if gap == "bridge and page" else None}
     thread = threading.Thread(target=station, args=(address, over))
     thread.start()
     events, complete = LiveEvents(), True
@@ -72,11 +72,11 @@ def flown_while(lost, folder, controller):  # noqa: F811
             for _ in drill.warm_up():
                 pass
             drill.take_off()
-            while (status := drill.watch()).ended is None and status.t < 20.0:
+            while (status := drill.watch()).end_reason is None and status.t < 20.0:
                 events.take(status)
                 if status.t > 1.0 and complete:
                     complete = False
-                    if lost == "ground":
+                    if gap == "ground":
                         over.set()
                     else:
                         drill.processes["bridge"].kill()
@@ -89,23 +89,23 @@ def flown_while(lost, folder, controller):  # noqa: F811
         over.set()
         thread.join(20.0)
     rows = whole_log(folder, status)
-    assert status.ended == "landed"
+    assert status.end_reason == "landed"
     return status, events, rows[rows[:, 1] < SECONDS - 0.1, -1]
 
 
-@pytest.mark.parametrize("lost", ["ground", "bridge and page"])
-def test_a_flight_with_learners_elsewhere(tmp_path, controller, lost):  # noqa: F811
+@pytest.mark.parametrize("gap", ["ground", "bridge and page"])
+def test_a_flight_with_learners_elsewhere(tmp_path, controller, gap):  # noqa: F811
     pytest.importorskip("zenoh")
     for attempt in ("first", "second", "third"):  # a busy machine may hold a process back until the guard takes over
         (tmp_path / attempt).mkdir()
-        status, events, flown_by = flown_while(lost, tmp_path / attempt, controller)
-        if (share := np.mean(flown_by == Mode.POLICY)) > 0.9:
+        status, events, start_vehicle = fly_while(gap, tmp_path / attempt, controller)
+        if (share := np.mean(start_vehicle == Mode.POLICY)) > 0.9:
             break
     assert share > 0.9
     swaps = [at for at, half, *_ in events.swaps if half == "policy"]
     assert swaps
     assert swaps[0] < 1.0
-    if lost == "ground":
+    if gap == "ground":
         assert swaps[-1] < 2.0
         assert not status.alive["policy"]
     else:
@@ -125,23 +125,23 @@ def test_with_another_key_or_none_nothing_takes_off_and_both_ends_say_why(
     pytest.importorskip("zenoh")
     for module in (ground, remote_learners):
         monkeypatch.setattr(module, "DISTRUST", 0.5)
-    port, heard, flown = unused_port(), [], request.getfixturevalue("controller")
+    port, reply, flight = unused_port(), [], request.getfixturevalue("controller")
 
     def listen():
         try:
             station(Address("zenoh", "127.0.0.1", port, shared=there), threading.Event())
         except ConfigError as error:
-            heard.append(str(error))
+            reply.append(str(error))
 
     thread = threading.Thread(target=listen)
     thread.start()
     address = Address("zenoh", "127.0.0.1", port, shared=here)
-    with Drill(spec_in(tmp_path, flown, learners=address)) as drill, pytest.raises(PlantError) as error:
+    with Drill(spec_in(tmp_path, flight, learners=address)) as drill, pytest.raises(PlantError) as error:
         for _ in drill.warm_up():
             pass
     thread.join(20.0)
     assert str(error.value) == f"zenoh:127.0.0.1:{port}: {said_here}"
-    assert heard == [f"zenoh:127.0.0.1:{port}: {said_there}"]
+    assert reply == [f"zenoh:127.0.0.1:{port}: {said_there}"]
 
 
 @pytest.mark.parametrize(
@@ -157,26 +157,26 @@ def test_addresses_that_cannot_be_learnt_for_together_are_named(addresses, why):
         learn_for([Address.of(each) for each in addresses], threading.Event())
 
 
-def learnt_by(preset):
+def learner_state_of(preset):
     return pack_arrays({}, kind="learnt", about={"preset": dump(preset)})
 
 
 def mission_in(folder, base, number=1, start=None, reference=None):
-    (folder / "start").write_bytes(start or learnt_by(PRESETS["hover/retrim"]))
+    (folder / "start").write_bytes(start or learner_state_of(PRESETS["hover/retrim"]))
     capacities = dict.fromkeys((*OUT, *INTO), 10_000)
     return LearnerMission.of(number, reference, 0, base, ("residual", "policy"), 0, capacities, folder / "start").pack()
 
 
 def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch):
-    network, started = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
+    network, start_time = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
-    class Noted(LearnerServer):
+    class NotingServer(LearnerServer):
         def _start(self, layer):
-            started.append((self._mission.base, self._mission.number, layer))
+            start_time.append((self._mission.base, self._mission.number, layer))
             self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
 
-    with Noted(Address("zenoh", "127.0.0.1", 1)) as ground:
+    with NotingServer(Address("zenoh", "127.0.0.1", 1)) as ground:
         network.publish("mission", b"noise")
         assert not ground._look()
         network.publish("mission", mission_in(tmp_path, "first"))
@@ -184,10 +184,10 @@ def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch
         first = ground._bus.folder
         network.publish("mission", mission_in(tmp_path, "first", 2))  # another way of learning
         ground._look()
-        assert started == [("first", 1, "residual"), ("first", 1, "policy"), ("first", 2, "policy")]
+        assert start_time == [("first", 1, "residual"), ("first", 1, "policy"), ("first", 2, "policy")]
         network.publish("mission", mission_in(tmp_path, "second"))
         ground._look()
-        assert started[3:] == [("second", 1, "residual"), ("second", 1, "policy")]
+        assert start_time[3:] == [("second", 1, "residual"), ("second", 1, "policy")]
         assert not first.exists()
         network.publish("status", b"whatever")
         assert "compiling" in next(ground.learn())
@@ -201,20 +201,20 @@ def test_a_learner_that_is_suspended_for_ever_is_started_again(tmp_path, monkeyp
     with DrillGround(Address("zenoh", "127.0.0.1", 1)) as ground:
         network.publish("mission", mission_in(tmp_path, "first"))
         assert ground._look()
-        suspended, until = ground.processes["policy"], time.monotonic() + 30.0
+        suspension, until = ground.processes["policy"], time.monotonic() + 30.0
         while ground._bus.latest("beat.policy") is None and time.monotonic() < until:
             time.sleep(0.01)
-        os.kill(suspended.pid, signal.SIGSTOP)
+        os.kill(suspension.pid, signal.SIGSTOP)
         while not ground.restarts and time.monotonic() < until:
             ground._beat()
             time.sleep(0.1)
         assert ground.restarts == {"policy": 1}
-        assert suspended.poll() == -signal.SIGKILL
+        assert suspension.poll() == -signal.SIGKILL
         assert ground.processes["policy"].poll() is None
 
 
 @pytest.fixture
-def joined(tmp_path, monkeypatch):
+def bus_case(tmp_path, monkeypatch):
     """A network, and a ground station at it whose learners do nothing."""
     network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
@@ -239,28 +239,30 @@ def joined(tmp_path, monkeypatch):
         ({"vehicle": "quad.toml"}, None, "names a file of this machine"),
     ],
 )
-def test_a_flight_that_names_code_or_files_of_the_ground_is_refused_and_told(joined, tmp_path, changes, reference, why):
-    network, ground = joined
-    start = learnt_by(changed(PRESETS["hover/retrim"], **changes))
+def test_a_flight_that_names_code_or_files_of_the_ground_is_refused_and_told(
+    bus_case, tmp_path, changes, reference, why
+):
+    network, ground = bus_case
+    start = learner_state_of(changed(PRESETS["hover/retrim"], **changes))
     network.publish("mission", mission_in(tmp_path, "first", start=start, reference=reference))
     assert why in next(ground.wait())
     assert not ground.processes
-    said = last_note(network, "ground")
-    assert said["base"] == "first"
-    assert why in said["failed"]
-    network.publish("mission", mission_in(tmp_path, "second", start=learnt_by(PRESETS["hover/retrim"])))
+    text = last_note(network, "ground")
+    assert text["base"] == "first"
+    assert why in text["failed"]
+    network.publish("mission", mission_in(tmp_path, "second", start=learner_state_of(PRESETS["hover/retrim"])))
     assert list(ground.wait()) == []
 
 
-def test_a_name_that_the_ground_trusts_is_learnt_for(joined, tmp_path):
-    network, ground = joined
-    start = learnt_by(changed(PRESETS["hover/retrim"], adapt={"residual": "mine:trusted"}))
+def test_a_name_that_the_ground_trusts_is_learnt_for(bus_case, tmp_path):
+    network, ground = bus_case
+    start = learner_state_of(changed(PRESETS["hover/retrim"], adapt={"residual": "mine:trusted"}))
     network.publish("mission", mission_in(tmp_path, "first", start=start))
     assert list(ground.wait()) == []
 
 
-def test_a_new_flight_gets_nothing_of_the_one_before_and_all_that_is_its_own(joined, tmp_path):
-    network, ground = joined
+def test_a_new_flight_gets_nothing_of_the_one_before_and_all_that_is_its_own(bus_case, tmp_path):
+    network, ground = bus_case
     network.publish("learning", b"paused before anybody was here")
     network.publish("mission", mission_in(tmp_path, "first"))
     stands = ground.learn()
@@ -273,30 +275,30 @@ def test_a_new_flight_gets_nothing_of_the_one_before_and_all_that_is_its_own(joi
     network.publish("learning", b"of the second")  # it may come before the mission is looked at
     network.publish("mission", mission_in(tmp_path, "second"))
     next(stands)
-    found = {topic: ground._bus.latest(topic) for topic in ("flight", "status", "parameters.reference")}
-    assert found == dict.fromkeys(found)
+    result = {topic: ground._bus.latest(topic) for topic in ("flight", "status", "parameters.reference")}
+    assert result == dict.fromkeys(result)
     assert ground._bus.latest("learning").data == b"of the second"
     network.publish("flight", b"of the second")
     next(stands)
     assert ground._bus.latest("flight").data == b"of the second"
 
 
-def test_a_flight_is_told_that_its_end_was_heard(joined, tmp_path):
-    network, ground = joined
+def test_a_flight_is_told_that_its_end_was_heard(bus_case, tmp_path):
+    network, ground = bus_case
     network.publish("mission", mission_in(tmp_path, "first"))
     stands = ground.learn()
     next(stands)
-    said = last_note(network, "ground")
-    assert (said["base"], said["over"]) == ("first", False)
+    text = last_note(network, "ground")
+    assert (text["base"], text["over"]) == ("first", False)
     network.publish("ended", pack_note("ended", reason="landed"))
     assert list(stands) == ["flight over: landed"]
-    said = last_note(network, "ground")
-    assert (said["base"], said["over"]) == ("first", True)
+    text = last_note(network, "ground")
+    assert (text["base"], text["over"]) == ("first", True)
 
 
 def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(monkeypatch):
     monkeypatch.setattr(Address, "join", lambda *_, **__: InProcessBus({}))
-    told = threading.Event()
+    message = threading.Event()
 
     class Other(LearnerServer):
         def wait(self):
@@ -306,17 +308,17 @@ def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(m
             if self.address.key == "a":
                 raise OSError("no room")
             until = time.monotonic() + 10.0
-            while not told.is_set() and time.monotonic() < until:
+            while not message.is_set() and time.monotonic() < until:
                 yield "learnt: policy 7"
 
     def tell(text):
         if text == "zenoh:127.0.0.1:1/a: failed: OSError('no room'); zenoh:127.0.0.1:1/b: learnt: policy 7":
-            told.set()
+            message.set()
 
     monkeypatch.setattr(ground, "LearnerServer", Other)
     with pytest.raises(OSError, match="no room"):
         learn_for([Address.of("zenoh:127.0.0.1:1/a"), Address.of("zenoh:127.0.0.1:1/b")], threading.Event(), tell)
-    assert told.is_set()
+    assert message.is_set()
 
 
 def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
@@ -324,9 +326,9 @@ def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
     start.write_bytes(np.random.default_rng(0).bytes(1000))
     capacities = {"flight": 1000, "parameters.policy": 5000, "knobs": 10}
     mission = LearnerMission.of(3, "circle", 7, "abc", ("residual", "policy"), 5, capacities, start)
-    found = LearnerMission.unpack(mission.pack())
-    assert found == mission
-    assert found.capacities == {"flight": 1000, "parameters.policy": 5000}  # knobs stay where the flight is
+    result = LearnerMission.unpack(mission.pack())
+    assert result == mission
+    assert result.capacities == {"flight": 1000, "parameters.policy": 5000}  # knobs stay where the flight is
     rng, whole = np.random.default_rng(1), mission.pack()
     for _ in range(300):
         data = bytearray(whole)
@@ -358,4 +360,4 @@ def test_a_bridge_carries_each_topic_its_way_and_no_more_than_needed():
     assert there.latest("flight").data == b"3"
     here.publish("status", b"too long for there")
     assert bridge.step() == 0
-    assert bridge.refused == 1
+    assert bridge.refusals == 1
