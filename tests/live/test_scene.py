@@ -4,11 +4,11 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from retrim.live.operator.manual_disturbance import ManualDisturbance
-from retrim.live.panel import LEAST, START_S, Panel, top_of
-from retrim.live.scene import Scene
 
 from live_processes import HOME
+from retrim.live.operator.manual_disturbance import ManualDisturbance
+from retrim.live.operator.panel import LEAST, START_S, Panel, top_of
+from retrim.live.operator.scene import Scene
 
 HALF = np.radians(75.0) / 2  # half of the height of viser's picture, as an angle
 ROTOR = 0.55  # radius of a drawn rotor, in arms
