@@ -1,0 +1,69 @@
+"""The public benchmark: its plant has the published constants, its trajectories the published speeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax, random
+
+from retrim.config.references import make_reference
+from retrim.config.scenario import Scenario
+from retrim.config.vehicles import make_vehicle
+from retrim.physics import Command, ExternalEffects, State, so3
+from retrim.testing import check_plant
+from retrim_paper.rotor_benchmark.plant import LOSS, LOSS_SCALE, SimplifiedQuadrotor, vehicle_file
+from retrim_paper.rotor_benchmark.references import NAMES, RADIUS
+
+VEHICLE = make_vehicle(vehicle_file())
+MODEL = SimplifiedQuadrotor((VEHICLE.command_min, VEHICLE.command_max), random.key(0), 0.02)
+CALM = ExternalEffects.calm(jnp.zeros(0).dtype)
+
+
+def mean_acceleration(c, v=(0.0, 0.0, 0.0), R=None, ms=400, seed=0):
+    """Mean acceleration over single milliseconds from one state, with many draws of the noise [m/s^2]."""
+    x = State(jnp.array([0.0, 0.0, 1.0]), jnp.eye(3) if R is None else R, jnp.array(v))
+    start, u = MODEL.init(x), Command(jnp.array(c), jnp.zeros(3))
+
+    def one(key, _):
+        after = MODEL.substep(type(start)(start.body, key), u, CALM)
+        return after.key, (after.body.x.v - x.v) / 1e-3
+
+    return np.asarray(jax.jit(lambda key: lax.scan(one, key, length=ms)[1])(random.key(seed))).mean(axis=0)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+def test_the_rotors_lose_the_published_part_of_their_input(share):
+    thrust = 80.0 * (share - LOSS * (share / LOSS_SCALE) ** 2)
+    noise = 80.0 * 0.02 * np.sqrt(share / 4.0 / 400.0)  # standard deviation of the mean
+    np.testing.assert_allclose(mean_acceleration(80.0 * share)[2], thrust - 9.80665, atol=4.0 * noise)
+
+
+def test_the_drag_is_linear_and_quadratic_in_body_axes():
+    v = np.array([3.0, -2.0, 4.0])
+    R = so3.exp(jnp.array([0.3, -0.2, 0.5]))
+    moving, resting = (mean_acceleration(9.81, v=speed, R=R, seed=1) for speed in (v, np.zeros(3)))
+    through = np.asarray(R).T @ v
+    drag = np.asarray(R) @ (np.array([0.3, 0.3, 0.0]) * through + 0.08 * through * np.abs(through))
+    np.testing.assert_allclose(moving - resting, -drag, atol=1e-6)
+
+
+def test_the_body_rates_follow_their_commands():
+    x, u = State.at(jnp.array([0.0, 0.0, 1.0])), Command(jnp.array(9.81), jnp.array([3.0, -2.0, 1.0]))
+    end = jax.jit(lambda s: lax.fori_loop(0, 200, lambda _, s: MODEL.substep(s, u, CALM), s))(MODEL.init(x))
+    np.testing.assert_allclose(end.body.omega, u.omega, atol=0.3)  # rotor noise remains
+
+
+def test_it_is_a_plant_by_name():
+    check_plant(Scenario(plant="neural-mpc", vehicle=vehicle_file()).make)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_trajectories_have_the_published_mean_speed(name):
+    shape, _, speed = name.partition("-5m-")
+    reference = make_reference(name)
+    begin, end = np.asarray(reference.lap)
+    at = jax.vmap(reference)(jnp.linspace(begin, end, 2000))
+    mean = np.linalg.norm(np.asarray(at.v), axis=1).mean()
+    np.testing.assert_allclose(mean, float(speed), rtol=2e-3)
+    extent = np.ptp(np.asarray(at.p), axis=0)
+    np.testing.assert_allclose(extent, [2.0 * RADIUS, (2.0 if shape == "circle" else 1.0) * RADIUS, 0.0], atol=0.02)
