@@ -25,8 +25,9 @@ MASS, INERTIA, ROTOR_MAX = 1.0, (0.03, 0.03, 0.06), 20.0  # [kg], [kg m^2], [N]
 ARM, TORQUE_RATIO = 0.235 / 2.0**0.5, 0.013  # [m]: rotors at the corners of a square, 0.235 m from the centre
 LINEAR_DRAG, QUADRATIC_DRAG = (0.3, 0.3, 0.0), 0.08  # per mass: [1/s] and [1/m]
 LOSS, LOSS_SCALE, NOISE = 0.1, 1.3, 0.02  # an input u loses LOSS (u / LOSS_SCALE)^2; its noise is NOISE sqrt(u)
-RATES_MAX = (20.0, 20.0, 10.0)  # [rad/s], of the on-board rate loop
-RATE_GAIN = 50.0  # [1/s], of the on-board rate loop
+RATES_MAX = (20.0, 20.0, 3.0)  # [rad/s], of the on-board rate loop
+RATE_GAINS = (50.0, 50.0, 5.0)  # [1/s], of the on-board rate loop; the rotors have little torque about z
+YAW_SHARE = 0.3  # largest share of a rotor's mean thrust that yaw may add or remove
 
 
 class NoisyState(eqx.Module):
@@ -76,7 +77,9 @@ class SimplifiedQuadrotor(AbstractSubstepDynamics[NoisyState]):
         b, dtype = s.body, s.body.x.p.dtype
         key, draw = random.split(s.key)
         inertia, levers = jnp.array(INERTIA, dtype), jnp.array([ARM, ARM, TORQUE_RATIO], dtype)
-        torque = inertia * RATE_GAIN * (u.omega - b.omega) + jnp.cross(b.omega, inertia * b.omega)
+        torque = inertia * jnp.array(RATE_GAINS, dtype) * (u.omega - b.omega) + jnp.cross(b.omega, inertia * b.omega)
+        yaw_max = YAW_SHARE * TORQUE_RATIO * MASS * u.c
+        torque = torque.at[2].set(jnp.clip(torque[2], -yaw_max, yaw_max))
         thrusts = MASS * u.c / 4.0 + signs(dtype).T @ (torque / levers) / 4.0
         inputs = jnp.clip(thrusts / ROTOR_MAX, 0.0, 1.0)
         noise = NOISE * jnp.sqrt(inputs) * random.normal(draw, (4,), dtype)
@@ -100,7 +103,7 @@ def vehicle_file() -> VehicleSpec:
         thrust_max=4.0 * ROTOR_MAX,
         rates_max=RATES_MAX,
         motor_tau=0.001,
-        rate_lag=(1.0 / RATE_GAIN,) * 3,
+        rate_lag=(1.0 / RATE_GAINS[0], 1.0 / RATE_GAINS[1], 1.0 / RATE_GAINS[2]),
         command_delay=0.0,
     )
 
