@@ -4,6 +4,7 @@ import pytest
 
 from retrim.config import Setup, changed
 from retrim.config import named_presets as presets
+from retrim.config.loading import dump
 from retrim.config.methods import find_method
 from retrim_paper.ablation_options import CONTROL, OFF, ON
 
@@ -17,5 +18,5 @@ def test_every_lever_is_one_change_of_its_preset(task, kind):
         find_method(method)
         Setup.from_preset(one)
     assert setup.count((preset, "full")) == 1
-    assert len({(str(one), method) for one, method in setup}) == len(setup)
+    assert len({(dump(one), method) for one, method in setup}) == len(setup)
     assert len({lever.label for lever in (*CONTROL, *each)}) == len(setup)

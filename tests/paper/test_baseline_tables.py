@@ -273,17 +273,17 @@ def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
 def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):
     """And says in its document that it is one."""
     choice = {"seconds": 30.0, "starts": 8, "seeds": (4,), "quick": True}
-    options, remark = quick.looked(tables.hover, choice)
+    options, remark = quick.quick_options(tables.hover, choice)
     assert (options["seconds"], options["starts"], options["seeds"]) == (12.0, 2, (4,))
     assert "not to quote" in remark
-    assert quick.looked(tables.hover, {**choice, "quick": False}) == (
+    assert quick.quick_options(tables.hover, {**choice, "quick": False}) == (
         {k: choice[k] for k in options if k in choice},
         "",
     )
     calls = inspect.signature(tables.hover).parameters
     names = {**{name: calls[name].default for name in calls if name not in ("run", "reporter")}, "quick": True}
-    assert quick.looked(tables.hover, names)[0]["starts"] == 2
-    assert quick.looked(tables.hover, names, ["--starts", "8"])[0]["starts"] == calls["starts"].default
+    assert quick.quick_options(tables.hover, names)[0]["starts"] == 2
+    assert quick.quick_options(tables.hover, names, ["--starts", "8"])[0]["starts"] == calls["starts"].default
     words = "--methods", "indi", "--candidates", "3", "--seconds", "4", "--plant", "simple", "--quick"
     retrim("reproduce", "tuning", *words, "--out", "t", cwd=tmp_path)
     assert remark in (tmp_path / "t" / "tuning.md").read_text()

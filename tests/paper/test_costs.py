@@ -112,8 +112,8 @@ def test_a_search_for_settings_flies_every_candidate_under_every_condition(tmp_p
         return flight(np.where(t > 3.0 + 1e-9, 0.3, 5.0), seconds=6.0)
 
     monkeypatch.setattr(tuning, "fly_together", fly_together)
-    monkeypatch.setattr(tuning, "until_terminated", lambda task, log: log)
-    monkeypatch.setattr(tuning, "scored", scored)
+    monkeypatch.setattr(tuning, "cut_at_termination", lambda task, log: log)
+    monkeypatch.setattr(tuning, "score_flight", scored)
     tuning.tuning(
         Run("test", tmp_path), Silent(), methods=("indi", "mppi"), candidates=5, starts=2, seconds=6.0, seed=7
     )
@@ -156,10 +156,10 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
         trained_policy.append((policy, tuple(logs), choice, epochs, jax.random.key_data(key).tolist()))
         return Retraining(f"re-{policy}", 2.0, [0.5, 0.7], 0.25)
 
-    monkeypatch.setattr(design, "fly_as_it_is", fly)
-    monkeypatch.setattr(design, "retrained", retrained)
-    monkeypatch.setattr(design, "until_terminated", lambda task, log: log)
-    monkeypatch.setattr(design, "scored", lambda setup, spec, log: flight(0.1 * (1 + spec.seed), seconds=4.0))
+    monkeypatch.setattr(design, "fly_batch_of_policy", fly)
+    monkeypatch.setattr(design, "retrain", retrained)
+    monkeypatch.setattr(design, "cut_at_termination", lambda task, log: log)
+    monkeypatch.setattr(design, "score_flight", lambda setup, spec, log: flight(0.1 * (1 + spec.seed), seconds=4.0))
     design.design(Run("test", tmp_path), watching, seeds=SEEDS, starts=5, epochs=30)
     n = len(design.CHOICES)
     assert [seeds for _, seeds in done.trainings] == [SEEDS]

@@ -75,8 +75,8 @@ def test_drag_grows_with_speed_and_most_of_it_is_the_rotors():
 
 def test_steps_are_answered_and_a_battery_sags():
     rates = curves(model.rate_panel())
-    assert set(rates) == {f"{name}, {axis}" for name in model.SHOWN for axis in ("roll", "yaw")}
-    for name in model.SHOWN:
+    assert set(rates) == {f"{name}, {axis}" for name in model.QUADROTORS for axis in ("roll", "yaw")}
+    for name in model.QUADROTORS:
         roll, yaw = rates[f"{name}, roll"], rates[f"{name}, yaw"]
         assert (roll.x[0], roll.x[-1]) == (1.0, 300.0)  # [ms]
         assert abs(roll.y[0]) < 0.05
@@ -85,7 +85,7 @@ def test_steps_are_answered_and_a_battery_sags():
     thrust = curves(model.step_panel())
     np.testing.assert_array_equal(thrust["commanded"].x, [0.0, 300.0])
     np.testing.assert_array_equal(thrust["commanded"].y, [5.0, 5.0])
-    for name in model.SHOWN:
+    for name in model.QUADROTORS:
         assert (thrust[name].x[0], thrust[name].x[-1]) == (2.0, 300.0)  # [ms]
         assert thrust[name].y[0] < 1.0
         assert thrust[name].y[-1] == pytest.approx(at(thrust["commanded"], 300.0), rel=0.1)
@@ -102,7 +102,7 @@ def test_the_model_s_page_has_each_figure_and_its_deviation(tmp_path, monkeypatc
     for name in ("thrust", "drag", "inflow", "rate", "step", "sag"):
         monkeypatch.setattr(model, f"{name}_panel", lambda: panel)
     rows = [{"what": "a", "ours": 1.1, "published": 1.0, "source": "s"}]
-    monkeypatch.setattr(model, "published", lambda: rows)
+    monkeypatch.setattr(model, "compare_published", lambda: rows)
     model.model(Run("test", tmp_path), Silent())
     text = (tmp_path / "model.md").read_text()
     assert "| a | 1.1 | 1 | +10.0 % | s |" in text
@@ -195,7 +195,7 @@ def test_latencies_of_buses_by_their_command(tmp_path, monkeypatch):
         calls.append((type(bus).__name__, words[-1], size))
         return [] if size > 1e6 else [1e-3, 3e-3]
 
-    monkeypatch.setattr(buses, "measured", measured)
+    monkeypatch.setattr(buses, "measure_latencies", measured)
     monkeypatch.setattr(buses, "rosmaster", nullcontext)
     monkeypatch.setattr(buses, "two_machines", nullcontext)
     watching = Watching()

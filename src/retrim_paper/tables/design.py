@@ -27,9 +27,9 @@ from ..design import (
     ROLLOUT_S,
     ROLLOUTS,
     SCORED_S,
+    fly_batch_of_policy,
     retrain,
 )
-from ..design import fly_batch_of_policy as fly_as_it_is
 
 PAPER = "the paper: low fidelity trains about twice as fast at a comparable error; res-back costs about 30 % more time"
 COLUMNS = ("model", "time of an epoch [ms]", "beside the first", "compiling [s]", "residual left [m/s²]", "error [m]")
@@ -72,14 +72,14 @@ def design(
     setup = Setup.from_preset(base)
     with run.interruptible(), reporter.progress("re-training") as advance:
         for seed, policy in study.policies.items() if not run.interrupted else ():
-            logs = fly_as_it_is(setup, policy, ROLLOUTS, ROLLOUT_S, 1000 + seed)
+            logs = fly_batch_of_policy(setup, policy, ROLLOUTS, ROLLOUT_S, 1000 + seed)
             for i, (name, choice) in enumerate(CHOICES.items()):
                 if run.interrupted:
                     break
                 advance(len(rows) / (len(CHOICES) * len(study.policies)), f"{name}, seed {seed}")
                 result = retrain(setup, policy, logs, random.key(seed), choice, epochs=epochs)
                 spec = FlightSpec(Scenario(PUSH, PLANT), "base", 0, seed)
-                flight_logs = fly_as_it_is(setup, result.policy, starts, SCORED_S, seed)
+                flight_logs = fly_batch_of_policy(setup, result.policy, starts, SCORED_S, seed)
                 flights = [score_flight(setup, spec, cut_at_termination(setup.flight_task, log)) for log in flight_logs]
                 rows.append({
                     "model": name, "seed": seed, "order": i, "compile_s": result.compile_s, "epoch_s": result.epoch_s,

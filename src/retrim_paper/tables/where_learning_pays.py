@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from retrim.config.loading import dump
 from retrim.errors import ConfigError
 from retrim.evaluation.flight_groups import clear_flights
 from retrim.evaluation.limits import check_seeds
@@ -73,7 +74,7 @@ def where_learning_pays(
         if run.interrupted:
             break
         reporter.say(f"{row.name}: {row.about}")
-        key = repr(row.preset)
+        key = dump(row.preset)
         if key not in studies:
             studies[key] = train_all(row.preset, seeds, run, reporter)
         methods = _methods(row, columns)

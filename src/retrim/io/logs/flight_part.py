@@ -40,9 +40,11 @@ def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bo
             notes.append(f"{name} was not valid for {gap:.1f} s, which are left out")
         valid &= around(holds, ENDS)
     ground = on_ground(ticks) if valid.any() else np.zeros(len(valid), dtype=bool)
-    ground |= marks.is_final
+    ground |= marks.on_ground
     if (ground_time := float(np.sum(ground) * dt)) > 0.5:
-        detector_note = f" (its land detector says {np.sum(marks.is_final) * dt:.1f} s)" if marks.is_final.any() else ""
+        detector_note = (
+            f" (its land detector says {np.sum(marks.on_ground) * dt:.1f} s)" if marks.on_ground.any() else ""
+        )
         notes.append(f"{ground_time:.1f} s on the ground{detector_note} are left out")
     valid &= ~ground
     for name in ("velocity", "attitude"):

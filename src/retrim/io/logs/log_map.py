@@ -196,7 +196,7 @@ class LogMap:
     measured_rates: BodyRates | None = None
     """Gyroscope rates; by default they are derived from the attitudes."""
     acceleration: Acceleration | None = None
-    is_final: LandDetector | None = None
+    landed: LandDetector | None = None
     time: Time | None = None
     frames: Frames = Frames()
     part: Part = Part()

@@ -19,7 +19,7 @@ class Marks:
     """Ticks at which a quantity is valid, (n,); quantities without flags are absent."""
     resets: Mapping[str, np.ndarray]
     """Ticks at which a quantity was reset since the previous tick, (n,)."""
-    is_final: np.ndarray
+    on_ground: np.ndarray
     """Ticks at which the vehicle is on the ground, (n,); all false if the log has no such field."""
 
 
@@ -39,8 +39,8 @@ def marks_of(log_map: LogMap, series: Mapping[str, Series], t: np.ndarray) -> Ma
                 changes = np.concatenate([[False], np.diff(count) != 0.0])
                 resets[name] = resets.get(name, np.zeros(len(t), dtype=bool)) | changes
     on_ground = np.zeros(len(t), dtype=bool)
-    if log_map.is_final is not None:
-        for k, field in enumerate(log_map.is_final.fields):
+    if log_map.landed is not None:
+        for k, field in enumerate(log_map.landed.fields):
             if (flag := series.get(f"landed {k}")) is not None:
                 on_ground |= _true(_around(flag, t)[0], field)
     return Marks(holds, resets, on_ground)

@@ -113,7 +113,7 @@ def _list_fields(used_map: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]
         optional |= {name} if getattr(spec, "optional", False) else set()
         for flag in FLAGS:
             marks[f"{name} {flag}"] = getattr(spec, flag, ())
-    marks["landed"] = () if used_map.is_final is None else used_map.is_final.fields
+    marks["landed"] = () if used_map.landed is None else used_map.landed.fields
     for name, fields in marks.items():
         for k, field in enumerate(fields):
             request[f"{name} {k}"] = (field.partition("==")[0],)
