@@ -52,7 +52,7 @@ def station(address, over):
             if over.is_set():
                 return
         for _ in ground.learn():
-            if not ground.carried:
+            if not ground.has_traffic:
                 time.sleep(0.002)
             if over.is_set():
                 return
