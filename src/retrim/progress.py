@@ -90,7 +90,7 @@ def _at_intervals(advance: Advance) -> Advance:
     """Return a function that passes on the first progress, the last one, and one in each interval."""
     last = float("-inf")
 
-    def sometimes(share: float, text: str) -> None:
+    def pass_on(share: float, text: str) -> None:
         nonlocal last
         now = time.monotonic()
         if now - last >= INTERVAL or share >= 1.0:
@@ -98,4 +98,4 @@ def _at_intervals(advance: Advance) -> Advance:
             with suppress(OSError):  # a lost terminal must not end a flight
                 advance(share, text)
 
-    return sometimes
+    return pass_on

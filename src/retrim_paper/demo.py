@@ -32,7 +32,7 @@ WHY = {
 }
 
 
-class Shown(NamedTuple):
+class Demonstration(NamedTuple):
     """Results of a demonstration."""
 
     tables: list[TableSection]
@@ -43,7 +43,7 @@ class Shown(NamedTuple):
 
 def demonstrate(
     name: str, plant: str, run: Run, reporter: Reporter, *, seconds: float, starts: int, seed: int, slow: bool = True
-) -> Shown | None:
+) -> Demonstration | None:
     """Pretrain a hover policy, fly it under unknown disturbances, and re-train it in flight.
 
     Then a policy for many vehicles flies a second quadrotor, whose rate loop is slow.
@@ -96,4 +96,4 @@ def demonstrate(
     pictures = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
     tables = [table] if second is None else [table, second.table]
     pictures += [] if second is None else second.pictures
-    return Shown(tables, [path for path in pictures if path.suffix == ".png"], run.folder / "hover_large.png")
+    return Demonstration(tables, [path for path in pictures if path.suffix == ".png"], run.folder / "hover_large.png")

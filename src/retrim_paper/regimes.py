@@ -18,8 +18,8 @@ from .vehicles import DELAY, slow_quadrotor
 
 PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
 LAST, TAIL = 2.0, 10.0  # [s], scored intervals at the end of hover flights and of tracking flights
-HIDDEN = 8  # number of hidden vehicles
-UNSEEN = 48  # seed of their draw
+VEHICLES = 8  # number of hidden vehicles
+VEHICLE_SEED = 48  # seed of their draw
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ def height_error(flight: Flight) -> float:
     """
     if flight.target is None:
         raise ValueError("height_error needs a flight with a target")
-    missed = flight.log.true.p[:, 2] - flight.target[:, 2]
-    return float(np.sqrt(np.mean(missed[_tail(flight, TAIL)] ** 2)))
+    errors = flight.log.true.p[:, 2] - flight.target[:, 2]
+    return float(np.sqrt(np.mean(errors[_tail(flight, TAIL)] ** 2)))
 
 
 def _tail(flight: Flight, seconds: float) -> np.ndarray:
@@ -83,14 +83,14 @@ def regimes() -> tuple[Regime, ...]:
     over_places = changed(tracking, vehicle="large", adapt=replace(tracking.adapt, residual="place"))
     slow = slow_quadrotor()
     circle = "circle=1"
-    hidden = tuple(vehicle.scenario(PUSH) for vehicle in draw_vehicles(HIDDEN, UNSEEN))
+    hidden = tuple(vehicle.scenario(PUSH) for vehicle in draw_vehicles(VEHICLES, VEHICLE_SEED))
     at_rest = Score(mean_error, f"mean error, last {LAST:g} s")
     on_path = Score(tracking_error, f"mean error, last {TAIL:g} s")
     in_height = Score(height_error, f"RMS height error, last {TAIL:g} s")
     return (
         Regime(
             "S1 hidden vehicles",
-            f"{HIDDEN} vehicles of 30 g to 3 kg, unknown to every method; a push of 2 m/s² per axis",
+            f"{VEHICLES} vehicles of 30 g to 3 kg, unknown to every method; a push of 2 m/s² per axis",
             any_hover, hidden, 10.0, at_rest, adapted="base-id",
             published="xadapt 100 % survive, 0.154 m; RAPTOR 0.1 to 0.3 m",
         ),

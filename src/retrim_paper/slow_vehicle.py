@@ -36,7 +36,7 @@ class Entrant(NamedTuple):
     study: Study
     method: str
     vehicle: str
-    """What the method is told about the vehicle."""
+    """Knowledge of the method about the vehicle."""
 
 
 class SlowVehicle(NamedTuple):

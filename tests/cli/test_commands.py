@@ -92,7 +92,7 @@ def test_a_full_disk_loses_no_flight(folder, monkeypatch):
     out = retrim(*words, cwd=folder, code=1)
     assert "hover error, last 2 s of 2 s, 2 starts" in out
     (place,) = {Path(result) for result in re.findall(r"\(No space left on device\); it is in (\S+)", out)}
-    for name in ("what was learnt", "events.jsonl", "the logs", "results.json"):
+    for name in ("the learner state", "events.jsonl", "the logs", "results.json"):
         assert f"retrim: {name} cannot be written to full (No space left on device); it is in {place}" in out
     assert results(place)["rows"] == results(folder / "f")["rows"]
     assert load_learner_state(place / "learner_state.safetensors")[1].name == "hover/retrim"

@@ -166,7 +166,7 @@ def test_the_encoder_is_trained_with_its_examples(seeing, key):
 def test_its_image_is_drawn(seeing, tmp_path):
     display = flight(0.1)
     text = picture([display], seeing, display.spec.scenario, tmp_path)[1].read_text()
-    assert "what the camera saw of the points" in text
+    assert "points in the image" in text
 
 
 def test_an_observation_around_another_measures_no_more_than_that(seeing):

@@ -142,7 +142,7 @@ def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_land
 
 def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch):
     """Two flights of a scenario and a method are one program; a third one is left for itself."""
-    monkeypatch.setattr(batching, "FULL", 2)
+    monkeypatch.setattr(batching, "CPU_LIMIT", 2)
     monkeypatch.setattr(batching, "lanes", lambda: 1)
     assert [len(batch.specs) for batch in fleet.make_batches(fleet.specs)] == [2, 2, 2, 2]
     assert [len(batch.specs) for batch in fleet.make_batches(fleet.specs[:3])] == [2, 1]
@@ -166,7 +166,7 @@ def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch
 
 
 def test_flights_that_are_forgotten_have_landed(fleet, flights, monkeypatch):
-    monkeypatch.setattr(batching, "FULL", 2)
+    monkeypatch.setattr(batching, "CPU_LIMIT", 2)
     monkeypatch.setattr(batching, "lanes", lambda: 1)
     on_result = []
     loss = fleet.run(only=two_batches(fleet), on_result=on_result.extend, forget=True)

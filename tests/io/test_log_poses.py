@@ -84,7 +84,7 @@ def test_positions_that_jump_have_no_velocity(dt, tmp_path):
     log = read(tmp_path, table, POSES)
     np.testing.assert_allclose(miss(log), 0.0, atol=0.1)
     assert log.seconds > 11.0
-    assert any("the position jumps 4 times, and what is around is left out" in note for note in log.notes)
+    assert any("the position jumps 4 times, and the ticks around are left out" in note for note in log.notes)
 
 
 @pytest.mark.parametrize("axes", ["world", "body"])

@@ -312,7 +312,9 @@ def test_defaults_of_keys_that_an_older_file_lacks_are_listed(tmp_path, setup, c
     write_policy(tmp_path / "p", policy, {"preset": json.dumps(tables)})
     assert load_policy(tmp_path / "p")[1] == changed(setup.preset)
     (line,) = [record.getMessage() for record in caplog.records if record.name.startswith("retrim")]
-    assert line.endswith("what it lacks: goal = (0.0, 0.0, 1.0), jump_cost = 0.0, adapt.trim = 'free'")
+    assert line.endswith(
+        "missing keys have their defaults: goal = (0.0, 0.0, 1.0), jump_cost = 0.0, adapt.trim = 'free'"
+    )
     caplog.clear()
     save_policy(tmp_path / "p", policy, setup.preset)
     load_policy(tmp_path / "p")

@@ -175,7 +175,7 @@ def test_a_folder_in_whose_place_is_something_else_loses_nothing(folder, seed):
 
     code, text = fly_once(folder, out.name, replace, seed)
     assert code == 1, text
-    place = elsewhere(text, "what was learnt", "File exists")
+    place = elsewhere(text, "the learner state", "File exists")
     result = results(elsewhere(text, "results.json", "File exists"))
     assert result["ended"] == "landed"
     assert any(fault.startswith(f"{out.name}/flight.csv: ") for fault in result["faults"])
@@ -200,7 +200,7 @@ def test_a_full_disk_loses_nothing(folder, small_disk, seed):
     full = "No space left on device"
     code, text = fly_once(folder, small_disk.name, lambda process: fill(small_disk), seed)
     assert code == 1, text
-    place = elsewhere(text, "what was learnt", full)
+    place = elsewhere(text, "the learner state", full)
     assert f"retrim: {small_disk.name}/flight.csv: {full}; the log goes on in {place}/flight.csv" in text
     result = results(elsewhere(text, "results.json", full))
     assert result["ended"] == "landed"

@@ -30,7 +30,7 @@ def spec():
 
 
 def needed(spec):
-    return [name for name, role in ROLES.items() if role.needed(spec)]
+    return [name for name, role in ROLES.items() if role.is_needed(spec)]
 
 
 def test_a_flight_has_the_processes_that_it_needs(spec):

@@ -20,7 +20,7 @@ from retrim.config import named_presets as presets
 from retrim.config.disturbances import DISTURBANCES
 from retrim.config.loading import dump, with_vehicle
 from retrim.config.presets import Adapt
-from retrim.evaluation.batches import FULL
+from retrim.evaluation.batches import CPU_LIMIT
 from retrim.evaluation.flight_groups import FLIGHTS
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
 from retrim.runkit import Run, provenance
@@ -476,7 +476,7 @@ def test_many_machines_are_limited_by_flying_then_by_the_network_then_by_the_sch
     assert {time for _, time, _ in network} == {f"{(1e6 + 60) / 86_400:.1f} days"}
     scheduler = longest(run_s=1e-9, size=0)
     assert {what for _, _, what in scheduler} == {"the scheduler"}
-    assert {time for _, time, _ in scheduler} == {f"{60 + 1e6 / FULL * scaling.JOB_S:.0f} s"}
+    assert {time for _, time, _ in scheduler} == {f"{60 + 1e6 / CPU_LIMIT * scaling.JOB_S:.0f} s"}
     first, *others = longest(run_s=1.1, size=scaling.LINK / 1000)
     assert first[2] == "flying"
     assert {what for *_, what in others} == {"the client's network"}

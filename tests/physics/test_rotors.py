@@ -44,7 +44,7 @@ def test_thrust_error_is_the_stated_acceleration():
 
 def test_mixer_and_wrench_are_inverse(exact, key):
     force, torque = jnp.array(5.0), 1e-3 * random.normal(key, (3,))
-    thrusts = exact.mixed(force, torque)
+    thrusts = exact.mix(force, torque)
     found_force, found_torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), thrusts, jnp.zeros(3))
     np.testing.assert_allclose(found_force[2], force, rtol=1e-12)
     np.testing.assert_allclose(found_torque, torque, atol=1e-14)

@@ -113,7 +113,7 @@ def test_a_report_is_a_table_a_picture_and_json(files, tmp_path, monkeypatch):
     run = Run("replay", tmp_path)
     replay(path, Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True), run, Silent())
     text = (tmp_path / "replay.md").read_text()
-    assert "What the point mass missed" in text
+    assert "Residual of the point mass" in text
     assert "| linear |" in text
     assert (tmp_path / "replay.png").stat().st_size > 10_000
     result = json.loads((tmp_path / "replay.json").read_text())
@@ -168,7 +168,7 @@ def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, m
     drag = Estimate(0.3, 0.2, 0.4)  # in a comment of the file
     result = IdentifiedVehicle(*[None] * 9, (drag, None, None), 0.1)
     monkeypatch.setattr(replays, "identify", lambda log, seed: result)
-    monkeypatch.setattr(replays, "_foretold", lambda *calls: [])
+    monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
     vehicle = str(tmp_path / "heavy.toml")
     calls = Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True, vehicle=vehicle)
     replay(path, calls, Run("replay", tmp_path), Silent())
@@ -179,7 +179,7 @@ def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, m
 
 def test_no_vehicle_file_is_written_of_a_log_that_says_nothing(brief, files, tmp_path, monkeypatch):
     monkeypatch.setattr(replays, "identify", lambda log, seed: IdentifiedVehicle(*[None] * 9, (None, None, None), 0.1))
-    monkeypatch.setattr(replays, "_foretold", lambda *calls: [])
+    monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
     calls = Replay(map=str(files[1]), buffer=2.0, horizon=1.0, identify=True)
     document = replay(brief, calls, Run("replay", tmp_path), Silent())
     assert "no vehicle file is written" in document.sections[-1].about
@@ -188,7 +188,7 @@ def test_no_vehicle_file_is_written_of_a_log_that_says_nothing(brief, files, tmp
 
 def test_a_report_begins_with_what_is_doubtful_and_shows_every_figure(tmp_path, monkeypatch):
     """A column that is not the thrust, as a battery's voltage; then the thrust."""
-    monkeypatch.setattr(replays, "_foretold", lambda *calls: [])
+    monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
     flight = fly_once(7.0, size=3.0)
     choice = write_map(tmp_path / "map.toml", thrust__unit='"share"')
     text = []
@@ -213,7 +213,7 @@ def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
     policy = setup.new_policy(jax.random.key(0))
     log = read_flight_log(files[0], read_map(files[1]), dt=preset.dt)
     result = adapt_to(rows_of(log), setup, policy, method="full", updates=4, seed=0, reporter=Silent())
-    assert 0 <= result.admitted <= result.tried == 4
+    assert 0 <= result.admissions <= result.attempts == 4
     model = setup.learner.residual_model
     x, u = jax.tree.map(lambda leaf: leaf[100], (rows_of(log).x, rows_of(log).u))
     np.testing.assert_allclose(model.predict(result.state.residual, x, u), PUSH, atol=0.1)

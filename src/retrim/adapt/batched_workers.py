@@ -35,9 +35,9 @@ class ResidualBatch(WorkerBatch):
 
     def learn(self, states: Any, windows: Window, incumbents: Any = None) -> BatchUpdate:
         """Fit the residual of each vehicle; ``states`` are the states of the residual models."""
-        fitted, reports = _fit_all(self.learner, states, windows)
+        residuals, reports = _fit_all(self.learner, states, windows)
         reports, t = jax.device_get((reports, windows.t[:, -1]))
-        return BatchUpdate(fitted, lambda i, state: residual_update(float(t[i]), state, _row(reports, i)))
+        return BatchUpdate(residuals, lambda i, state: residual_update(float(t[i]), state, _row(reports, i)))
 
     def unstack(self, workers: Sequence[Any]) -> None:
         """Do nothing, since a fit uses no random numbers."""
@@ -52,9 +52,9 @@ class PolicyBatch(WorkerBatch):
     def learn(self, states: LearnerState, windows: Window, incumbents: Any = None) -> BatchUpdate:
         """Re-train the policy of each vehicle; a vehicle keeps its old policy if the gate refuses the new one."""
         self.keys, now = _next_keys(self.keys)
-        trained_policy, verdicts = _update_all(self.learner, states, windows, now, incumbents)
+        trained_states, verdicts = _update_all(self.learner, states, windows, now, incumbents)
         verdicts, t = jax.device_get((verdicts, windows.t[:, -1]))
-        return BatchUpdate(trained_policy, lambda i, state: policy_update(float(t[i]), state, _row(verdicts, i)))
+        return BatchUpdate(trained_states, lambda i, state: policy_update(float(t[i]), state, _row(verdicts, i)))
 
     def unstack(self, workers: Sequence[Any]) -> None:
         """Let the workers continue with the next random keys."""
@@ -83,12 +83,12 @@ def learn_together(
     """
     if not workers[0].stackable:
         return [worker.learn(window) for worker, window in zip(workers, windows, strict=True)]
-    padded = _padded(len(workers))
-    batch = type(workers[0]).stack([workers[i] for i in padded])
+    numbers = _pad_numbers(len(workers))
+    batch = type(workers[0]).stack([workers[i] for i in numbers])
     states = [worker.state for worker in workers]
-    incumbents = None if base is None else stack([states[i].policy.policy for i in padded])
-    together = stack([states[i] if base is None else _on(states[i], base) for i in padded])
-    update = batch.learn(together, stack([windows[i] for i in padded]), incumbents)
+    incumbents = None if base is None else stack([states[i].policy.policy for i in numbers])
+    together = stack([states[i] if base is None else _on(states[i], base) for i in numbers])
+    update = batch.learn(together, stack([windows[i] for i in numbers]), incumbents)
     batch.unstack(workers)
     return update.unstack(len(workers))
 
@@ -121,12 +121,12 @@ def learn_base(
     Returns:
         The base after the step, or the unchanged base if the gradient is not finite.
     """
-    n, padded = len(workers), _padded(len(workers))
-    states = stack([_on(workers[i].state, base) for i in padded])
-    weight = jnp.asarray([1.0 / n] * n + [0.0] * (len(padded) - n))
-    window = stack([windows[i] for i in padded])
-    stepped: PolicyState = _base_step(workers[0].learner, base, states, window, weight, key)
-    return to_default_device(stepped)  # the next step may be shared by other devices
+    n, numbers = len(workers), _pad_numbers(len(workers))
+    states = stack([_on(workers[i].state, base) for i in numbers])
+    weight = jnp.asarray([1.0 / n] * n + [0.0] * (len(numbers) - n))
+    window = stack([windows[i] for i in numbers])
+    new_base: PolicyState = _base_step(workers[0].learner, base, states, window, weight, key)
+    return to_default_device(new_base)  # the next step may be shared by other devices
 
 
 def refused_by_all(updates: Sequence[Update]) -> bool:
@@ -150,7 +150,7 @@ def at_once(n: int, size: int) -> int:
     return max(range(2, most + 1), key=lambda few: (-(-n % few), few), default=1)
 
 
-def _padded(n: int) -> list[int]:
+def _pad_numbers(n: int) -> list[int]:
     """Return the numbers of ``n`` vehicles, followed by copies of the first one that fill the program."""
     return [*range(n), *[0] * (room_for(n) - n)]
 
@@ -183,8 +183,8 @@ def _next_keys(keys: Key[Array, " n"]) -> tuple[Key[Array, " n"], Key[Array, " n
 @eqx.filter_jit
 def _fit_all(learner: OnlineLearner, residuals: Any, windows: Window) -> tuple[Any, FitReport]:
     """Fit the residual of each vehicle; every array has a leading axis of vehicles."""
-    fitted: tuple[Any, FitReport] = eqx.filter_vmap(learner.fit_residual)(residuals, windows)
-    return fitted
+    result: tuple[Any, FitReport] = eqx.filter_vmap(learner.fit_residual)(residuals, windows)
+    return result
 
 
 @eqx.filter_jit
@@ -194,25 +194,25 @@ def _update_all(
     """Return the trained policies, or the old ones where the gate refused them, and the verdicts."""
 
     def update(state: LearnerState, window: Window, key: Key[Array, ""], incumbent: Any) -> tuple[PolicyState, Verdict]:
-        trained_policy, verdict = learner.update_policy(state.policy, state.residual, window, key, incumbent)
-        return where(verdict.admitted, trained_policy, state.policy), verdict
+        trained_state, verdict = learner.update_policy(state.policy, state.residual, window, key, incumbent)
+        return where(verdict.admitted, trained_state, state.policy), verdict
 
     if jax.default_backend() != "cpu" or jax.device_count() > 1:
-        updated: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys, incumbents)
-        return updated
+        result: tuple[PolicyState, Verdict] = eqx.filter_vmap(update)(state, windows, keys, incumbents)
+        return result
     # A core is fastest with a few updates at once, since their activations stay in its cache. The last group is padded.
     arrays, rest = eqx.partition((state, windows, keys, incumbents), eqx.is_array)
     n = keys.shape[0]
     few = at_once(n, sum(leaf.nbytes for leaf in jax.tree.leaves(eqx.filter(state.policy.policy, eqx.is_array))) // n)
-    filling = jnp.minimum(jnp.arange(n + -n % few), n - 1)
+    indices = jnp.minimum(jnp.arange(n + -n % few), n - 1)
 
     def of_arrays(one: Any) -> tuple[PolicyState, Verdict]:
-        trained_policy, verdict = update(*eqx.combine(one, rest))
-        return eqx.filter(trained_policy, eqx.is_array), verdict
+        trained_state, verdict = update(*eqx.combine(one, rest))
+        return eqx.filter(trained_state, eqx.is_array), verdict
 
-    made = lax.map(of_arrays, jax.tree.map(lambda leaf: leaf[filling], arrays), batch_size=few)
-    trained_policy, verdicts = jax.tree.map(lambda leaf: leaf[:n], made)
-    return eqx.combine(trained_policy, eqx.filter(state.policy, eqx.is_array, inverse=True)), verdicts
+    results = lax.map(of_arrays, jax.tree.map(lambda leaf: leaf[indices], arrays), batch_size=few)
+    trained_states, verdicts = jax.tree.map(lambda leaf: leaf[:n], results)
+    return eqx.combine(trained_states, eqx.filter(state.policy, eqx.is_array, inverse=True)), verdicts
 
 
 @eqx.filter_jit
@@ -220,15 +220,15 @@ def _base_step(
     learner: OnlineLearner, base: PolicyState, states: LearnerState, windows: Window, weight: Array, key: Key[Array, ""]
 ) -> PolicyState:
     def gradient(state: LearnerState, window: Window, key: Key[Array, ""]) -> Any:
-        corrected = learner.view(learner.env, FittedResidual(learner.residual_model, state.residual))
+        corrected_env = learner.view(learner.env, FittedResidual(learner.residual_model, state.residual))
         x0 = jax.tree.map(lambda leaf: leaf[0], learner.starts(learner.env.task, window, key, 1, learner.num_envs))
-        return policy_gradient(state.policy.policy.merged(), corrected, x0)[1]
+        return policy_gradient(state.policy.policy.merged(), corrected_env, x0)[1]
 
     each = eqx.filter_vmap(gradient)(states, windows, random.split(key, weight.shape[0]))
     mean = jax.tree.map(lambda leaf: jnp.tensordot(weight.astype(leaf.dtype), leaf, axes=1), each)
     params = base.policy.params
     change, memory = _optimiser(learner).update(mean, base.optimiser, params)
-    stepped = PolicyState(base.policy.with_params(optax.apply_updates(params, change)), memory)
+    new_base = PolicyState(base.policy.with_params(optax.apply_updates(params, change)), memory)
     fine = jnp.isfinite(optax.tree.norm(mean))
-    result: PolicyState = jax.tree.map(lambda new, old: jnp.where(fine, new, old), stepped, base)
+    result: PolicyState = jax.tree.map(lambda new, old: jnp.where(fine, new, old), new_base, base)
     return result

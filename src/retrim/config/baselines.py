@@ -1,4 +1,4 @@
-"""What a set-up gives to controllers without a policy: its task, and the declared command path of its vehicle."""
+"""The task and the declared command path of a set-up, for controllers without a policy."""
 
 from typing import TYPE_CHECKING
 

@@ -56,12 +56,12 @@ class MethodRequest:
             effective_gravity_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset
         )
 
-    def by_state(self, controller: AbstractController[Any], called: str | None = None) -> AbstractController[Any]:
+    def by_state(self, controller: AbstractController[Any], name: str | None = None) -> AbstractController[Any]:
         """Adapt a state-feedback controller to the observation, whose state estimator it uses if there is one.
 
         Args:
             controller: Controller that needs the state.
-            called: Name of the method in error messages; by default, the name of the controller class.
+            name: Name of the method in error messages; by default, the name of the controller class.
 
         Raises:
             ConfigError: The observation neither measures nor estimates the state.
@@ -70,9 +70,9 @@ class MethodRequest:
         if observation.state_estimator is not None:
             return PoseFilteredController(observation, controller)
         if not observation.measures_state:
-            name = called or type(controller).__name__
+            method = name or type(controller).__name__
             raise ConfigError(
-                f"method {name!r} needs the state, and preset {self.setup.preset.name!r} shows keypoints, from which "
+                f"method {method!r} needs the state, and preset {self.setup.preset.name!r} shows keypoints, from which "
                 "only a pose filter gives one: set [vision] occlusion = true"
             )
         return controller
@@ -163,7 +163,7 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(request.in_effective_gravity_frame())
 
 
-def _make_adaptive_path(request: MethodRequest) -> Pilot:
+def _make_identifying_pilot(request: MethodRequest) -> Pilot:
     return ControllerPilot(identify_vehicle(request.in_effective_gravity_frame(), request.setup.preset))
 
 
@@ -187,7 +187,7 @@ def _low_rank(setup: "Setup", policy: AbstractPolicy, key: Key[Array, ""]) -> Lo
 register_method("base", MethodEntry(_base, "base policy"))
 register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
-register_method("base-id", MethodEntry(_make_adaptive_path, "base policy + observer + identification"))
+register_method("base-id", MethodEntry(_make_identifying_pilot, "base policy + observer + identification"))
 for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _name, _baseline), _baseline.label))
 register_method("full", MethodEntry(_full, "**adapted, all weights**", learns=_all_weights))

@@ -27,11 +27,11 @@ def find_plant(name: str) -> tuple[PlantEntry, str]:
     kind, _, address = name.partition(":")
     if kind in PLANTS and PLANTS[kind].is_vehicle:
         return PLANTS[kind], address
-    found: Any = PLANTS.find(name)
-    if isinstance(found, PlantEntry):
-        return found, ""
-    about = (found.__doc__ or name).strip().splitlines()[0]
-    entry = PlantEntry(found, about, has_sensors=True, has_faults=True, has_thrust_error=True, has_delay=True)
+    thing: Any = PLANTS.find(name)
+    if isinstance(thing, PlantEntry):
+        return thing, ""
+    about = (thing.__doc__ or name).strip().splitlines()[0]
+    entry = PlantEntry(thing, about, has_sensors=True, has_faults=True, has_thrust_error=True, has_delay=True)
     return entry, ""
 
 

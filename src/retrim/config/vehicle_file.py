@@ -143,7 +143,7 @@ class VehicleSpec:
         like = small() if kind == "3 inch" else kingfisher()
         scale = inches / (3.07 if kind == "3 inch" else 5.1)
         blade = like.propeller
-        scaling = dataclasses.replace(
+        propeller = dataclasses.replace(
             blade,
             radius=scale * blade.radius,
             chord_root=scale * blade.chord_root,
@@ -167,7 +167,7 @@ class VehicleSpec:
             thrust_coefficient=coefficient,
             torque_ratio=like.torque_ratio * scale,
             drag_area=drag,
-            propeller=scaling,
+            propeller=propeller,
             rate_lag=None if self.rate_lag is None else jnp.array(self.rate_lag),
             rate_damping=None if self.rate_damping is None else jnp.array(self.rate_damping),
             esc=dataclasses.replace(esc, base=esc.base * ratio, linear=esc.linear * ratio, root=esc.root * ratio),

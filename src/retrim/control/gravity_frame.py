@@ -91,10 +91,10 @@ class GravityFrame(AbstractController[GravityFrameState]):
         observer_state = self.observer.init(x)
         hover = observer_state.commands.newest
         command = Command(hover.c, hover.omega - self._bias(x.p.dtype))
-        rows = jax.tree.map(
+        commands = jax.tree.map(
             lambda leaf, new: jnp.broadcast_to(new, leaf.shape), observer_state.commands, CommandQueue(command)
         )
-        observer_state = dataclasses.replace(observer_state, commands=rows)
+        observer_state = dataclasses.replace(observer_state, commands=commands)
         return GravityFrameState(observer_state, self.inner.init(x), EffectiveGravityFrame.of(observer_state.d_hat))
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
@@ -106,13 +106,11 @@ class GravityFrame(AbstractController[GravityFrameState]):
             observer = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, unsteady))
             if self.place is not None:
                 there = x.p + (self.lead + self.age).astype(x.p.dtype) * x.v
-                disturbance = disturbance + self.trust_residual.astype(x.p.dtype) * (
-                    self.place(there) - self.place(x.p)
-                )
+                change = self.place(there) - self.place(x.p)
+                disturbance = disturbance + self.trust_residual.astype(x.p.dtype) * change
         observer_state = observer(memory.observer, t, x)
-        disturbance = self.trust_estimate.astype(x.p.dtype) * (observer_state.d_hat + disturbance) + self.steady.astype(
-            x.p.dtype
-        )
+        disturbance = self.trust_estimate.astype(x.p.dtype) * (observer_state.d_hat + disturbance)
+        disturbance = disturbance + self.steady.astype(x.p.dtype)
         frame = EffectiveGravityFrame.of(limit_norm(disturbance, observer.limit))
         bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
         acting, flying = Command(last.c, last.omega + bias), self.inner

@@ -80,8 +80,8 @@ class IndiController(AbstractController[IncrementalState]):
         soon, _ = self.prediction(memory.underway, x, -excess, self.omega)
         setpoint = self.task.setpoint(t + self.prediction.path.delay.astype(t.dtype))
         acceleration = self.gains.acceleration(soon, setpoint, jnp.zeros_like(x.p))
-        target = command_for(soon, thrust_of(acceleration) + excess, setpoint, self.gains.turning())
-        u = target.within(self.low, self.high)
+        command = command_for(soon, thrust_of(acceleration) + excess, setpoint, self.gains.turning())
+        u = command.within(self.low, self.high)
         return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess, t.astype(a.dtype))
 
     def accepted(self, memory: IncrementalState, u: Command) -> IncrementalState:

@@ -38,8 +38,8 @@ class LoraPolicy(eqx.Module):
         if len(self.delta) != len(self.base.layers):
             raise ValueError(f"LoRA: {len(self.delta)} deltas for {len(self.base.layers)} layers")
         for i, (layer, thin) in enumerate(zip(self.base.layers, self.delta, strict=True)):
-            shape, result = layer.weight.shape, (thin.up.shape[0], thin.down.shape[1])
-            if shape != result or thin.up.shape[1] != thin.down.shape[0]:
+            shape, product = layer.weight.shape, (thin.up.shape[0], thin.down.shape[1])
+            if shape != product or thin.up.shape[1] != thin.down.shape[0]:
                 raise ValueError(f"LoRA: layer {i} has weights {shape}, the delta {thin.up.shape} x {thin.down.shape}")
 
     @classmethod

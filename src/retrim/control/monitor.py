@@ -117,17 +117,17 @@ class Monitor(AbstractController[MonitorState]):
 
     def __call__(self, memory: MonitorState, t: Float[Array, ""], x: State) -> tuple[Command, MonitorState]:
         """Return the command for the present stage, and test the stage."""
-        flies_adapted, observes = memory.stage == Stage.ADAPTED, memory.stage <= Stage.OBSERVED
+        is_adapted, observes = memory.stage == Stage.ADAPTED, memory.stage <= Stage.OBSERVED
         slow = memory.stage == Stage.SLOW
         flying = dataclasses.replace(
             self.frame,
             inner=NearTarget(
-                dataclasses.replace(self._inner, policy=where(flies_adapted, self._inner.policy, memory.base)),
+                dataclasses.replace(self._inner, policy=where(is_adapted, self._inner.policy, memory.base)),
                 self.task,
                 self._reach(memory),
             ),
             trust_estimate=observes.astype(x.p.dtype) * self._trust(memory, t),
-            trust_residual=flies_adapted.astype(x.p.dtype),
+            trust_residual=is_adapted.astype(x.p.dtype),
             steady=slow.astype(x.p.dtype) * memory.d,
         )
         u, flight = flying(memory.flight, t, x)
@@ -135,8 +135,8 @@ class Monitor(AbstractController[MonitorState]):
 
     def accepted(self, memory: MonitorState, u: Command) -> MonitorState:
         """Remember the accepted command."""
-        flies_adapted = (memory.stage == Stage.ADAPTED).astype(u.c.dtype)
-        frame = dataclasses.replace(self.frame, trust_residual=flies_adapted)
+        trust = (memory.stage == Stage.ADAPTED).astype(u.c.dtype)
+        frame = dataclasses.replace(self.frame, trust_residual=trust)
         return dataclasses.replace(memory, flight=frame.accepted(memory.flight, u))
 
     def condition(self, memory: MonitorState) -> Condition:
@@ -177,13 +177,13 @@ class Monitor(AbstractController[MonitorState]):
         worse = over & (excess > MARGIN)
         strikes = jnp.where(over, jnp.where(worse, s.strikes + 1, 0), s.strikes)
         strikes = jnp.where(over & (excess > FAR), STRIKES, strikes)
-        failures = (strikes >= STRIKES) & (s.stage < Stage.BASE)
+        fails = (strikes >= STRIKES) & (s.stage < Stage.BASE)
         swung = swings.size > SWINGS
         wait = jnp.maximum(s.wait - dt, 0.0)
-        returns = over & ~worse & ~failures & (wait <= 0.0) & (s.stage > s.best)
-        stage = s.stage + failures.astype(s.stage.dtype) - returns.astype(s.stage.dtype)
-        changes = failures | returns
-        cause = jnp.where(failures, Cause.ERROR, jnp.where(returns, Cause.RECOVERY, s.cause))
+        returns = over & ~worse & ~fails & (wait <= 0.0) & (s.stage > s.best)
+        stage = s.stage + fails.astype(s.stage.dtype) - returns.astype(s.stage.dtype)
+        changes_stage = fails | returns
+        cause = jnp.where(fails, Cause.ERROR, jnp.where(returns, Cause.RECOVERY, s.cause))
         cause = jnp.where(swung & (s.stage < Stage.BASE), Cause.OSCILLATION, cause)
         best = jnp.where(s.stage < Stage.SLOW, Stage.SLOW, Stage.BASE)
         calm = Swings.none(d_hat)
@@ -198,9 +198,9 @@ class Monitor(AbstractController[MonitorState]):
             twin=Twin(
                 twin.x, twin.memory, jnp.where(over, 0.0, twin.excess), jnp.where(over, 0, twin.ticks), twin.path
             ),
-            strikes=jnp.where(changes | swung, 0, strikes),
-            wait=jnp.where(changes | swung, s.hold, wait),
-            hold=jnp.where(failures, 2.0 * s.hold, s.hold),
+            strikes=jnp.where(changes_stage | swung, 0, strikes),
+            wait=jnp.where(changes_stage | swung, s.hold, wait),
+            hold=jnp.where(fails, 2.0 * s.hold, s.hold),
         )
 
     def _step(self, s: MonitorState, t: Float[Array, ""], x: State) -> Twin:

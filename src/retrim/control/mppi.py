@@ -133,14 +133,14 @@ class MppiController(AbstractController[MppiState]):
 
         def tick(carry: Any, plan: tuple[Array, Point]) -> tuple[Any, None]:
             p, R, v, u, cost = carry
-            commands, goal = plan
+            commands, setpoint = plan
             mean, u = apply_lag(u, commands, dt, tau)
             before, R = R, _turn(R, dt * mean[1:])
             a = 0.5 * (before[:, 2] + R[:, 2]) * mean[:1] + pull[:, None]
             p, v = p + dt * v + 0.5 * dt**2 * a, v + dt * a
-            away = jnp.sqrt(jnp.sum((p - goal.p[:, None]) ** 2, axis=0) + 1e-12)
-            apart = jnp.sqrt(jnp.sum((v - goal.v[:, None]) ** 2, axis=0) + 1e-12)
-            heading = so3.rotz(goal.heading)
+            away = jnp.sqrt(jnp.sum((p - setpoint.p[:, None]) ** 2, axis=0) + 1e-12)
+            apart = jnp.sqrt(jnp.sum((v - setpoint.v[:, None]) ** 2, axis=0) + 1e-12)
+            heading = so3.rotz(setpoint.heading)
             askew = 0.25 * (3.0 - jnp.sum(heading[:, :, None] * R, axis=(0, 1)))
             weights = (self.position_cost, self.velocity_cost, self.attitude_cost)
             terms = zip(weights, (away, apart, askew), strict=True)

@@ -55,27 +55,25 @@ class PoseFilteredController(AbstractController[PoseFilteredState]):
 
     def init(self, x: State) -> PoseFilteredState:
         """Return the memory at the start of a flight; the filter starts near the state, not exactly at it."""
-        memory_of_poses = self.observation.init(x)
-        return PoseFilteredState(
-            memory_of_poses, self.inner.init(self._estimate(memory_of_poses)), Command.hover(x.p.dtype)
-        )
+        poses = self.observation.init(x)
+        return PoseFilteredState(poses, self.inner.init(self._estimate(poses)), Command.hover(x.p.dtype))
 
     def __call__(self, memory: PoseFilteredState, t: Float[Array, ""], x: State) -> tuple[Command, PoseFilteredState]:
         """Return the command for the estimated pose; the state only defines the poses of camera and inertial unit."""
-        _, memory_of_poses = self.observation(memory.observation, t, x, memory.last)
-        here, controller = self._estimate(memory_of_poses), self.inner
+        _, poses = self.observation(memory.observation, t, x, memory.last)
+        here, controller = self._estimate(poses), self.inner
         if self.omega is not None and self.a is not None:
             gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
             specific_force = so3.act(x.R.T, self.a - gravity)  # as an accelerometer measures it, in the body frame
             controller = controller.with_inertial(self.omega, so3.act(here.R, specific_force) + gravity)
         u, inner = controller(memory.inner, t, here)
-        return u, PoseFilteredState(memory_of_poses, inner, u)
+        return u, PoseFilteredState(poses, inner, u)
 
     def accepted(self, memory: PoseFilteredState, u: Command) -> PoseFilteredState:
         """Remember the accepted command, here and in the inner controller."""
         return PoseFilteredState(memory.observation, self.inner.accepted(memory.inner, u), u)
 
-    def _estimate(self, memory_of_poses: Any) -> State:
+    def _estimate(self, poses: Any) -> State:
         estimator = self.observation.state_estimator
         assert estimator is not None
-        return estimator(memory_of_poses).x
+        return estimator(poses).x

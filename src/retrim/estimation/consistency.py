@@ -167,10 +167,12 @@ class Consistency(eqx.Module):
         moving = jax.tree.map(lambda old, new: old + dt / SCALE_TAU * (new - old), self.scale, Scale.of(missing, v, dt))
         scale = where(successive & possible & self.possible, moving, self.scale)
         shows, wrong = scale.verdict(dt, self.noise)
-        scaling = jnp.where(shows, wrong, self.scaled)
-        certain = possible & self.possible & ~scaling
+        has_wrong_scale = jnp.where(shows, wrong, self.scaled)
+        certain = possible & self.possible & ~has_wrong_scale
         doubt = self.doubt + dt / DOUBT_TAU * (jnp.where(certain, 0.0, 1.0) - self.doubt)
         new = jnp.minimum(gap_noise(self.gap, missing), NOISE_LIMIT)
         noise = self.noise + (1.0 - jnp.exp(-dt / NOISE_TAU)) * (new - self.noise)
         noise = jnp.where(successive & possible & self.possible, noise, self.noise)
-        return Consistency(missing, noise, scale, scaling, successive & result.repeated, possible, certain, doubt)
+        return Consistency(
+            missing, noise, scale, has_wrong_scale, successive & result.repeated, possible, certain, doubt
+        )

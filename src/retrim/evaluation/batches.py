@@ -10,7 +10,7 @@ import jax
 from ..runkit.flights import FlightSpec
 from ..runkit.provenance import cores
 
-FULL, LARGE = 64, 2048  # largest number of flights in one program: on a CPU, on an accelerator
+CPU_LIMIT, ACCELERATOR_LIMIT = 64, 2048  # largest number of flights in one program: on a CPU, on an accelerator
 SMALL = 2  # smallest batch; Python steps a single flight, which uses only one core
 
 
@@ -58,7 +58,7 @@ def _parts(group: list[FlightSpec], size: int) -> list[list[FlightSpec]]:
 
 def largest() -> int:
     """Return the largest number of flights in one program, on all devices together."""
-    return (FULL if jax.default_backend() == "cpu" else LARGE) * jax.device_count()
+    return (CPU_LIMIT if jax.default_backend() == "cpu" else ACCELERATOR_LIMIT) * jax.device_count()
 
 
 def lanes() -> int:

@@ -28,8 +28,8 @@ def figure_cells(row: Mapping[str, Any]) -> tuple[str, str, str]:
     error = with_counts(row, _mean_and_deviation(row["mean"], row["std"]))
     if row["mean"] is None:
         return error, "-", "-"
-    has_settled = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
-    return error, millimetres(row["peak_after_5s"]), has_settled
+    settling = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
+    return error, millimetres(row["peak_after_5s"]), settling
 
 
 def millimetres(value: float | None) -> str:
@@ -38,14 +38,14 @@ def millimetres(value: float | None) -> str:
     Args:
         value: The error [m]; None for an infinite one.
     """
-    return "-" if value is None else _shown(1000 * value, _digits(1000 * value))
+    return "-" if value is None else _format(1000 * value, _digits(1000 * value))
 
 
 def _mean_and_deviation(mean: float | None, deviation: float | None) -> str:
     if mean is None:
         return ""
     digits = _digits(1000 * mean)
-    text = _shown(1000 * mean, digits)
+    text = _format(1000 * mean, digits)
     return text if deviation is None or text.startswith("<") else f"{text} ± {1000 * deviation:.{digits}f}"
 
 
@@ -54,6 +54,6 @@ def _digits(value: float) -> int:
     return 0 if value >= 100 else 1 if value >= 1 else 3
 
 
-def _shown(value: float, digits: int) -> str:
+def _format(value: float, digits: int) -> str:
     least = 10.0**-digits
     return f"{value:.{digits}f}" if value >= 0.5 * least else f"< {least:.{digits}f}"

@@ -35,7 +35,7 @@ EFFORT = ("rates_rms", "rates_change_rms")
 
 def record(flight: Flight) -> dict[str, Any]:
     """Return one flight's figures; the errors of a terminated flight are None."""
-    spec, crashes = flight.spec, flight.log.terminated
+    spec, has_crashed = flight.spec, flight.log.terminated
     effort = flight.effort if find_method(spec.method).on_board is None else (np.nan, np.nan)  # no rates are commanded
     behind, aligned_error = flight.behind or (None, None)
     scenario = spec.scenario
@@ -52,15 +52,15 @@ def record(flight: Flight) -> dict[str, Any]:
         "seed": spec.seed,
         "start": spec.start,
         "metric": flight.metric,
-        "error": None if crashes else flight.steady,
+        "error": None if has_crashed else flight.steady,
         "peak_after_5s": _finite(flight.peak),
         "settle_s": _finite(flight.settle_s),
-        "cross_track_m": None if crashes else flight.cross_track,
+        "cross_track_m": None if has_crashed else flight.cross_track,
         "behind_s": behind,
         "unshifted_m": aligned_error,
         "rates_rms": _finite(effort[0]),
         "rates_change_rms": _finite(effort[1]),
-        "crashed": crashes,
+        "crashed": has_crashed,
         "failed": None,
     }
 

@@ -106,7 +106,7 @@ def load_learner_state(path: str | Path, *, trust: Collection[str] = ()) -> tupl
     check_size(state, source=str(path), largest=MOST)
     check_policy(state.policy.policy.merged(), source=str(path), observation=np.asarray(_observe_at_rest(setup)))
     if not np.isfinite(np.asarray(_command_at_rest(setup.controller(state), setup.flight_task.home()))).all():
-        raise CheckpointError(f"{path}: its command at hover is not finite; what was learnt cannot be flown")
+        raise CheckpointError(f"{path}: its command at hover is not finite; the learner state cannot be flown")
     return state, setup.preset
 
 
@@ -143,9 +143,7 @@ def _setup(header: dict[str, str], sizes: str, source: str, trust: Collection[st
         raise CheckpointError(str(error)) from error
     if absent := missing_defaults(preset, header["preset"]):
         defaults = ", ".join(f"{name} = {value!r}" for name, value in absent.items())
-        LOG.warning(
-            one_line(f"{source}: written by an earlier release; defaults are taken for what it lacks: {defaults}")
-        )
+        LOG.warning(one_line(f"{source}: written by an earlier release; missing keys have their defaults: {defaults}"))
     expected = "-".join(map(str, (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)))
     if preset.pretrain.network != "mlp":
         expected = architecture(_shapes(setup))

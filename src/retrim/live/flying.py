@@ -56,7 +56,7 @@ class LiveFlight(NamedTuple):
 
 
 def fly_live(
-    request: LiveRequest, run: Run, reporter: Reporter, display: Display, opened: Callable[[str], None]
+    request: LiveRequest, run: Run, reporter: Reporter, display: Display, on_page: Callable[[str], None]
 ) -> LiveFlight | None:
     """Fly, and write the output files.
 
@@ -65,7 +65,7 @@ def fly_live(
         run: Run with the flight's folder and the interruption flag.
         reporter: Reporter that receives messages before take-off and at the end.
         display: Display of the flight.
-        opened: Function that is called with the page's address when the page is ready.
+        on_page: Function that is called with the page's address when the page is ready.
 
     Returns:
         The flight; None if it was interrupted before take-off.
@@ -86,7 +86,7 @@ def fly_live(
                 return None
             page = supervisor.spec.page
             if request.page is not None and page is not None and supervisor.page_port is not None:
-                opened(page_url(request.page[0], supervisor.page_port, page.token))
+                on_page(page_url(request.page[0], supervisor.page_port, page.token))
             show = screen.enter_context(display(events))
             with closing(OperatorRequests(request, supervisor)) as wishes:
                 status = watch_flight(supervisor, request.seconds, events, show, run.stop, wishes)
@@ -112,12 +112,12 @@ def _write(
         flight, rows = flight_of(request, events.all, status, state, log)
     except (PlantError, OSError):
         if state is not None:
-            outlet.write("what was learnt", partial(write_state, state, preset))
+            outlet.write("the learner state", partial(write_state, state, preset))
         raise
     outlet.faults += missing(rows, status, preset.dt)
     if log.parent != run.folder:
         outlet.faults.append(status.log_moved or f"flight.csv cannot be written to {run.folder}; it is in {log.parent}")
-    outlet.write("what was learnt", partial(write_learner_state, [flight], preset))
+    outlet.write("the learner state", partial(write_learner_state, [flight], preset))
     outlet.write("events.jsonl", partial(write_events, [flight]))
     recording_path = _record(request, rows, events, outlet)
     result = results(request, flight, rows, status, events)

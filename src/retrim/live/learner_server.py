@@ -27,7 +27,7 @@ from .processes.learner import LearnerPlan
 from .roles import ROLES
 
 IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before the flight
-BEAT_EVERY = TOLD_EVERY = 0.25  # [s]
+BEAT_EVERY = REPORT_EVERY = 0.25  # [s]
 SILENCE = 5.0  # [s] without a status from the flight, after which the silence is reported
 STARTING, ATTEMPTS = 300.0, 5  # [s] for a learner to compile and send its first heartbeat; restarts per learner
 
@@ -265,7 +265,7 @@ def learn_for(
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
         flights = {pool.submit(_serve, ground, stands, stop): ground for ground in grounds}
         try:
-            while (now := wait(flights, TOLD_EVERY)).not_done:
+            while (now := wait(flights, REPORT_EVERY)).not_done:
                 for flight in now.done:  # report a failure immediately, since the other flights may last long
                     if (error := flight.exception()) is not None:
                         stands[flights[flight]] = f"failed: {error!r}"

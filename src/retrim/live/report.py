@@ -85,8 +85,8 @@ def results(
     changes = change_times(scenario.disturbance, request.setup.flight_task.home(), end)
     # The log may lack the state at the crash.
     is_lost = (status.end_reason or "").startswith((CRASHED, STOPPED)) and status.control.get("reason") != "landing"
-    crashes = log.terminated or is_lost
-    back = recoveries(log.t, flight.error, changes, 0.05, terminated=crashes)
+    has_crashed = log.terminated or is_lost
+    back = recoveries(log.t, flight.error, changes, 0.05, terminated=has_crashed)
     control_rows = rows if is_lost else rows[rows[:, 1] <= end]
     by = {name: summary(control_rows[is_from_control(control_rows), column]) for name, column in ACCOUNTS.items()}
     policies = [swap for swap in events.swaps if swap[1] == "policy" and swap[0] <= end]
@@ -97,7 +97,7 @@ def results(
         **{f"{name}_{q}_ms": by[name][q] for name in ("lateness", "step", "idle") for q in ("p50", "p99", "max")},
         "state_age_p99_ms": by["state_age"]["p99"],
         "policy_age_p50_s": None if by["policy_age"]["p50"] is None else 1e-3 * by["policy_age"]["p50"],
-        "steady": None if crashes else flight.steady,
+        "steady": None if has_crashed else flight.steady,
         "recovery_5cm": float(np.mean(back)),
         "policies": len(policies),
         "flight_to_swap_s": float(np.median([swap[3] for swap in policies])) if policies else None,
@@ -110,7 +110,7 @@ def results(
         "fallback_ticks": int(np.sum(control_rows[:, -1] != Mode.POLICY)),
     }
     about = {"scenario": scenario.disturbance, "method": request.method, "plant": scenario.plant, "n": 1,
-             "crashes": int(crashes)}  # fmt: skip
+             "crashes": int(has_crashed)}  # fmt: skip
     return [{**about, "metric": metric, "value": _finite(value)} for metric, value in values.items()]
 
 

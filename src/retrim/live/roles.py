@@ -50,11 +50,11 @@ class Role:
     """Main function of the process, as ``module:name``."""
     build: Callable[[RoleRequest], Any]
     """Function that builds the start parameters of the process."""
-    needed: Callable[[LiveSpec], bool] = lambda spec: True
+    is_needed: Callable[[LiveSpec], bool] = lambda spec: True
     """Function that returns whether a flight has this process."""
     priority: int = 0
     """Real-time priority; 0 for a process that runs on other cores than the real-time processes."""
-    restarted: bool = True
+    restarts: bool = True
     """Whether the process sends heartbeats and is restarted when it dies or hangs."""
 
     def plan(self, request: RoleRequest) -> Any:
@@ -113,8 +113,8 @@ def _learns_here(layer: Layer, spec: LiveSpec) -> bool:
 
 
 ROLES: Mapping[str, Role] = {
-    "control": Role("retrim.onboard.control_process:fly", _control, priority=30, restarted=False),
-    "plant": Role("retrim.live.processes.plant:simulate", _plant, priority=20, restarted=False),
+    "control": Role("retrim.onboard.control_process:fly", _control, priority=30, restarts=False),
+    "plant": Role("retrim.live.processes.plant:simulate", _plant, priority=20, restarts=False),
     "residual": Role(
         "retrim.live.processes.learner:learn", partial(_learner, "residual"), partial(_learns_here, "residual")
     ),

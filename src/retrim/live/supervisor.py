@@ -99,7 +99,7 @@ class Supervisor:
         if self._remote is not None:
             self._remote.announce(self.start)
         for name, role in ROLES.items():
-            if role.needed(self.spec):
+            if role.is_needed(self.spec):
                 self._start(name)
         while waiting := self._not_ready():
             self._check_alive()
@@ -176,7 +176,7 @@ class Supervisor:
             self._end_hanging()
             for role, process in self.processes.items():
                 has_failed = process.poll() not in (None, 0)  # a regular exit means that the flight is over
-                if ROLES[role].restarted and has_failed and self.restarts.get(role, 0) < ATTEMPTS:
+                if ROLES[role].restarts and has_failed and self.restarts.get(role, 0) < ATTEMPTS:
                     self._restart(role)
             if self.processes["plant"].poll() is not None:
                 reason = self._lost_plant()
@@ -189,14 +189,11 @@ class Supervisor:
         t, fallback = time.monotonic() - self.epoch, self.bus.latest("fallback")
         by_watchdog = last_send_time(self.bus, "fallback") > last_send_time(self.bus, "setpoint")
         ticks = 0 if fallback is None else fallback.version
-        lines, stalls, fit = (
-            self._rejections(),
-            last_note(self.bus, "stalls"),
-            last_note(self.bus, "learner.residual"),
-        )
+        stalls, fit = last_note(self.bus, "stalls"), last_note(self.bus, "learner.residual")
         return Status(
-            t, control, world, alive, dict(self.restarts), reason, lines, by_watchdog, ticks, log.get("failed"), stalls,
-            self._notes.look(), self._notes.count, fit.get("excluded", []), dict(self.hangs), self._log_location,
+            t, control, world, alive, dict(self.restarts), reason, self._rejections(), by_watchdog, ticks,
+            log.get("failed"), stalls, self._notes.look(), self._notes.count, fit.get("excluded", []),
+            dict(self.hangs), self._log_location,
             ticks_of(self.bus), last_note(self.bus, "identified").get("reports", []),
         )  # fmt: skip
 
@@ -239,8 +236,8 @@ class Supervisor:
 
     def _lost_plant(self) -> str:
         """Return the reason for the end of a flight whose plant process has ended."""
-        if lines := last_note(self.bus, "ended").get("reason"):
-            return str(lines)
+        if reason := last_note(self.bus, "ended").get("reason"):
+            return str(reason)
         if "plant" in self.hangs:
             flies_on = self.spec.scenario.entry.is_vehicle
             what = "left to its autopilot" if flies_on else STOPPED
@@ -277,8 +274,8 @@ class Supervisor:
                 continue
             self._report_versions[layer] = message.version
             with contextlib.suppress(MessageError, KeyError, ValueError, TypeError):
-                lines = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
-                result.append(f"{layer}: {plain(str(lines['reason']))}")
+                content = json.loads(describe(message.data, kind="rejected", source=layer)["update"])
+                result.append(f"{layer}: {plain(str(content['reason']))}")
         return result
 
     def _start(self, role: str) -> None:

@@ -15,7 +15,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
     rows = 8 * len(COLUMNS) * spec.window + 10_000
     # Leave room for a policy with its optimiser's moments, even if the current method learns only a low-rank delta.
     state_size = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
-    beating = [name for name, role in ROLES.items() if role.restarted]
+    beating = [name for name, role in ROLES.items() if role.restarts]
     return (
         dict.fromkeys(SMALL, 4096)
         | {"status": 65536, "stalls": 16384, "flight": rows, "fallback.flight": rows}

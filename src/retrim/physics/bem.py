@@ -105,13 +105,13 @@ class BemQuadrotor(AbstractSubstepDynamics[BemState]):
     def substep(self, s: BemState, u: Command, effects: ExternalEffects) -> BemState:
         """Advance one millisecond under constant loads."""
         vehicle, b = self.vehicle, s.body
-        speeds, integral, wanted_slow = self.loop(vehicle, b, u)
+        speeds, integral, slow_setpoint = self.loop(vehicle, b, u)
         motors = speeds + (b.motors - speeds) * jnp.exp(-SUBSTEP / vehicle.motor_tau)
         blades, inflow = self.rotors(b, motors, s.inflow, effects.wind)
         loads = self.loads(b, motors, blades, effects)
         mass, inertia = vehicle.mass + effects.mass, vehicle.inertia + effects.inertia
         torque = loads.torque - jnp.cross(effects.moment / mass, loads.force)
-        body = rigid_body(b, motors, integral, loads.force, torque, mass, inertia, effects.push, wanted_slow)
+        body = rigid_body(b, motors, integral, loads.force, torque, mass, inertia, effects.push, slow_setpoint)
         return BemState(body, inflow)
 
     def rotors(

@@ -54,10 +54,10 @@ class Betaflight(eqx.Module):
         result, power = cls.of(thrust_map), authority(vehicle, coefficient)
         plain = result.gains(power)
         keep, own = is_damped(plain, power.lead, vehicle.motor_tau), tune(plain, vehicle.motor_tau)
-        scaling = (own.a / P_SCALE, own.i / I_SCALE, own.b / D_SCALE)
+        own_settings = (own.a / P_SCALE, own.i / I_SCALE, own.b / D_SCALE)
         kp, ki, kd = (
             jnp.where(keep, old, new / power.alpha)
-            for old, new in zip((result.kp, result.ki, result.kd), scaling, strict=True)
+            for old, new in zip((result.kp, result.ki, result.kd), own_settings, strict=True)
         )
         return dataclasses.replace(result, kp=kp, ki=ki, kd=kd)
 
@@ -80,9 +80,9 @@ class Betaflight(eqx.Module):
         relaxation = jnp.maximum(0.0, 1.0 - jnp.abs(setpoint - s.slow_setpoint) / RELAX_RATE)
         new_integral = s.integral + SUBSTEP * error * relaxation
         integral = jnp.clip(new_integral, -self.integral_max, self.integral_max)
-        wanted_slow = setpoint + (s.slow_setpoint - setpoint) * jnp.exp(-2.0 * jnp.pi * RELAX_CUTOFF * SUBSTEP)
+        slow_setpoint = setpoint + (s.slow_setpoint - setpoint) * jnp.exp(-2.0 * jnp.pi * RELAX_CUTOFF * SUBSTEP)
         turn = P_SCALE * self.kp * error + I_SCALE * self.ki * integral - D_SCALE * self.kd * s.omega_dot
         thrust = vehicle.mass * jnp.clip(u.c, low.c, high.c)
         throttle = vehicle.esc.throttle(jnp.sqrt(thrust / (4.0 * self.thrust_map)))
         motor_outputs = jnp.clip(throttle + signs(turn.dtype).T @ turn, vehicle.esc.idle, 1.0)
-        return jnp.clip(vehicle.esc.speed(motor_outputs), vehicle.motor_min, vehicle.motor_max), integral, wanted_slow
+        return jnp.clip(vehicle.esc.speed(motor_outputs), vehicle.motor_min, vehicle.motor_max), integral, slow_setpoint

@@ -112,11 +112,11 @@ class LinearDragQuadrotor(AbstractSubstepDynamics[RotorState]):
         integral = jnp.clip(s.integral + SUBSTEP * error, -loop.integral_max, loop.integral_max)
         angular_acceleration = loop.kp * error + loop.ki * integral - loop.kd * s.omega_dot
         torque = vehicle.inertia * angular_acceleration + jnp.cross(s.omega, vehicle.inertia * s.omega)
-        thrusts = self.mixed(vehicle.mass * jnp.clip(u.c, low.c, high.c), torque)
+        thrusts = self.mix(vehicle.mass * jnp.clip(u.c, low.c, high.c), torque)
         idle = vehicle.thrust_coefficient * vehicle.motor_min**2
         return jnp.sqrt(jnp.clip(thrusts, idle, vehicle.thrust_max / 4.0) / vehicle.thrust_coefficient), integral
 
-    def mixed(self, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
+    def mix(self, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
         """Return the thrust of each rotor [N] for the collective ``thrust`` [N] and the ``torque`` [Nm]."""
         arm, kappa = self.vehicle.arm, self.vehicle.torque_ratio
         levers = jnp.stack([arm[1], arm[0], kappa])

@@ -94,7 +94,7 @@ def rigid_body(
     mass: Float[Array, ""],
     inertia: Float[Array, "3"],
     push: Float[Array, "3"],
-    wanted_slow: Float[Array, "3"] | None = None,
+    slow_setpoint: Float[Array, "3"] | None = None,
 ) -> RotorState:
     """Advance by one semi-implicit step of a millisecond under the body-frame ``force`` [N] and ``torque`` [Nm].
 
@@ -106,4 +106,5 @@ def rigid_body(
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=s.x.p.dtype)
     a = s.x.R @ force / mass + gravity + push
     x = State(s.x.p + h * s.x.v + 0.5 * h**2 * a, s.x.R @ so3.exp(h * omega), s.x.v + h * a)
-    return RotorState(x, omega, motors, integral, omega_dot, s.slow_setpoint if wanted_slow is None else wanted_slow)
+    slow = s.slow_setpoint if slow_setpoint is None else slow_setpoint
+    return RotorState(x, omega, motors, integral, omega_dot, slow)

@@ -30,9 +30,9 @@ class AdaptationResult(NamedTuple):
     """Result of adapting to a log."""
 
     state: LearnerState
-    admitted: int
+    admissions: int
     """Number of updates that the gate has admitted."""
-    tried: int
+    attempts: int
     before: float
     """The policy's error before the adaptation, in the corrected model [m]."""
     after: float

@@ -58,8 +58,8 @@ class Sums(NamedTuple):
         """
         xx, xy = np.einsum("dlbij,b->dlij", self.xx, draw), np.einsum("dlbi,b->dli", self.xy, draw)
         size = np.sqrt(np.einsum("dlii->dli", xx) + 1e-12)
-        scaling = xx / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(xx.shape[-1])
-        theta = np.linalg.solve(scaling, (xy / size)[..., None])[..., 0] / size
+        scaled_xx = xx / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(xx.shape[-1])
+        theta = np.linalg.solve(scaled_xx, (xy / size)[..., None])[..., 0] / size
         left = np.maximum(self.yy @ draw - np.einsum("dli,dli->dl", theta, xy), 1e-12)
         count = self.n @ draw
         return count * np.log(left / count), theta

@@ -91,33 +91,33 @@ def identify(log: FlightLog, *, seed: int = 0) -> IdentifiedVehicle:
     rates = {} if log.command is None else {
         name: _rates(log, log.command, blocks, axes) for name, axes in (("rates", [0, 1]), ("yaw", [2]))
     }  # fmt: skip
-    significant = {name: channel for name, channel in {"thrust": thrust, **rates}.items() if channel.is_significant()}
+    channels = {name: channel for name, channel in {"thrust": thrust, **rates}.items() if channel.is_significant()}
     random = np.random.default_rng(seed)
-    samples = [random.integers(0, len(blocks), len(blocks)) for _ in range(DRAWS)]
-    draws = [np.ones(len(blocks)), *(np.bincount(draw, minlength=len(blocks)).astype(float) for draw in samples)]
-    result = [_solve(significant, thrust, draw) for draw in draws]
+    resamples = [random.integers(0, len(blocks), len(blocks)) for _ in range(DRAWS)]
+    draws = [np.ones(len(blocks)), *(np.bincount(draw, minlength=len(blocks)).astype(float) for draw in resamples)]
+    solutions = [_solve(channels, thrust, draw) for draw in draws]
 
-    for each in result:
+    for each in solutions:
         each["full"] = each["thrust gain"] * (log.full_thrust or 0.0) + each["offset"]
 
     def of(name: str, is_known: bool) -> Estimate | None:
-        values = [each[name] for each in result] if is_known else []
+        values = [each[name] for each in solutions] if is_known else []
         return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], INSIDE))) if is_known else None
 
     speeds = np.sqrt(np.mean(np.einsum("nji,nj->ni", log.R, log.v)[log.valid] ** 2, axis=0))
     x, y, z = (
-        of(f"drag {axis}", bool(significant) and bool(fast > SLOW)) for axis, fast in zip("xyz", speeds, strict=True)
+        of(f"drag {axis}", bool(channels) and bool(fast > SLOW)) for axis, fast in zip("xyz", speeds, strict=True)
     )
-    lift, turn, yaw = (name in significant for name in ("thrust", "rates", "yaw"))
-    batch_result = IdentifiedVehicle(
-        of("delay", bool(significant)), of("thrust gain", lift), of("offset", lift),
+    lift, turn, yaw = (name in channels for name in ("thrust", "rates", "yaw"))
+    vehicle = IdentifiedVehicle(
+        of("delay", bool(channels)), of("thrust gain", lift), of("offset", lift),
         of("full", lift and log.full_thrust is not None), of("thrust lag", lift), of("rates lag", turn),
-        of("rates gain", turn), of("yaw lag", yaw), of("yaw gain", yaw), (x, y, z), result[0]["left"],
+        of("rates gain", turn), of("yaw lag", yaw), of("yaw gain", yaw), (x, y, z), solutions[0]["left"],
     )  # fmt: skip
-    return _with_path(batch_result, path_of_log(log)) if turn else batch_result
+    return _with_path(vehicle, path_of_log(log)) if turn else vehicle
 
 
-def _with_path(result: IdentifiedVehicle, path: PathEstimate) -> IdentifiedVehicle:
+def _with_path(vehicle: IdentifiedVehicle, path: PathEstimate) -> IdentifiedVehicle:
     """Return the identified vehicle, with the in-flight estimator's delay and lags where they are excited.
 
     That estimator models the damping and the noise of differences, but a vehicle file has a first-order lag. The delay
@@ -125,25 +125,26 @@ def _with_path(result: IdentifiedVehicle, path: PathEstimate) -> IdentifiedVehic
     regression, because they must be estimated together with the offset and all three drag coefficients.
     """
     if not (bool(path.delay.excited) and bool(path.rate_lag.excited)):
-        return result
+        return vehicle
     delay, lag = (float(x) for x in path.first_order())
     longer, share = delay - float(path.delay.mean), lag / float(path.rate_lag.mean)
-    yaw, thrust = result.yaw_lag, result.thrust_lag
+    yaw, thrust = vehicle.yaw_lag, vehicle.thrust_lag
     if yaw is not None and bool(path.yaw_lag.excited):
         yaw = _scale(path.yaw_lag)
     if thrust is not None and bool(path.thrust_lag.excited):
         thrust = _scale(path.thrust_lag)
     ends = (max(0.0, float(end) + longer) for end in (path.delay.mean, path.delay.low, path.delay.high))
-    return replace(result, delay=Estimate(*ends), rate_lag=_scale(path.rate_lag, share), yaw_lag=yaw, thrust_lag=thrust)
+    rate_lag = _scale(path.rate_lag, share)
+    return replace(vehicle, delay=Estimate(*ends), rate_lag=rate_lag, yaw_lag=yaw, thrust_lag=thrust)
 
 
 def _scale(each: PathParameter, scale: float = 1.0) -> Estimate:
     return Estimate(*(scale * float(end) for end in (each.mean, each.low, each.high)))
 
 
-def _solve(significant: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:
+def _solve(channels: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> dict[str, float]:
     """Return the common delay, and each channel's lag and parameters, interpolated on the grid."""
-    fits = {name: channel.sums.fit(draw) for name, channel in significant.items()}
+    fits = {name: channel.sums.fit(draw) for name, channel in channels.items()}
     late = np.sum([misfit.min(axis=1) for misfit, _ in fits.values()], axis=0) if fits else np.zeros(len(DELAYS))
     d = int(np.argmin(late))
     result = {"delay": lowest(DELAYS, late, d)}
@@ -192,13 +193,13 @@ def _rates(log: FlightLog, command: np.ndarray, blocks: np.ndarray, axes: list[i
     """Return the channel for some axes: omega = k omega_cmd + bias, over each tick; the axes share the lag and gain."""
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
-    rotation = Rotation.from_matrix(np.swapaxes(log.R[:-1], 1, 2) @ log.R[1:]).as_rotvec() / log.dt
-    bias = np.broadcast_to(np.eye(len(axes)), (len(rotation), len(axes), len(axes)))
+    omega = Rotation.from_matrix(np.swapaxes(log.R[:-1], 1, 2) @ log.R[1:]).as_rotvec() / log.dt
+    bias = np.broadcast_to(np.eye(len(axes)), (len(omega), len(axes), len(axes)))
 
-    def features(significant: np.ndarray) -> np.ndarray:
-        return np.concatenate([significant[:, :, None], bias], axis=2)
+    def features(acting: np.ndarray) -> np.ndarray:
+        return np.concatenate([acting[:, :, None], bias], axis=2)
 
-    samples = command[:, axes]
+    commands = command[:, axes]
     return Channel.of(
-        features, lambda delay, lag: acting_commands(samples, log.dt, delay, lag)[:-1], rotation[:, axes], blocks
+        features, lambda delay, lag: acting_commands(commands, log.dt, delay, lag)[:-1], omega[:, axes], blocks
     )

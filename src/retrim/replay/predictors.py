@@ -55,7 +55,7 @@ def _inputs(rows: Targets) -> np.ndarray:
     return np.concatenate([np.asarray(column, dtype=float) for column in columns], axis=1)
 
 
-class Learnt:
+class LearningPredictor:
     """A residual model; each fit starts from the result of the previous one, as in flight."""
 
     def __init__(self, model: ResidualModel, seed: int) -> None:
@@ -107,4 +107,4 @@ def model_factory(name: str, preset: Preset, vehicle: Vehicle, seed: int, **adap
         ConfigError: There is no model with that name, or a value is invalid.
     """
     model = make_residual(ResidualRequest(changed(preset, adapt={"residual": name, **adapt}), vehicle))
-    return lambda: Learnt(model, seed)
+    return lambda: LearningPredictor(model, seed)

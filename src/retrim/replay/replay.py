@@ -121,7 +121,7 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
     document.more["agreement"] = dict(log.agreement)
     document.add(agreement_section(log))
     document.add(residual_section(log, rows))
-    result = _foretold(request, protocol, setup, log, rows, reporter, run)
+    result = _score_predictions(request, protocol, setup, log, rows, reporter, run)
     if result:
         picture_path = picture(log, rows, result, protocol, run.folder)[0]
         section = dataclasses.replace(prediction_section(result, protocol), picture=picture_path)
@@ -141,7 +141,7 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
     return document
 
 
-def _foretold(
+def _score_predictions(
     request: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets, reporter: Reporter, run: Run
 ) -> list[PredictionScore]:
     result = list[PredictionScore]()
@@ -177,8 +177,8 @@ def _adapt(
     write_state(result.state, preset, run.folder)
     lines = (("as it was", f"{result.before:.3f}"), ("adapted", f"{result.after:.3f}"))
     about = (
-        f"{result.admitted} of {result.tried} updates passed the gate, residual `{preset.adapt.residual}`. Error over "
-        f"the last half second of 6 s in the model that the log has corrected, 64 starts of the task."
+        f"{result.admissions} of {result.attempts} updates passed the gate, residual `{preset.adapt.residual}`. "
+        "Error over the last half second of 6 s in the model that the log has corrected, 64 starts of the task."
     )
     if not result.after < LOST:
         about += (

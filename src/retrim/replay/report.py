@@ -40,7 +40,7 @@ def agreement_section(log: FlightLog) -> TableSection:
     about = warning_of(log) or (
         "What one quantity says of another; wind, drag and lags leave something unexplained in every log."
         if lines
-        else "The vehicle hardly moves: nothing can be told."
+        else "The vehicle hardly moves, so its quantities cannot be compared."
     )
     return TableSection(("", "agreement", "doubtful below"), lines, "How well the log agrees with itself", about)
 
@@ -56,10 +56,8 @@ def residual_section(log: FlightLog, rows: Targets) -> TableSection:
         f"{log.seconds:.1f} s of flight, a tick of {1000 * log.dt:.4g} ms; speed {slow.mean():.2f} m/s on average, "
         f"{slow.max():.2f} m/s at most."
     )
-    warnings = "".join(f" {note[0].upper()}{note[1:]}." for note in log.notes if note not in log.warnings)
-    return TableSection(
-        ("residual [m/s^2]", "x", "y", "z", "all"), lines, "What the point mass missed", about + warnings
-    )
+    notes = "".join(f" {note[0].upper()}{note[1:]}." for note in log.notes if note not in log.warnings)
+    return TableSection(("residual [m/s^2]", "x", "y", "z", "all"), lines, "Residual of the point mass", about + notes)
 
 
 def prediction_section(results: Sequence[PredictionScore], protocol: Protocol) -> TableSection:
@@ -75,34 +73,34 @@ def prediction_section(results: Sequence[PredictionScore], protocol: Protocol) -
     about = (
         f"Fitted every {protocol.every:g} s to the last {protocol.buffer:g} s, the error over the next "
         f"{protocol.horizon:g} s; {len(results[0].per_window)} windows. Raw: noise of the derivative of velocity is in "
-        f"every figure. `regression` is that of flight, made for the next second."
+        f"every figure. `regression` is the model of a flight, for the next second."
     )
-    title = "How well the next seconds are foretold"
+    title = "Prediction of the next seconds"
     return TableSection(("predictor", "error [m/s^2]", "x", "y", "z", "explained"), tuple(lines), title, about)
 
 
-def identified_section(results: IdentifiedVehicle) -> TableSection:
+def identified_section(vehicle: IdentifiedVehicle) -> TableSection:
     """Return a table of the vehicle's identified parameters."""
 
     def line(name: str, what: Estimate | None, unit: str, scale: float = 1.0) -> tuple[str, str]:
-        return name, "the log does not say" if what is None else what.text(unit, scale)
+        return name, "not determined by the log" if what is None else what.text(unit, scale)
 
     lines = (
-        line("command delay", results.delay, "ms", 1000.0),
-        line("thrust per commanded thrust", results.thrust_gain, ""),
-        line("acceleration upwards without a command", results.thrust_offset, "m/s^2"),
-        *((line("full thrust", results.full_thrust, "m/s^2"),) if results.full_thrust else ()),
-        line("lag of thrust", results.thrust_lag, "ms", 1000.0),
-        line("lag of roll and pitch rates", results.rate_lag, "ms", 1000.0),
-        line("roll and pitch rate per command", results.rate_gain, ""),
-        line("lag of yaw rate", results.yaw_lag, "ms", 1000.0),
-        line("yaw rate per command", results.yaw_gain, ""),
-        *(line(f"linear drag along body {axis}", each, "1/s") for axis, each in zip("xyz", results.drag, strict=True)),
-        ("acceleration left unexplained", f"{results.unexplained:.2f} m/s^2"),
+        line("command delay", vehicle.delay, "ms", 1000.0),
+        line("thrust per commanded thrust", vehicle.thrust_gain, ""),
+        line("acceleration upwards without a command", vehicle.thrust_offset, "m/s^2"),
+        *((line("full thrust", vehicle.full_thrust, "m/s^2"),) if vehicle.full_thrust else ()),
+        line("lag of thrust", vehicle.thrust_lag, "ms", 1000.0),
+        line("lag of roll and pitch rates", vehicle.rate_lag, "ms", 1000.0),
+        line("roll and pitch rate per command", vehicle.rate_gain, ""),
+        line("lag of yaw rate", vehicle.yaw_lag, "ms", 1000.0),
+        line("yaw rate per command", vehicle.yaw_gain, ""),
+        *(line(f"linear drag along body {axis}", each, "1/s") for axis, each in zip("xyz", vehicle.drag, strict=True)),
+        ("acceleration left unexplained", f"{vehicle.unexplained:.2f} m/s^2"),
     )
     about = "Estimates with intervals of 90 %, of a bootstrap over blocks of 2 s of the log."
-    if not results.known:
-        about = "The log says nothing of the vehicle, and no vehicle file is written: fly circles and turn the nose."
+    if not vehicle.known:
+        about = "The log determines no parameter of the vehicle, so no vehicle file is written: fly circles and yaw."
     return TableSection(("", "estimate"), lines, "What the vehicle is", about)
 
 
@@ -120,7 +118,7 @@ def picture(
     scores = [each for each in results if each.name != "zero"]
     errors = [Curve(np.array(each.times), np.array(each.per_window), each.name) for each in scores]
     panels = [
-        Panel("what the point mass missed", "time [s]", "residual acceleration [m/s^2]", curves, 3),
+        Panel("residual of the point mass", "time [s]", "residual acceleration [m/s^2]", curves, 3),
         Panel(f"error over the next {protocol.horizon:g} s", "time of the prediction [s]", "[m/s^2]", errors, 2),
     ]
-    return save(panel_figure("What the model missed, and what was foretold of it", panels, across=2), folder, "replay")
+    return save(panel_figure("Residual of the model, and its prediction", panels, across=2), folder, "replay")

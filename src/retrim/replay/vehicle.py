@@ -58,11 +58,11 @@ def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str) -> s
     base_lag = None if base.rate_lag is None else base.rate_lag.tolist()
     if (level := identification.rate_lag) is not None:
         yaw = identification.yaw_lag
-        remarks = (
+        origin = (
             f"roll and pitch {level.text('ms', 1000.0)}, yaw {yaw.text('ms', 1000.0) if yaw else 'taken for the same'}"
         )
         lags = [_limit(each.value) for each in (level, level, yaw or level)]
-        lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {remarks}")
+        lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {origin}")
         if (damping := identification.rate_damping) is not None:
             least, most = DAMPINGS
             ratio = min(max(damping.value, least), most)
@@ -72,8 +72,8 @@ def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str) -> s
         if base.rate_damping is not None:  # an identified lag describes a first-order loop, which has no damping
             lines.append(f"rate_damping = {_row(base.rate_damping.tolist())}")
     if (delay := identification.delay) is not None:
-        remarks = delay.text("ms", 1000.0)
-        lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {remarks}")
+        origin = delay.text("ms", 1000.0)
+        lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {origin}")
     elif keep is not None and keep.command_delay is not None:
         lines.append(f"command_delay = {keep.command_delay:.6g}  # [s]")
     if keep is not None:

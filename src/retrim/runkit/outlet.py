@@ -79,6 +79,6 @@ class Outlet:
         """Write the learned parameters, events and logs of flights; remove those of earlier flights."""
         with contextlib.suppress(OSError):
             clear_outputs(self.folder)
-        self.write("what was learnt", partial(write_learner_state, flights, preset))
+        self.write("the learner state", partial(write_learner_state, flights, preset))
         self.write("events.jsonl", partial(write_events, flights))
         self.write("the logs", partial(write_logs, flights))

@@ -90,10 +90,10 @@ class Store:
             on_reuse: Called if the value is not made.
             on_store: Called after a new value is stored.
         """
-        stored = self.get(key, codec)
-        if stored is not None:
+        earlier = self.get(key, codec)
+        if earlier is not None:
             on_reuse()
-            return stored
+            return earlier
         value = make()
         if value is not None and not self._stop.is_set():
             self.put(key, value, codec)

@@ -49,8 +49,8 @@ def train(
     with (reporter or Silent()).progress(title) as advance:
         advance(0.0, first)
         try:
-            for state, latest in setup.pretraining(seed):
-                policy = state
+            for after, latest in setup.pretraining(seed):
+                policy = after
                 losses += [float(loss) for loss in latest]
                 advance(len(losses) / p.num_updates, f"loss {losses[-1]:.3f}")
                 if stop.is_set():
@@ -116,8 +116,8 @@ def train_job(preset: str, seed: int) -> AbstractPolicy:
 
 def ground_warning(setup: Setup) -> str | None:
     """Return a line if the goal or the reference of the flight is below the ground; None if it is not."""
-    home, followed = setup.flight_task.home(), setup.flight_reference
-    lowest = float(home[2]) if followed is None else float(followed.rows[:, 2].min())
+    home, reference = setup.flight_task.home(), setup.flight_reference
+    lowest = float(home[2]) if reference is None else float(reference.rows[:, 2].min())
     if lowest >= 0.0:
         return None
     return f"the goal or the reference is at z = {lowest:g} m, below the ground; z points up, so negate z of NED data"
@@ -147,11 +147,11 @@ def _long(setup: Setup) -> Setup:
 
 
 def _mean_error(setup: Setup, env: Env, policy: AbstractPolicy, n: int, seed: int) -> float:
-    return float(_settle(policy, env, random.key(seed), n, round(0.5 / setup.preset.dt)))
+    return float(_end_errors(policy, env, random.key(seed), n, round(0.5 / setup.preset.dt)))
 
 
 @eqx.filter_jit
-def _settle(policy: AbstractPolicy, env: Env, key: Key[Array, ""], n: int, ticks: int) -> Array:
+def _end_errors(policy: AbstractPolicy, env: Env, key: Key[Array, ""], n: int, ticks: int) -> Array:
     def error(k: Key[Array, ""]) -> Array:
         start = env.task.reset(k)
         trajectory = rollout(env, policy, start)

@@ -42,8 +42,8 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
         """Return the reference relative to the vehicle, in world axes, with attitude, velocity and commands."""
-        scaling = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
-        memory = jnp.concatenate([memory, scaling[None]])[1:]
+        scaled_command = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
+        memory = jnp.concatenate([memory, scaled_command[None]])[1:]
         # Evaluate all instants at once, since each separate evaluation of a reference would be compiled again.
         first, second = len(POSITIONS), len(POSITIONS) + len(VELOCITIES)
         ahead = jax.vmap(self.reference)(t + jnp.array((*POSITIONS, *VELOCITIES, *self.accelerations), dtype=t.dtype))

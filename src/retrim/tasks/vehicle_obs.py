@@ -59,8 +59,8 @@ class VehicleObs(AbstractWrappedObservation[M]):
         inner_observation, memory = self.inner(memory, t, x, last)
         acting, slope = self.actuators.command, self.actuators.slope
         thrust = (acting.c / STANDARD_GRAVITY - 1.0)[None]
-        scaling = (thrust, acting.omega / self.omega_max, slope / self.omega_max, self.belief.vector())
-        return jnp.concatenate([inner_observation, *(each.astype(inner_observation.dtype) for each in scaling)]), memory
+        parts = (thrust, acting.omega / self.omega_max, slope / self.omega_max, self.belief.vector())
+        return jnp.concatenate([inner_observation, *(each.astype(inner_observation.dtype) for each in parts)]), memory
 
     def with_belief(self, belief: PathBelief) -> "VehicleObs[M]":
         """Return the same observation with a different belief."""

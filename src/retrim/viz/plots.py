@@ -207,7 +207,7 @@ def camera(axes: "matplotlib.axes.Axes", groups: Sequence[Group[ImageTrack]], go
                 first[:, 0], first[:, 1], ".", color="#999999", label="at the start" if name == groups[0].name else None
             )
     axes.plot(goal[:, 0], goal[:, 1], "+", color=INK, markersize=14, markeredgewidth=1.6, label="at the target")
-    axes.set(xlabel="image, across", ylabel="image, down", title="what the camera saw of the points")
+    axes.set(xlabel="image, across", ylabel="image, down", title="points in the image")
     ticks = (-1.0, -0.5, 0.0, 0.5, 1.0)
     axes.set(xlim=(-1, 1), ylim=(1, -1), xticks=ticks, yticks=ticks, aspect=ASPECT)
     axes.spines[["top", "right"]].set_visible(True)

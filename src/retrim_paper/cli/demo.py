@@ -35,15 +35,15 @@ def demo(
 
     def execute(stop: threading.Event) -> int:
         run = report_start(Run("demo", out, stop=stop))
-        paths = demonstrate(preset, plant, run, RichReporter(), seconds=seconds, starts=starts, seed=seed, slow=slow)
-        if paths is None:
+        result = demonstrate(preset, plant, run, RichReporter(), seconds=seconds, starts=starts, seed=seed, slow=slow)
+        if result is None:
             return INTERRUPTED
-        for table in paths.tables:
+        for table in result.tables:
             show_table(table)
         console.print(run.watch.sentence())
-        show_paths(paths.pictures)
-        if paths.best in paths.pictures and sys.stdout.isatty():
-            webbrowser.open(paths.best.resolve().as_uri())
+        show_paths(result.pictures)
+        if result.best in result.pictures and sys.stdout.isatty():
+            webbrowser.open(result.best.resolve().as_uri())
         return run.exit_code
 
     return execute

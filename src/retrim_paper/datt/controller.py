@@ -41,8 +41,8 @@ class DattNet(eqx.Module):
     def of(cls, *, key: Key[Array, ""], width: int = 64) -> "DattNet":
         """Return a fresh network; its mean action is nearly zero, which is hover."""
         k_first, k_second, k_actor, k_critic = random.split(key, 4)
-        features = OWN + 8 * (AHEAD - 4)
-        actor = eqx.nn.MLP(features, 4, width, 3, key=k_actor)
+        size = OWN + 8 * (AHEAD - 4)
+        actor = eqx.nn.MLP(size, 4, width, 3, key=k_actor)
         actor = eqx.tree_at(lambda m: m.layers[-1].weight, actor, 0.01 * actor.layers[-1].weight)
         actor = eqx.tree_at(lambda m: m.layers[-1].bias, actor, jnp.zeros(4))
         return cls(
@@ -51,7 +51,7 @@ class DattNet(eqx.Module):
             random.normal(k_second, (3, 8, 8)) / 24.0**0.5,
             jnp.zeros(8),
             actor,
-            eqx.nn.MLP(features, "scalar", width, 3, key=k_critic),
+            eqx.nn.MLP(size, "scalar", width, 3, key=k_critic),
             jnp.full(4, -0.5, dtype=actor.layers[-1].bias.dtype),  # a weak type would compile the first update twice
         )
 
@@ -82,9 +82,9 @@ def datt_observation(x: State, acting: Command, d: Float[Array, "3"], ahead: Flo
         d: Disturbance, world frame [m/s^2].
         ahead: Reference positions now and at the times ahead, world frame [m].
     """
-    features = (x.p[None] - ahead) @ x.R
+    offsets = (x.p[None] - ahead) @ x.R
     acts = (acting.vector() - Command.hover().vector().astype(x.p.dtype)) / jnp.array(SCALE, dtype=x.p.dtype)
-    return jnp.concatenate([features[0], x.v @ x.R, x.R.reshape(9), d @ x.R, acts, features.reshape(-1)])
+    return jnp.concatenate([offsets[0], x.v @ x.R, x.R.reshape(9), d @ x.R, acts, offsets.reshape(-1)])
 
 
 def datt_command(action: Float[Array, "4"], low: Command, high: Command) -> Command:

@@ -151,8 +151,8 @@ def update(
 
 def log_prob(action: Float[Array, " a"], mean: Float[Array, " a"], log_std: Float[Array, " a"]) -> Float[Array, ""]:
     """Return the log-density of an action that is normally distributed around ``mean``."""
-    scaling = (action - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * scaling * scaling - log_std) - 0.5 * action.shape[0] * jnp.log(2.0 * jnp.pi)
+    standard = (action - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * standard * standard - log_std) - 0.5 * action.shape[0] * jnp.log(2.0 * jnp.pi)
 
 
 def _roll_out(

@@ -139,9 +139,9 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
 
     def _decide(self, s: RaptorState) -> tuple[Float[Array, "4"], Float[Array, " hidden"]]:
         body, x = s.body.body, self.state(s)
-        goal = self.setpoint(SUBSTEP * s.ms.astype(x.p.dtype))
-        facing = so3.rotz(goal.heading).T
-        p = jnp.clip(so3.act(facing, x.p - goal.p), -FARTHEST, FARTHEST)
-        v = jnp.clip(so3.act(facing, x.v - goal.v), -FASTEST, FASTEST)
+        setpoint = self.setpoint(SUBSTEP * s.ms.astype(x.p.dtype))
+        facing = so3.rotz(setpoint.heading).T
+        p = jnp.clip(so3.act(facing, x.p - setpoint.p), -FARTHEST, FARTHEST)
+        v = jnp.clip(so3.act(facing, x.v - setpoint.v), -FASTEST, FASTEST)
         o = jnp.concatenate([p, so3.mul(facing, x.R).reshape(9), v, body.omega, s.action])
         return self.net(s.hidden, o)

@@ -100,13 +100,13 @@ def _section(rows: list[dict[str, Any]]) -> TableSection:
         times = 1e3 * np.concatenate([row["epoch_s"] for row in mine])
         errors = np.concatenate([row["errors"] for row in mine])
         whole = errors[np.isfinite(errors)]
-        crashes = f", {len(errors) - len(whole)} crashed" if len(whole) < len(errors) else ""
+        crash_text = f", {len(errors) - len(whole)} crashed" if len(whole) < len(errors) else ""
         lines.append((
             name,
             f"{np.median(times):.1f} ({times.min():.1f} to {times.max():.1f})",
             f"{np.median(times) / (1e3 * first):.2f}",
             f"{max(row['compile_s'] for row in mine):.1f}",
             f"{np.mean([row['residual_rms'] for row in mine]):.3f}",
-            mean_and_deviation(whole) + crashes if len(whole) else "all crashed",
+            mean_and_deviation(whole) + crash_text if len(whole) else "all crashed",
         ))  # fmt: skip
     return TableSection(COLUMNS, tuple(lines), "", PAPER[0].upper() + PAPER[1:] + ".")

@@ -225,8 +225,8 @@ def _section(
         for method in methods:
             rows = [by[name, method, metric] for metric in METRICS if (name, method, metric) in by]
             if rows:
-                crashes = f"{rows[0]['crashes']} of {rows[0]['n']}"
-                lines.append((name, find_method(method).label, *map(_cell, rows), crashes))
+                crash_text = f"{rows[0]['crashes']} of {rows[0]['n']}"
+                lines.append((name, find_method(method).label, *map(_cell, rows), crash_text))
     columns = tuple(f"{metric} {unit}" for metric, unit in METRICS.items())
     metrics = ("late", "peak", "recovery_2cm")
     values = [[[_value(by.get((name, m, metric))) for m in methods] for name in names] for metric in metrics]

@@ -272,12 +272,12 @@ def _section(
         own = [row for row in rows if (row["preset"], row["method"], row["vehicle_known"]) == key]
         if not own:
             continue
-        is_lost, label = sum(row["lost"] for row in own), find_method(entrant.method).label
+        losses, label = sum(row["lost"] for row in own), find_method(entrant.method).label
         cells = [_quantiles([row[name] for row in own], name) for name in scoring.columns]
         finite = [row[colour_metric] for row in own if row[colour_metric] is not None]
         cells += [metres(float(np.mean(finite))) if finite else "-"] if means else []
         knowledge = "known" if entrant.knows_vehicle else "not known"
-        lines.append((f"`{entrant.preset}`", label, knowledge, f"{is_lost} of {len(own)}", *cells))
+        lines.append((f"`{entrant.preset}`", label, knowledge, f"{losses} of {len(own)}", *cells))
         worst = np.full(len(vehicles), -np.inf)
         for row in own:
             worst[row["vehicle"]] = max(

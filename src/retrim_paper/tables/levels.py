@@ -141,31 +141,31 @@ def _fly_section(
     study = studies[key]
     methods, title = section.methods, section.title
     own = [method for method in methods if method not in RIVALS]
-    flights_all = []
+    all_flights = []
     if own:
-        flights_all = fly_all(
+        all_flights = fly_all(
             study, section.scenarios, run, reporter, methods=own, starts=starts, seconds=seconds
         ).flights
     for rival in (method for method in methods if method in RIVALS):
         nets = RIVALS[rival](study.preset, tuple(study.policies), run, reporter, steps=datt_steps)
         policy_study = Study(study.preset, nets, ())
-        flights_all += fly_all(
+        all_flights += fly_all(
             policy_study, section.scenarios, run, reporter, methods=[rival], starts=starts, seconds=seconds
         ).flights
-    if not flights_all:
+    if not all_flights:
         return None
     place = {scenario: i for i, scenario in enumerate(section.scenarios)}
-    flights_all.sort(key=lambda flight: (place[flight.spec.scenario], methods.index(flight.spec.method)))
-    result = [{**row, "preset": study.preset.name, "section": title} for row in rows(flights_all)]
-    kinds = [event.kind for flight in flights_all for event in flight.events]
-    crashes = sum(flight.log.terminated for flight in flights_all)
+    all_flights.sort(key=lambda flight: (place[flight.spec.scenario], methods.index(flight.spec.method)))
+    result = [{**row, "preset": study.preset.name, "section": title} for row in rows(all_flights)]
+    kinds = [event.kind for flight in all_flights for event in flight.events]
+    crashes = sum(flight.log.terminated for flight in all_flights)
     about = (
         f"{study.about()} The gate admitted {kinds.count('policy')} policies and refused {kinds.count('rejected')}. "
-        f"{crashes} of {len(flights_all)} flights crashed."
+        f"{crashes} of {len(all_flights)} flights crashed."
     )
     setup = Setup.from_preset(study.preset, section.scenario.reference)
     first = [
-        f for f in flights_all if f.spec.seed == flights_all[0].spec.seed and f.spec.method in section.drawn_methods
+        f for f in all_flights if f.spec.seed == all_flights[0].spec.seed and f.spec.method in section.drawn_methods
     ]
     picture_paths = picture(first, setup, section.scenarios[-1], run.folder, stem=section.stem)
     table = level_table(result, methods, section.paper, title, section.levels)

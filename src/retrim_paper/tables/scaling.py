@@ -11,7 +11,7 @@ import numpy as np
 
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
-from retrim.evaluation.batches import FULL
+from retrim.evaluation.batches import CPU_LIMIT
 from retrim.evaluation.executor import report_progress
 from retrim.evaluation.fleet import Fleet
 from retrim.evaluation.limits import check_flights
@@ -109,7 +109,7 @@ def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
         bounds = {
             "flying": MANY * per_flight / m,
             "the client's network": MANY * size / LINK,
-            "the scheduler": MANY / FULL * JOB_S,
+            "the scheduler": MANY / CPU_LIMIT * JOB_S,
         }
         most = max(bounds, key=lambda name: bounds[name])
         lines.append((f"{m}", _time(compiling + bounds[most]), most))
@@ -118,9 +118,9 @@ def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
         f"Time = compiling ({compiling:.0f} s, on all machines at once, as measured above) + the largest of: flying "
         f"({1e3 * per_flight:.0f} ms a flight, measured above, divided by the machines); the network of the client, "
         f"who receives {size / 1e3:.0f} kB a flight (measured) at {LINK / 1e6:.0f} MB/s (assumed, a gigabit); the "
-        f"scheduler, at {1e3 * JOB_S:.0f} ms a job of {FULL} flights (assumed). Training, stragglers and lost machines "
-        "are left out. Beyond the network's limit more machines do not help: several clients do, each with a part of "
-        "the seeds."
+        f"scheduler, at {1e3 * JOB_S:.0f} ms a job of {CPU_LIMIT} flights (assumed). Training, stragglers and lost "
+        "machines are left out. Beyond the network's limit more machines do not help: several clients do, each with a "
+        "part of the seeds."
     )
     return TableSection(("machines", "time", "what takes longest"), tuple(lines), "On more machines", about)
 

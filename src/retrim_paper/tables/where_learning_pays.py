@@ -59,18 +59,18 @@ def where_learning_pays(
         starts: Flights per row, method and seed.
     """
     check_seeds(seeds)
-    chosen = [row for row in regimes() if not only or row.name.startswith(only)]
-    if not chosen:
+    selection = [row for row in regimes() if not only or row.name.startswith(only)]
+    if not selection:
         raise ConfigError(f"no row {only[0]!r}; there are {', '.join(row.name for row in regimes())}")
     if unknown := [name for name in columns if name not in OPPONENTS]:
         raise ConfigError(f"no column {unknown[0]!r}; there are {', '.join(OPPONENTS)}")
-    for row in chosen:
+    for row in selection:
         options: dict[str, Any] = {"methods": _methods(row, columns), "starts": starts, "seconds": row.seconds}
         refuse_misfits(row.preset, row.scenarios[:1], **options)
     document = Document(run, "where_learning_pays", "Where learning pays", INTRO, seeds, reporter)
     lines, results = list[tuple[str, ...]](), list[dict[str, Any]]()
     studies = dict[str, Study]()
-    for row in chosen:
+    for row in selection:
         if run.interrupted:
             break
         reporter.say(f"{row.name}: {row.about}")
@@ -94,8 +94,8 @@ def where_learning_pays(
 
 def _methods(row: Regime, columns: Sequence[str]) -> tuple[str, ...]:
     """Return the methods of a row, each once."""
-    wanted = [method for column in columns for method in OPPONENTS[column]]
-    return tuple(dict.fromkeys([*wanted, row.adapted]))
+    opponents = [method for column in columns for method in OPPONENTS[column]]
+    return tuple(dict.fromkeys([*opponents, row.adapted]))
 
 
 def _line(
@@ -109,7 +109,7 @@ def _line(
         worst = max(OPPONENTS[column], key=lambda method: (float(np.median(scores[method])), np.sum(scores[method])))
         cells[column], medians[column] = _cell(scores[worst]), float(np.median(scores[worst]))
     cells[ADAPTED], medians[ADAPTED] = _cell(scores[row.adapted]), float(np.median(scores[row.adapted]))
-    verdict = decide(medians, {name: _lost(scores, columns, name, row) for name in medians})
+    verdict = decide(medians, {name: _losses(scores, columns, name, row) for name in medians})
     line = (row.name, row.about, row.score.about, *cells.values(), row.published, verdict)
     rows = [
         {"regime": row.name, "method": method, "score_m": [value if np.isfinite(value) else None for value in values]}
@@ -123,19 +123,19 @@ def _scores(row: Regime, flights: Sequence[Flight], method: str) -> np.ndarray:
     return np.array([np.inf if flight.log.terminated else row.score.of(flight) for flight in own])
 
 
-def _lost(scores: dict[str, np.ndarray], columns: Sequence[str], name: str, row: Regime) -> int:
+def _losses(scores: dict[str, np.ndarray], columns: Sequence[str], name: str, row: Regime) -> int:
     methods = (row.adapted,) if name == ADAPTED else OPPONENTS[name]
     return max(int(np.sum(np.isinf(scores[method]))) for method in methods)
 
 
 def _cell(scores: np.ndarray) -> str:
     """Return the median [mm], its bootstrap interval, and the number of lost flights."""
-    lost = int(np.sum(np.isinf(scores)))
+    losses = int(np.sum(np.isinf(scores)))
     draw = np.random.default_rng(0)
-    resampled = np.median(scores[draw.integers(0, len(scores), (1000, len(scores)))], axis=1)
-    low, high = np.quantile(resampled, [0.025, 0.975], method="nearest")
+    medians = np.median(scores[draw.integers(0, len(scores), (1000, len(scores)))], axis=1)
+    low, high = np.quantile(medians, [0.025, 0.975], method="nearest")
     text = f"{_mm(float(np.median(scores)))} ({_mm(float(low))} to {_mm(float(high))})"
-    return f"{text}, {lost} of {len(scores)} lost" if lost else text
+    return f"{text}, {losses} of {len(scores)} lost" if losses else text
 
 
 def _mm(metres: float) -> str:
@@ -145,7 +145,7 @@ def _mm(metres: float) -> str:
     return f"{value:.2f}" if value < 1.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
 
 
-def decide(medians: dict[str, float], lost: dict[str, int]) -> str:
+def decide(medians: dict[str, float], losses: dict[str, int]) -> str:
     """Return the verdict of a row.
 
     Args:
@@ -155,11 +155,11 @@ def decide(medians: dict[str, float], lost: dict[str, int]) -> str:
     rivals = {name: medians[name] for name in COMPARABLE if name in medians}
     if not rivals:
         return "no opponent was flown"
-    fewest = min(lost[name] for name in rivals)
-    if lost[ADAPTED] > fewest:
-        best = min((name for name in rivals if lost[name] == fewest), key=lambda name: rivals[name])
+    fewest = min(losses[name] for name in rivals)
+    if losses[ADAPTED] > fewest:
+        best = min((name for name in rivals if losses[name] == fewest), key=lambda name: rivals[name])
         return f"use {best} here: adapted flights are lost"
-    safe = {name: value for name, value in rivals.items() if lost[name] == lost[ADAPTED]}
+    safe = {name: value for name, value in rivals.items() if losses[name] == losses[ADAPTED]}
     if not safe:
         return "learning pays: every opponent loses flights"
     best = min(safe, key=lambda name: safe[name])

@@ -90,9 +90,9 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
     cells, least = around(region)
     fit, h = likelihood_of(cells, one)
     weight = _weight(fit.log_likelihood, cells, prior, belief, 1.0)
-    scaling = fit.gain[:, None] * h
-    response = weight @ scaling
-    off, middle = scaling - response[None], weight @ h
+    cell_responses = fit.gain[:, None] * h
+    response = weight @ cell_responses
+    off, middle = cell_responses - response[None], weight @ h
     spread = (weight[:, None] * off).T @ off + (weight @ fit.gain_variance) * jnp.outer(middle, middle)
     noise = jnp.sqrt(weight @ fit.variance)
     region = region_of(cells, fit, 1.0, least)
@@ -137,8 +137,8 @@ def responses(
     """
     delay, lag, ringing = cells[:, :1], jnp.exp(cells[:, 1:2]), jnp.clip(cells[:, 2:], 0.0, MOST_RINGING)
     t = dt * jnp.asarray(ages(dt), dtype=cells.dtype)[None] - delay - age
-    has_settled = jnp.ones_like(delay)
-    return jnp.concatenate([mean_step_response(t, width, lag, ringing), has_settled, hover * has_settled], axis=1)
+    ones = jnp.ones_like(delay)
+    return jnp.concatenate([mean_step_response(t, width, lag, ringing), ones, hover * ones], axis=1)
 
 
 def _without_others(channel: Channel, prior: Prior) -> _Sums:

@@ -51,8 +51,8 @@ def flight_part(path: Path, ticks: Ticks, marks: Marks, *, measured_position: bo
         resets, airborne_jumps = marks.resets.get(name, np.zeros(len(valid), dtype=bool)), jumps_of(ticks, name)
         if (both := (resets | airborne_jumps) & valid).any():
             notes.append(
-                f"{name} jumps {np.sum(both)} times ({np.sum(resets & both)} resets by its counter); what is around is "
-                f"left out"
+                f"{name} jumps {np.sum(both)} times ({np.sum(resets & both)} resets by its counter); the ticks around "
+                "are left out"
             )
         valid &= around(~(resets | airborne_jumps), ENDS)
     if measured_position:
@@ -93,6 +93,6 @@ def _moves(path: Path, ticks: Ticks, airborne: np.ndarray, marks: Marks) -> tupl
     if (airborne_jumps := jumps[1:] & airborne[1:]).any():
         far = np.linalg.norm(steps, axis=1)[airborne_jumps].max()
         notes.append(
-            f"position jumps {np.sum(airborne_jumps)} times, by up to {far:.2f} m; what is around it is left out"
+            f"position jumps {np.sum(airborne_jumps)} times, by up to {far:.2f} m; the ticks around are left out"
         )
     return ~frozen & around(~jumps, ENDS), notes

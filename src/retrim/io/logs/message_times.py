@@ -57,7 +57,7 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
         stamp, arrival = both.T
         if np.mean(np.isnan(stamp) | (stamp == 0.0)) > 0.5:
             times[topic], even = evenly(arrival)
-            remark = ", less what held single messages up" if even else ""
+            remark = ", without the delays of single messages" if even else ""
             notes.append(f"{topic} has no stamps; its times are those of reception{remark}")
         else:
             times[topic] = stamp

@@ -28,7 +28,7 @@ def write_rrd(path: Path, flight: Recording) -> None:
             ("error", "error [m]"),
             ("command/thrust", "thrust [m/s²]"),
             ("command/rates", "body rates [rad/s]"),
-            ("age", "age of what was learnt from [s]"),
+            ("age", "age of the data of the policy [s]"),
         )
     ]
     beside = rrb.Vertical(*plots, rrb.TextLogView(origin="/events", name="events"))

@@ -55,7 +55,7 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
         f"lag; its noise is about {noise:.2g} m/s"
     )
     if jumps.any():
-        remark += f"; the position jumps {np.sum(jumps)} times, and what is around is left out"
+        remark += f"; the position jumps {np.sum(jumps)} times, and the ticks around are left out"
     return Series(t[result], v[result]), remark
 
 

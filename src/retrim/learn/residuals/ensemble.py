@@ -164,14 +164,14 @@ def fit_ensemble(
     weight = weight / jnp.maximum(jnp.sum(weight), 1.0)
 
     def loss(layers: Any, vectors: Any) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Any]]:
-        data, spectral, shift = jnp.zeros_like(features[0, 0]), jnp.zeros_like(features[0, 0]), []
+        data, spectral, next_vectors = jnp.zeros_like(features[0, 0]), jnp.zeros_like(features[0, 0]), []
         for member, starting in zip(layers, vectors, strict=True):
             predictions = jax.vmap(lambda f, member=member: _forward(member, f))(features)
             data += jnp.sum(weight * jnp.sum((rows.a_res - predictions) ** 2, axis=1))
             norms = [_spectral(layer.weight, v) for layer, v in zip(member, starting, strict=True)]
             spectral += sum(square for square, _ in norms)
-            shift.append(tuple(v for _, v in norms))
-        return data + spectral_weight * spectral, (data, tuple(shift))
+            next_vectors.append(tuple(v for _, v in norms))
+        return data + spectral_weight * spectral, (data, tuple(next_vectors))
 
     def step(carry: Any, _: None) -> Any:
         layers, memory, vectors = carry

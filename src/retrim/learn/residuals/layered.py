@@ -63,10 +63,10 @@ class LayeredModel(eqx.Module):
         """
         first, _, weight = self.first.fit_weighted(state.first, rows)
         left = rows.a_res - jax.vmap(lambda x, u: self.first.predict(first, x, u))(rows.x, rows.u)
-        foretold = jax.vmap(lambda x, u: self._certain(state.second, x, u))(rows.x, rows.u)
+        prediction = jax.vmap(lambda x, u: self._certain(state.second, x, u))(rows.x, rows.u)
         newest = (jnp.arange(weight.shape[0]) >= weight.shape[0] - BLOCK) & (weight > 0.0)
-        agreement = DECAY * state.agreed + jnp.sum(jnp.where(newest, jnp.sum(left * foretold, axis=1), 0.0))
-        square = DECAY * state.foretold + jnp.sum(jnp.where(newest, jnp.sum(foretold**2, axis=1), 0.0))
+        agreement = DECAY * state.agreed + jnp.sum(jnp.where(newest, jnp.sum(left * prediction, axis=1), 0.0))
+        square = DECAY * state.foretold + jnp.sum(jnp.where(newest, jnp.sum(prediction**2, axis=1), 0.0))
         rest = Targets(rows.x, rows.u, left, rows.omega, weight > 0.0)
         second, _ = self.second.fit(state.second, rest)
         result = LayeredState(first, second, agreement, square, _smooth(left, weight))

@@ -118,8 +118,8 @@ class PlaceModel(eqx.Module):
         """Return the state without information, which predicts zero; the key is consumed by the first model."""
         eye = jnp.eye(CENTRES + 1, dtype=self.prior.dtype)
         nothing = jnp.zeros((CENTRES + 1, 3), dtype=eye.dtype)
-        unused = jnp.full(CENTRES, -1, dtype=jnp.int32)
-        empty = PlaceMap(nothing[1:], unused, eye, nothing, nothing)
+        no_visits = jnp.full(CENTRES, -1, dtype=jnp.int32)
+        empty = PlaceMap(nothing[1:], no_visits, eye, nothing, nothing)
         zero = jnp.zeros((), dtype=eye.dtype)
         return PlaceState(self.first.init(key), empty, zero, zero, jnp.zeros((), dtype=jnp.int32))
 
@@ -135,11 +135,11 @@ class PlaceModel(eqx.Module):
         remainder = rows.a_res - jax.vmap(lambda x: self._drag(first, x))(rows.x)
         agreement, prediction = self._evidence(state, forecast, remainder - state.map.weights[-1:], new)
         after = self._learn(state.map, p, remainder, new, state.fits)
-        fitted = PlaceState(first, after, agreement, prediction, state.fits + 1)
-        error = rows.a_res - jax.vmap(lambda x, u: self.predict(fitted, x, u))(rows.x, rows.u)
+        new_state = PlaceState(first, after, agreement, prediction, state.fits + 1)
+        error = rows.a_res - jax.vmap(lambda x, u: self.predict(new_state, x, u))(rows.x, rows.u)
         valid = rows.valid.astype(error.dtype)
         mean_square = jnp.sum(valid * jnp.sum(error**2, axis=1)) / jnp.maximum(jnp.sum(valid), 1.0)
-        return where(jnp.any(rows.valid), fitted, state), jnp.sqrt(mean_square)
+        return where(jnp.any(rows.valid), new_state, state), jnp.sqrt(mean_square)
 
     def predict(self, state: PlaceState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the sum of the first model's prediction and the map, world [m/s^2]."""
@@ -201,9 +201,9 @@ class PlaceModel(eqx.Module):
         """Return the evidence for the map. Evidence fades with further predictions, not with time."""
         counts = new.astype(forecast.dtype)
         square = jnp.sum(counts * jnp.sum(forecast**2, axis=1))
-        agreed = jnp.sum(counts * jnp.sum(forecast * remainder, axis=1))
+        product = jnp.sum(counts * jnp.sum(forecast * remainder, axis=1))
         remains = jnp.exp(-square / EVIDENCE)
-        return remains * state.agreement + agreed, remains * state.prediction + square
+        return remains * state.agreement + product, remains * state.prediction + square
 
     def _learn(
         self,
@@ -214,19 +214,19 @@ class PlaceModel(eqx.Module):
         fits: Int[Array, ""],
     ) -> PlaceMap:
         """Return the map after the new rows: place centres, forget, and solve for the weights."""
-        placed = self._place_centres(before, p, new, fits)
+        place_map = self._place_centres(before, p, new, fits)
         remains, eye = jnp.exp(-self.every / self.memory), jnp.eye(CENTRES + 1, dtype=p.dtype)
-        precision = remains * placed.precision + (1.0 - remains) * eye
-        moment = remains * placed.moment
+        precision = remains * place_map.precision + (1.0 - remains) * eye
+        moment = remains * place_map.moment
         # The constant wanders: add variance to it.
         column, variance = precision[:, -1], (WANDER / self.prior) ** 2 * self.every
         gain = column / (1.0 / variance + column[-1])
         precision, moment = precision - jnp.outer(gain, column), moment - jnp.outer(gain, moment[-1])
-        bumps = jnp.concatenate([self._bumps(placed, p), jnp.ones_like(p[:, :1])], axis=1) * self.prior
+        bumps = jnp.concatenate([self._bumps(place_map, p), jnp.ones_like(p[:, :1])], axis=1) * self.prior
         weight = new.astype(p.dtype)[:, None] / self.noise**2
         precision = precision + bumps.T @ (weight * bumps)
         moment = moment + bumps.T @ (weight * target)
-        return PlaceMap(placed.centres, placed.visited, precision, moment, self._weights(precision, moment))
+        return PlaceMap(place_map.centres, place_map.visited, precision, moment, self._weights(precision, moment))
 
     def _weights(self, precision: Float[Array, "n n"], moment: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         weights: Array = self.prior * jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(precision), moment)
@@ -241,16 +241,16 @@ class PlaceModel(eqx.Module):
         def visit(carry: Centres, row: tuple[Float[Array, "3"], Bool[Array, ""]]) -> tuple[Centres, None]:
             centres, visited, fresh = carry
             position, counts = row
-            away = jnp.sum((centres - position[None]) ** 2, axis=1)
-            near = (away < (SPACING * self.length) ** 2) & (visited >= 0)
+            square = jnp.sum((centres - position[None]) ** 2, axis=1)
+            near = (square < (SPACING * self.length) ** 2) & (visited >= 0)
             oldest = jnp.arange(CENTRES) == jnp.argmin(visited)
-            replaced = oldest & counts & ~jnp.any(near)
-            centres = jnp.where(replaced[:, None], position[None], centres)
-            visited = jnp.where((near & counts) | replaced, fits, visited)
-            return (centres, visited, fresh | replaced), None
+            is_replaced = oldest & counts & ~jnp.any(near)
+            centres = jnp.where(is_replaced[:, None], position[None], centres)
+            visited = jnp.where((near & counts) | is_replaced, fits, visited)
+            return (centres, visited, fresh | is_replaced), None
 
-        unchanged = jnp.zeros(CENTRES, dtype=bool)
-        (centres, visited, fresh), _ = lax.scan(visit, (centres, visited, unchanged), (p, new))
+        none = jnp.zeros(CENTRES, dtype=bool)
+        (centres, visited, fresh), _ = lax.scan(visit, (centres, visited, none), (p, new))
         fresh, eye = jnp.append(fresh, False), jnp.eye(CENTRES + 1, dtype=p.dtype)
         return PlaceMap(
             centres,

@@ -146,11 +146,15 @@ class RegressionModel(eqx.Module):
     def _posterior(
         self, features: Float[Array, "n 3 10"], target: Float[Array, "n 3"], weight: Float[Array, " n"]
     ) -> Normal:
-        scaling = features * self.prior[None, None]  # parameters of order one: well conditioned in single precision
-        eye = jnp.eye(SIZE, dtype=scaling.dtype)
-        precision = eye + jnp.einsum("n,nik,nil->kl", weight, scaling, scaling) / self.noise**2
+        scaled_features = (
+            features * self.prior[None, None]
+        )  # parameters of order one: well conditioned in single precision
+        eye = jnp.eye(SIZE, dtype=scaled_features.dtype)
+        precision = eye + jnp.einsum("n,nik,nil->kl", weight, scaled_features, scaled_features) / self.noise**2
         factor = jax.scipy.linalg.cho_factor(precision)
-        mean = jax.scipy.linalg.cho_solve(factor, jnp.einsum("n,nik,ni->k", weight, scaling, target) / self.noise**2)
+        mean = jax.scipy.linalg.cho_solve(
+            factor, jnp.einsum("n,nik,ni->k", weight, scaled_features, target) / self.noise**2
+        )
         covariance = jax.scipy.linalg.cho_solve(factor, eye)
         return Normal(self.prior * mean, self.prior[:, None] * covariance * self.prior[None])
 

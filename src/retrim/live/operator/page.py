@@ -58,8 +58,8 @@ class PagePlan:
 HOST = re.compile(r"(?:[\w-]{1,63}\.){0,9}[\w-]{1,63}|(?=.*:)[\da-fA-F:.]{2,45}(?:%\w{1,15})?", re.ASCII)
 
 
-def free_port(host: str, preference: int) -> int:
-    """Return the first free port of ``host`` among the ten ports from ``preference`` on.
+def free_port(host: str, first_port: int) -> int:
+    """Return the first free port of ``host`` among the ten ports from ``first_port`` on.
 
     Raises:
         ConfigError: All ten ports are in use, or ``host`` is not an address of this machine.
@@ -67,13 +67,13 @@ def free_port(host: str, preference: int) -> int:
     if not HOST.fullmatch(host):
         raise ConfigError(f"--page-host {excerpt(host)}: neither an address nor the name of a host")
     reason = ""
-    for port in range(preference, min(preference + 10, 65536)):
+    for port in range(first_port, min(first_port + 10, 65536)):
         try:
             with socket.create_server((host, port)):
                 return port
         except (OSError, ValueError) as error:  # not every text is a valid host name
             reason = str(getattr(error, "strerror", None) or error)[:160]
-    raise ConfigError(f"page: no free port from {preference} on at {excerpt(host)} ({reason})")
+    raise ConfigError(f"page: no free port from {first_port} on at {excerpt(host)} ({reason})")
 
 
 def page_address(host: str, port: int, *, is_explicit: bool, say: Callable[[str], None]) -> tuple[str, int] | None:
@@ -115,14 +115,14 @@ def show(plan: PagePlan) -> None:
     page = _Page(spec, bus, server)
     take_values_only(server, page.refuse)
     bus.publish("ready.page", pack_note("ready", port=server.get_port()))
-    refresh_time, heart = 0, Heart(bus, "page")
+    refreshes, heart = 0, Heart(bus, "page")
     while not parent.has_ended(1.0 / RATE):
         heart.beat()
         try:
-            page.refresh(text=refresh_time % TEXT_EVERY == 0)
+            page.refresh(text=refreshes % TEXT_EVERY == 0)
         except Exception as error:  # the landing button must work even if a refresh fails
             page.refuse(f"{type(error).__name__}: {error}")
-        refresh_time += 1
+        refreshes += 1
     server.stop()
 
 

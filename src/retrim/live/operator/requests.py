@@ -94,7 +94,7 @@ class OperatorRequests:
         try:
             self._supervisor.learn_from(future.result())
         except (RetrimError, OSError) as error:
-            return [Event(t, "asked", f"method {method} cannot be had: {error}")]
+            return [Event(t, "asked", f"method {method} is not available: {error}")]
         return [Event(t, "asked", f"the policy's learner starts again: {method}")]
 
     def _knobs(self, t: float) -> list[Event]:

@@ -264,7 +264,7 @@ class LearnerLoop:
             time.sleep(CHECK_EVERY)
         learner_state, outlet = active_learner_state(self.bus, self.state, self._status()), Outlet(folder)
         if learner_state is not None:
-            outlet.write("what was learnt", partial(write_state, learner_state, self.setup.preset))
+            outlet.write("the learner state", partial(write_state, learner_state, self.setup.preset))
         for fault in outlet.faults:
             print(fault, file=sys.stderr)
 

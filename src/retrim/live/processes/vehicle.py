@@ -79,9 +79,9 @@ def _carry(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: ParentWatch, 
         late += max(0, due - tick - 1)
         tick = max(tick + 1, due)
         if tick % 25 == 0:
-            refusals = "a vehicle has no knobs" if bus.latest("knobs") is not None else ""
+            refusal = "a vehicle has no knobs" if bus.latest("knobs") is not None else ""
             bus.publish("world", pack_note(
-                "world", late=late, held=holds, lost=plant.lost_time, knobs_refused=refusals, notes=list(plant.notes)
+                "world", late=late, held=holds, lost=plant.lost_time, knobs_refused=refusal, notes=list(plant.notes)
             ))  # fmt: skip
 
 
