@@ -41,9 +41,9 @@ def fly_once(seconds=30.0, dt=0.02, wind=(0.0, 0.0, 0.0), gain=1.0, seed=0, size
     a = np.sum(-size * waves**2 * np.sin(angle), axis=2)
     specific_force = a + G - np.array(wind)
     R = _attitudes(specific_force, 0.6 * np.sin(0.9 * t))
-    rotation = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec() / dt
+    omega = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec() / dt
     c = np.linalg.norm(specific_force, axis=1) / gain
-    return Flight(t, p, R, v, a, c, np.concatenate([rotation, rotation[-1:]]))
+    return Flight(t, p, R, v, a, c, np.concatenate([omega, omega[-1:]]))
 
 
 def _attitudes(specific_force, yaw):

@@ -73,7 +73,7 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
     p = rng.normal(size=(n, 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     R, v, w, wd, f = np.tile(np.eye(3), (n, 1, 1)), 0 * p, 0 * p, 0 * p, np.full(n, G)
-    argument = np.tile([G, 0.0, 0.0, 0.0], (n, ticks + 8, 1))
+    command = np.tile([G, 0.0, 0.0, 0.0], (n, ticks + 8, 1))
     slow = np.clip(0.09 / (vehicles.delay + vehicles.rate_lag + 0.03), 0.35, 1.0)[:, None]
     with_push, a_mean, half, last, rows = 0 * p, 0 * p, None, None, []
 
@@ -99,11 +99,11 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
         if excitation is not None:
             u = u + excitation(k * DT)
         rows.append((*last, omega, a, u))
-        argument[:, 8 + k] = u
+        command[:, 8 + k] = u
         a_mean = 0.0
         for i in range(PER):
             at = np.maximum((k * PER + i - late) // PER, -8) + 8
-            message = argument[np.arange(n), at]
+            message = command[np.arange(n), at]
             before = w
             error = np.stack([w - message[:, 1:], wd], axis=2)
             shift = np.einsum("anij,naj->nai", loops, error)

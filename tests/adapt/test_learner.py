@@ -80,18 +80,18 @@ def test_a_fit_that_is_not_finite_is_dropped(setup, fresh):
     buffer = RollingBuffer(40)
     for i in range(10):
         buffer.push(0.02 * i, State.at(jnp.array([0.0, 0.0, 1.0 + float("nan") * (i == 5)])), Command.hover())
-    rest, report = learner.fit_residual(state.residual, buffer.window())
+    new_state, report = learner.fit_residual(state.residual, buffer.window())
     assert not bool(report.accepted)
-    jax.tree.map(np.testing.assert_array_equal, rest, state.residual)
+    jax.tree.map(np.testing.assert_array_equal, new_state, state.residual)
 
 
 def test_a_window_without_a_whole_row_is_dropped(setup, fresh):
     learner, state = setup.learner, fresh
     buffer = RollingBuffer(40)
     buffer.push(0.0, State.at(jnp.array([0.0, 0.0, 1.0])), Command.hover())
-    rest, report = learner.fit_residual(state.residual, buffer.window())
+    new_state, report = learner.fit_residual(state.residual, buffer.window())
     assert not bool(report.accepted)
-    jax.tree.map(np.testing.assert_array_equal, rest, state.residual)
+    jax.tree.map(np.testing.assert_array_equal, new_state, state.residual)
 
 
 def test_the_rate_falls_along_a_cosine():
@@ -267,8 +267,8 @@ def test_low_rank_updates_leave_the_base(low_rank):
 def test_a_low_rank_delta_has_a_learning_rate_of_its_own(low_rank):
     """Adam's first step is as long as the rate; all weights keep theirs, as the paper's update shows."""
     policy, after = low_rank
-    shift = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), after.policy.delta, policy.delta)
-    assert max(jax.tree.leaves(shift)) == pytest.approx(0.04, rel=1e-3)
+    change = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), after.policy.delta, policy.delta)
+    assert max(jax.tree.leaves(change)) == pytest.approx(0.04, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["ensemble", "regression", "layered", "linear", "place"])

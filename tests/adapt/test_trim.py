@@ -64,10 +64,10 @@ def test_only_the_output_is_shifted(key):
     policy = awake(key, env.task.observation.size)
     trim_result = TRIM(policy, env, window_of(jnp.eye(3)))
     both = random.normal(key, (2, env.task.observation.size))
-    shift = eqx.filter_jit(
+    trimmed_policy = eqx.filter_jit(
         lambda trim_result, policy: jax.vmap(lambda o: trim_result.output(o) - policy.output(o))(both)
     )
-    np.testing.assert_allclose(*shift(trim_result, policy), atol=1e-12)
+    np.testing.assert_allclose(*trimmed_policy(trim_result, policy), atol=1e-12)
     jax.tree.map(np.testing.assert_array_equal, trim_result.layers[:-1], policy.layers[:-1])
     assert NoTrim()(policy, env, window_of(jnp.eye(3))) is policy
 

@@ -306,10 +306,10 @@ def test_pretraining_has_the_presets_second_decay(case):
     """After a large gradient and a zero one, Adam's second moment tells its decay."""
     preset, setup = case
     b1, b2, rate = 0.9, preset.pretrain.adam_b2, preset.pretrain.learning_rate
-    shift = moves(setup.optimiser, [0.4, 0.0])[1]
+    change = moves(setup.optimiser, [0.4, 0.0])[1]
     m, v = b1 * (1 - b1) * 0.4 / (1 - b1**2), b2 * (1 - b2) * 0.16 / (1 - b2**2)
     cosine = 0.5 * (1 + math.cos(math.pi / preset.pretrain.num_updates))
-    assert float(shift) == pytest.approx(-rate * cosine * m / (math.sqrt(v) + 1e-8), rel=1e-6)
+    assert float(change) == pytest.approx(-rate * cosine * m / (math.sqrt(v) + 1e-8), rel=1e-6)
 
 
 # ---- what a caller may get wrong
@@ -375,11 +375,11 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
 def test_training_follows_references_as_they_are_felt():
     """Every member of the family is a built-in reference, level or tilted and scaled; flight follows the plain one."""
     setup = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "gravity_copies": 2}))
-    trained_policy, flight = setup.env.task.reference, setup.flight_task.reference
-    assert trained_policy.joins.shape[0] == 2 * (1 + 2)
+    training_reference, flight = setup.env.task.reference, setup.flight_task.reference
+    assert training_reference.joins.shape[0] == 2 * (1 + 2)
     assert flight.joins.shape[0] == 2
-    starts = trained_policy.joins[:, 0]
-    p = jax.vmap(jax.vmap(trained_policy, (0,)))(starts[:, None] + jnp.linspace(3.0, 12.0, 200)[None]).p
+    starts = training_reference.joins[:, 0]
+    p = jax.vmap(jax.vmap(training_reference, (0,)))(starts[:, None] + jnp.linspace(3.0, 12.0, 200)[None]).p
     height = np.ptp(np.asarray(p)[:, :, 2], axis=1)
     assert (height[:2] < 1e-4).all()
     assert (height[2:] > 0.01).all()
@@ -402,8 +402,8 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
     assert sum(losses.shape[0] for _, losses in chunks) == 150
     policy = chunks[-1][0]
     x0 = draw_starts(setup.env.task, random.key(7), 16)
-    fresh, trained_policy = (policy_loss(p, setup.env, x0) for p in (setup.new_policy(random.key(1)), policy))
-    assert float(trained_policy) < 0.7 * float(fresh)
+    fresh, trained_loss = (policy_loss(p, setup.env, x0) for p in (setup.new_policy(random.key(1)), policy))
+    assert float(trained_loss) < 0.7 * float(fresh)
     plant = Scenario("small", "simple").make(preset.vehicle, dt=preset.dt)
     assert plant.dt == 0.01
     pilot = setup.pilot(policy, "full", random.key(3))

@@ -58,16 +58,16 @@ def test_what_a_file_leaves_out_follows_from_its_size(vehicle_file, size):
     other = dataclasses.replace(
         spec, arm=arm, propeller_diameter=5.5 * size, inertia=tuple(size**2 * moment for moment in spec.inertia)
     )
-    one, scaling = spec.build(), other.build()
+    one, bigger = spec.build(), other.build()
     for name, power in (("radius", 1), ("chord_root", 1), ("chord_tip", 1)):
-        assert getattr(scaling.propeller, name) == pytest.approx(size**power * getattr(one.propeller, name))
+        assert getattr(bigger.propeller, name) == pytest.approx(size**power * getattr(one.propeller, name))
     for name, power in (
         ("drag_area", 2), ("thrust_coefficient", 4), ("rotor_inertia", 5), ("torque_ratio", 1),
         ("motor_max", -2), ("motor_min", -2),
     ):  # fmt: skip
-        np.testing.assert_allclose(getattr(scaling, name), size**power * getattr(one, name), rtol=1e-6, err_msg=name)
+        np.testing.assert_allclose(getattr(bigger, name), size**power * getattr(one, name), rtol=1e-6, err_msg=name)
     for name in ("base", "linear", "root"):
-        assert getattr(scaling.esc, name) == pytest.approx(size**-2 * getattr(one.esc, name))
+        assert getattr(bigger.esc, name) == pytest.approx(size**-2 * getattr(one.esc, name))
     like = dataclasses.replace(spec, arm=(0.075, 0.1), inertia=(0.004, 0.005, 0.008)).build()  # as far as kingfisher's
     np.testing.assert_allclose(like.drag_area, kingfisher().drag_area)
     # Without propellers of its own, they are as large as nine tenths of what the shorter arm leaves them:

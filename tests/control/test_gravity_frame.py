@@ -78,11 +78,11 @@ def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
         frame = EffectiveGravityFrame.of(d)
         left = lambda x, u: frame.vector(residual(frame.world_state(x), frame.world_command(u)) - d)  # noqa: E731
         world, inside = Hybrid(model, residual), Hybrid(model, left)
-        s, rotation = world.init(x), inside.init(frame.state(x))
+        s, s_in_frame = world.init(x), inside.init(frame.state(x))
         if isinstance(model, LaggedModel):  # its actuators hover at first, in the world as in the frame
-            rotation = replace_fields(rotation, actuators=ActuatorState.at(frame.command(s.actuators.command)))
-        s, rotation = world.step(s, u, jnp.zeros(3)), inside.step(rotation, frame.command(u), jnp.zeros(3))
-        return inside.state(rotation), frame.state(world.state(s))
+            s_in_frame = replace_fields(s_in_frame, actuators=ActuatorState.at(frame.command(s.actuators.command)))
+        s, s_in_frame = world.step(s, u, jnp.zeros(3)), inside.step(s_in_frame, frame.command(u), jnp.zeros(3))
+        return inside.state(s_in_frame), frame.state(world.state(s))
 
     all_pushes = jax.jit(jax.vmap(ticks, in_axes=(0, None)))
     for drag in (0.0, 0.3):  # without, and with a part that depends on the state
@@ -106,19 +106,19 @@ def test_flatness_flies_the_turned_reference(make):
     def observe(d):
         frame = EffectiveGravityFrame.of(d)
         here, in_frame = jax.vmap(reference)(times), reference.in_frame(frame)
-        rotation = jax.vmap(in_frame)(times)
+        points = jax.vmap(in_frame)(times)
         close_to = (jax.vmap(frame.vector)(here.p), jax.vmap(frame.vector)(here.v))
         inside = in_frame.distance(frame.vector(away)) / frame.scale
-        return here, rotation, close_to, frame.scale, in_frame.lap, (inside, reference.distance(away))
+        return here, points, close_to, frame.scale, in_frame.lap, (inside, reference.distance(away))
 
-    here, rotation, (p, v), scale, lap, (inside, outside) = jax.tree.map(np.asarray, observe(jnp.array(PUSHES)))
-    close(rotation.p, p)
-    close(rotation.v, v)
-    thrust = rotation.u[..., 0] / scale[:, None]
+    here, points, (p, v), scale, lap, (inside, outside) = jax.tree.map(np.asarray, observe(jnp.array(PUSHES)))
+    close(points.p, p)
+    close(points.v, v)
+    thrust = points.u[..., 0] / scale[:, None]
     needs = np.linalg.norm(here.a - np.array([0.0, 0.0, -9.81]) - np.array(PUSHES)[:, None], axis=-1)
     np.testing.assert_allclose(thrust, needs, rtol=1e-6)
     assert PUSHES[0] == (0.0, 0.0, 0.0)
-    np.testing.assert_allclose(rotation.u[0], here.u[0], atol=0.02)
+    np.testing.assert_allclose(points.u[0], here.u[0], atol=0.02)
     np.testing.assert_array_equal(lap, np.broadcast_to(reference.lap, lap.shape))
     np.testing.assert_allclose(inside, outside, rtol=1e-6)
 
@@ -160,18 +160,18 @@ def test_a_turned_task_sees_and_rewards_the_same(kind, key):
 
     @eqx.filter_jit
     def both(task, frame):
-        rotation, memory = task.in_frame(frame), task.observation.init(x)
+        task_in_frame, memory = task.in_frame(frame), task.observation.init(x)
         outside, _ = task.observation(memory, t, x, Command.hover())
-        inside, _ = rotation.observation(memory, t, frame.state(x), Command.hover())
+        inside, _ = task_in_frame.observation(memory, t, frame.state(x), Command.hover())
         vectors = [(inside[k : k + 3], frame.vector(outside[k : k + 3])) for k in (0, 3, 6, 9, 12, 15, 18, 30)]
-        at = rotation.reference(t)
-        reward = rotation.reward(t, State(at.p, jnp.eye(3), at.v), Command.of(at.u))
-        return vectors, rotation.error(t, frame.state(x)), frame.scale * task.error(t, x), at.heading, reward
+        at = task_in_frame.reference(t)
+        reward = task_in_frame.reward(t, State(at.p, jnp.eye(3), at.v), Command.of(at.u))
+        return vectors, task_in_frame.error(t, frame.state(x)), frame.scale * task.error(t, x), at.heading, reward
 
-    vectors, error, scaling, heading, reward = both(task, frame)
+    vectors, error, scaled_error, heading, reward = both(task, frame)
     for inside, outside in vectors:  # positions, velocities, and its own velocity
         np.testing.assert_allclose(inside, outside, atol=1e-9)
-    np.testing.assert_allclose(error, scaling, rtol=1e-9)
+    np.testing.assert_allclose(error, scaled_error, rtol=1e-9)
     heads = 0.5 * (1.0 - np.cos(float(heading)))
     if kind is L2Track:
         np.testing.assert_allclose(reward, -heads, atol=1e-9)
@@ -266,13 +266,13 @@ def test_what_a_pose_filter_feels_turns_the_picture(key):
         u, after = controller((memory, last), jnp.array(0.0), x)
         start = calm.init(frame.state(x))
         expected, _ = calm((start[0], frame.command(last)), jnp.array(0.0), frame.state(x))
-        rotation = frame.command(u).vector(), expected.vector()
-        return rotation, (after[1], u), (controller.accepted(after, last)[1], last)
+        commands = frame.command(u).vector(), expected.vector()
+        return commands, (after[1], u), (controller.accepted(after, last)[1], last)
 
     back = PointMass(0.02).step(State(x.p, x.R, -x.v), Command.hover(), jnp.zeros(3))
     close(back.p, x.p)  # it hovers: a tick ago it was here
-    rotation, memory, accepted_command = decide()
-    np.testing.assert_allclose(*rotation, atol=1e-4)
+    commands, memory, accepted_command = decide()
+    np.testing.assert_allclose(*commands, atol=1e-4)
     close(*memory)
     close(*accepted_command)
 

@@ -121,8 +121,8 @@ def test_steps_back_are_in_order_and_last_longer_each_time(flying):
     np.testing.assert_allclose(waits, [HOLD, 2 * HOLD, 4 * HOLD], atol=0.1)
     memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
     assert int(memory.stage) == Stage.BASE
-    rest = dataclasses.replace(memory, wait=jnp.zeros_like(memory.wait))
-    back = judge_excess(monitor, rest, excess=0.0)
+    ready = dataclasses.replace(memory, wait=jnp.zeros_like(memory.wait))
+    back = judge_excess(monitor, ready, excess=0.0)
     assert (int(back.stage), int(back.cause)) == (Stage.SLOW, Cause.RECOVERY)
 
 
@@ -147,8 +147,8 @@ def test_a_second_oscillation_is_the_last_one(flying):
     assert int(back.stage) == Stage.SLOW
     twice = judge(monitor, wild(back), jnp.float32(0.0), x)
     assert (int(twice.stage), int(twice.best)) == (Stage.BASE, Stage.BASE)
-    rest = judge_excess(monitor, dataclasses.replace(twice, wait=jnp.float32(0.0)), excess=0.0)
-    assert int(rest.stage) == Stage.BASE
+    calm = judge_excess(monitor, dataclasses.replace(twice, wait=jnp.float32(0.0)), excess=0.0)
+    assert int(calm.stage) == Stage.BASE
 
 
 def test_swings_count_reversals_and_not_steps():

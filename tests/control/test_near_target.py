@@ -47,11 +47,11 @@ def test_an_infinite_limit_changes_nothing(controller):
 
 def test_it_turns_with_its_task(controller):
     frame, x = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5])), random_state(random.key(3))
-    rotation, observation = controller.in_frame(frame), frame.state(x)
-    home = rotation.task.home()
+    in_frame, observation = controller.in_frame(frame), frame.state(x)
+    home = in_frame.task.home()
     near = home + REACH * (observation.p - home) / jnp.linalg.norm(observation.p - home)
     np.testing.assert_allclose(
-        command(rotation, observation),
+        command(in_frame, observation),
         command(controller.inner.in_frame(frame), State(near, observation.R, observation.v)),
         rtol=1e-5,
         atol=1e-5,

@@ -72,8 +72,8 @@ def test_an_inertial_unit_does_not_tell_the_attitude(setup, key):
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY])
     call = eqx.filter_jit(lambda omega, a, x: blind.with_inertial(omega, a)(memory, jnp.array(0.0), x)[0].vector())
     omega = jnp.array([0.3, -0.1, 0.2])
-    rotation = [random_state(k, 0.5) for k in random.split(key, 2)]
-    one, other = (call(omega, so3.act(x.R, specific_force) + gravity, x) for x in rotation)
+    states = [random_state(k, 0.5) for k in random.split(key, 2)]
+    one, other = (call(omega, so3.act(x.R, specific_force) + gravity, x) for x in states)
     np.testing.assert_allclose(one, other, rtol=1e-9)
     assert np.any(np.abs(np.asarray(call(2.0 * omega, gravity, HERE)) - np.asarray(one)) > 1e-3)
 

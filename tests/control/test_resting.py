@@ -46,9 +46,9 @@ def test_at_rest_it_commands_hover(controller, heading, model):
 
 def test_it_turns_with_its_home(controller):
     frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5]))
-    rotation, x = controller.in_frame(frame), random_state(random.key(1))
+    in_frame, x = controller.in_frame(frame), random_state(random.key(1))
     home = frame.state(State.at(jnp.array(GOAL)))
     heading = jnp.arctan2(home.R[1, 0], home.R[0, 0])
     rest = State(home.p, so3.rotz(heading), jnp.zeros(3))
-    np.testing.assert_allclose(command(rotation, rest), Command.hover().vector(), atol=1e-6)
-    assert np.all(np.isfinite(command(rotation, frame.state(x))))
+    np.testing.assert_allclose(command(in_frame, rest), Command.hover().vector(), atol=1e-6)
+    assert np.all(np.isfinite(command(in_frame, frame.state(x))))

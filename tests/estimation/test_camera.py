@@ -41,8 +41,8 @@ def test_looks_down_with_x_to_the_right():
     x = State.at(jnp.array([0.0, 0.0, 3.0]))
     points = in_camera(x, jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
     np.testing.assert_allclose(points, [[0.0, -1.0, 3.0], [-1.0, 0.0, 3.0], [0.0, 0.0, 3.0]], atol=1e-12)
-    rotation = in_camera(replace_fields(x, R=so3.rotz(jnp.array(0.5 * math.pi))), jnp.array([[0.0, 1.0, 0.0]]))
-    np.testing.assert_allclose(rotation, [[0.0, -1.0, 3.0]], atol=1e-12)
+    points = in_camera(replace_fields(x, R=so3.rotz(jnp.array(0.5 * math.pi))), jnp.array([[0.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(points, [[0.0, -1.0, 3.0]], atol=1e-12)
 
 
 def test_bearing_is_the_inverse_of_project(camera):

@@ -55,8 +55,8 @@ def test_a_repeated_measurement():
 
 def test_a_jump_of_the_attitude_and_a_matrix_that_is_no_rotation():
     before, after = motion(random.key(4))
-    rotation = State(after.p, so3.mul(after.R, so3.exp(jnp.array([0.0, 0.0, 1.5]))), after.v)
-    assert names(find(before, rotation)) == ["attitude"]
+    rotated_state = State(after.p, so3.mul(after.R, so3.exp(jnp.array([0.0, 0.0, 1.5]))), after.v)
+    assert names(find(before, rotated_state)) == ["attitude"]
     assert names(find(before, State(after.p, 1.2 * after.R, after.v))) == ["attitude"]
 
 

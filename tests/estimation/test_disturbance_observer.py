@@ -144,11 +144,11 @@ def test_what_a_vehicle_gained_by_another_time_than_a_tick_is_no_disturbance():
     observer, model, u = make(wander=np.inf), PointMass(DT), Command(jnp.array(12.0), jnp.array([0.5, 0.0, 0.0]))
     x = State(jnp.zeros(3), so3.exp(jnp.array([0.3, -0.3, 0.0])), jnp.array([1.0, 0.0, 0.0]))
     step = jax.jit(lambda s, t, x: observer.issued(observer(s, t, x), u))
-    shift = jax.jit(lambda x: model.step(x, u, D))
+    advance = jax.jit(lambda x: model.step(x, u, D))
     s = step(observer.init(x), jnp.array(0.0), x)
     np.testing.assert_array_equal(s.d_hat, 0.0)
     for k in range(1, 40):
-        x = shift(x)
+        x = advance(x)
         if k in (20, 21, 30):
             continue
         before, s = s, step(s, jnp.array(DT * k), x)

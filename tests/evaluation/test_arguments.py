@@ -55,9 +55,9 @@ def test_the_reference_of_a_flight_is_one_that_the_policy_can_follow():
 
 
 def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
-    trained_policy = load("track/retrim")
-    free = changed(trained_policy, adapt={"num_updates": 3}, delay_ticks=0)
-    assert same_policy(trained_policy, free, Path("a.toml")) is free
+    original = load("track/retrim")
+    free = changed(original, adapt={"num_updates": 3}, delay_ticks=0)
+    assert same_policy(original, free, Path("a.toml")) is free
     for changes, text in (
         ({"vehicle": "large"}, "vehicle = 'large', but the policy was trained with 'small'"),
         ({"dt": 0.01}, "dt = 0.01, but the policy was trained with 0.02"),
@@ -66,24 +66,22 @@ def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
         ({"track": {"observation": "both"}}, "track.observation = 'both', but the policy was trained with 'flat'"),
     ):
         with pytest.raises(ConfigError, match=rf"a\.toml: {text}"):
-            same_policy(
-                trained_policy, dataclasses.replace(trained_policy, **_whole(trained_policy, changes)), Path("a.toml")
-            )
+            same_policy(original, dataclasses.replace(original, **_whole(original, changes)), Path("a.toml"))
 
 
 def test_a_flight_may_excite_a_vehicle_but_not_change_its_family():
-    trained_policy = load("hover/any")
-    excitation = changed(trained_policy, family={"excitation": True})
-    assert same_policy(trained_policy, excitation, Path("a.toml")) is excitation
+    original = load("hover/any")
+    excitation = changed(original, family={"excitation": True})
+    assert same_policy(original, excitation, Path("a.toml")) is excitation
     for other, text in (
-        (changed(trained_policy, family={"delay": (0.0, 0.05)}), "family = "),
+        (changed(original, family={"delay": (0.0, 0.05)}), "family = "),
         (
-            dataclasses.replace(trained_policy, axes="world"),
+            dataclasses.replace(original, axes="world"),
             "axes = 'world', but the policy was trained with 'heading'",
         ),
     ):
         with pytest.raises(ConfigError, match=rf"a\.toml: {text}"):
-            same_policy(trained_policy, other, Path("a.toml"))
+            same_policy(original, other, Path("a.toml"))
 
 
 def _whole(preset, changes):

@@ -197,9 +197,9 @@ def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(her
     assert f"2 workers at {here}" in text
     retrim("sweep", "study.toml", "--out", "here", cwd=tmp_path)
     assert rows(tmp_path / "there") == rows(tmp_path / "here")
-    rest = [json.loads(line) for line in (tmp_path / "there/flights.jsonl").read_text().splitlines()]
-    rest[0] |= {"failed": "OSError: gone", "error": None}
-    (tmp_path / "there/flights.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rest))
+    records = [json.loads(line) for line in (tmp_path / "there/flights.jsonl").read_text().splitlines()]
+    records[0] |= {"failed": "OSError: gone", "error": None}
+    (tmp_path / "there/flights.jsonl").write_text("".join(json.dumps(row) + "\n" for row in records))
     retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
     assert [row["n"] for row in rows(tmp_path / "there")] == [2] * 2
     assert not any("failures" in row for row in rows(tmp_path / "there"))
@@ -222,14 +222,14 @@ def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(gap
         def release(self):
             pass
 
-    argument, outer = [], Future()
+    calls, outer = [], Future()
 
     def submit():
-        argument.append("lost" if len(argument) < gap else "finished")
-        return Gone(argument[-1])
+        calls.append("lost" if len(calls) < gap else "finished")
+        return Gone(calls[-1])
 
     Cluster.__new__(Cluster)._start(outer, submit, cluster.ATTEMPTS)
-    assert len(argument) == min(gap + 1, cluster.ATTEMPTS)
+    assert len(calls) == min(gap + 1, cluster.ATTEMPTS)
     if gap < cluster.ATTEMPTS:
         assert outer.result(0) == "whole"
     else:

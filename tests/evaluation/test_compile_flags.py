@@ -16,8 +16,8 @@ def flags_of(monkeypatch):
     """What ``XLA_FLAGS`` says after a command has begun."""
     monkeypatch.setattr(compile_flags, "enable_compile_cache", lambda: None)
 
-    def begin(command, argument="", *, jaxlib="0.10.1", plugins=()):
-        monkeypatch.setenv("XLA_FLAGS", argument)
+    def begin(command, flags="", *, jaxlib="0.10.1", plugins=()):
+        monkeypatch.setenv("XLA_FLAGS", flags)
         monkeypatch.setattr(compile_flags, "version", lambda name: jaxlib)
         monkeypatch.setattr(compile_flags, "entry_points", lambda group: plugins)
         compile_flags.compile_for(command)

@@ -56,12 +56,12 @@ def test_an_interrupted_table_flies_what_is_left_and_is_the_same(study, whole, t
     stop = Run("test", tmp_path)
     watching = Watching(lambda share: share >= 0.5 and stop.stop.set())
     some = fly_all(study, [CALM, PUSH], stop, watching, methods=("base", "indi"), starts=2, seconds=1.0)
-    rest = list((tmp_path / FLIGHTS).iterdir())
+    files = list((tmp_path / FLIGHTS).iterdir())
     assert some.interrupted
-    assert 0 < len(rest) < 4
+    assert 0 < len(files) < 4
     watching = Watching()
     flights, earlier = fly_once(study, tmp_path, reporter=watching)
-    assert earlier == len(rest)
+    assert earlier == len(files)
     assert not flights.interrupted
     assert bits(flights.flights) == bits(whole)
     watching = Watching()

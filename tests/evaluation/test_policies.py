@@ -49,11 +49,11 @@ def test_a_policy_is_trained_once_for_a_folder(tmp_path, requests, monkeypatch):
 def test_what_is_kept_is_flown_with_its_preset_and_what_is_damaged_is_trained_again(tmp_path, requests):
     preset, run, reporter, text = tiny_preset(), Run("test", tmp_path), Silent(), []
     reporter.say = text.append
-    trained_policy = train_policies(preset, (0,), run, reporter)
+    trained_policies = train_policies(preset, (0,), run, reporter)
     (path,) = (tmp_path / "policies").iterdir()
     policy, flight = load_policy(path)
     assert flight == preset
-    assert same(policy, trained_policy[0])
+    assert same(policy, trained_policies[0])
     path.write_bytes(path.read_bytes()[:-40])
     assert same(train_policies(preset, (0,), run, reporter)[0], policy)
     assert same(load_policy(path)[0], policy)

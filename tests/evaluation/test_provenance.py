@@ -61,11 +61,11 @@ def test_a_run_leaves_no_folder_until_it_writes(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="file: results cannot be written there"):
         Run("demo", tmp_path / "file")
-    rest = tmp_path / "kept"
-    rest.mkdir()
-    Run("demo", rest)
-    assert rest.is_dir()
-    assert not list(rest.iterdir())
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    Run("demo", folder)
+    assert folder.is_dir()
+    assert not list(folder.iterdir())
 
 
 def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):

@@ -76,8 +76,8 @@ def test_a_sweep_leaves_a_table_json_a_picture_policies_and_rows(folder):
 def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
     process = start_process(("sweep", "sweep.toml", "--out", "cut"), folder, KILLED)
     out, _ = process.communicate(timeout=180)
-    rest = fly_once(folder / "cut")
-    assert (process.returncode, 0 < len(rest) < 8) == (-signal.SIGKILL, True), out.decode()
+    rows_so_far = fly_once(folder / "cut")
+    assert (process.returncode, 0 < len(rows_so_far) < 8) == (-signal.SIGKILL, True), out.decode()
     assert not (folder / "cut" / "sweep.json").exists()
     policies = {path: path.stat().st_mtime_ns for path in (folder / "cut" / "policies").iterdir()}
     with (folder / "cut" / "flights.jsonl").open("a") as file:
@@ -89,7 +89,7 @@ def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
     assert {path: path.stat().st_mtime_ns for path in (folder / "cut" / "policies").iterdir()} == policies
     assert results(folder / "cut", "sweep.json")["rows"] == results(folder / "whole", "sweep.json")["rows"]
     again = fly_once(folder / "cut")
-    assert again[: len(rest)] == rest  # not flown twice
+    assert again[: len(rows_so_far)] == rows_so_far  # not flown twice
     assert sorted(again) == sorted(fly_once(folder / "whole"))
 
 
@@ -116,16 +116,16 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
     monkeypatch.chdir(tmp_path)
     overlay = tomllib.loads(OVERLAY)["overlay"]
     calls = Sweep(methods=("indi",), disturbances=("none",), plants=("simple",), seconds=1.0, overlay=overlay)
-    trained_policy = []
+    trainings = []
     monkeypatch.setattr(sweep, "bars", lambda *_: None)
     monkeypatch.setattr(sweep, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / f"{stem}.svg"))
     setup = policies.train
-    monkeypatch.setattr(policies, "train", lambda *a, **k: trained_policy.append(0) or setup(*a, **k))
+    monkeypatch.setattr(policies, "train", lambda *a, **k: trainings.append(0) or setup(*a, **k))
 
     def fly():
-        trained_policy.clear()
+        trainings.clear()
         run_sweep(calls, Run("sweep", tmp_path / "out"), Silent())
-        return len(trained_policy), len(fly_once(tmp_path / "out"))
+        return len(trainings), len(fly_once(tmp_path / "out"))
 
     assert [fly(), fly()] == [(1, 1), (0, 1)]
     assert "An earlier run had made 1 of the parts" in (tmp_path / "out" / "sweep.md").read_text()
@@ -208,7 +208,7 @@ def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
     policies = {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}
     fleet = Fleet(preset, policies, [Scenario(plant="simple")], methods=("base",), starts=2, seconds=1.2)
     reporter, run = Silent(), Run("test", tmp_path)
-    rest = sweep._FlightRows(run, reporter)
+    flight_rows = sweep._FlightRows(run, reporter)
     reporter.say = text.append
     calls = []
 
@@ -219,7 +219,7 @@ def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(fleet, "run", flies)
     sweep._fly(
-        fleet, {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}, rest, run, reporter
+        fleet, {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}, flight_rows, run, reporter
     )
     assert (run.failed, run.exit_code) == (True, 1)
     assert text == ["1 flights failed elsewhere, the first by OSError: gone; the same command flies them"]

@@ -145,11 +145,11 @@ def test_c_and_numpy_do_what_jax_does(kind, ticks, place, plain, good, folder, p
     for program in programs:
         process = subprocess.run([program], input=rows.astype(np.float32).tobytes(), capture_output=True, check=True)
         assert process.stderr == b""
-        argument = np.frombuffer(process.stdout, np.float32).reshape(-1, 5)
-        np.testing.assert_array_equal(argument[:, 4], fine)
-        result[program.name] = argument[:, :4]
-    for name, argument in result.items():
-        assert np.max(np.abs(np.array(argument) - expected) / (high - low)) <= SHARE, name
+        outputs = np.frombuffer(process.stdout, np.float32).reshape(-1, 5)
+        np.testing.assert_array_equal(outputs[:, 4], fine)
+        result[program.name] = outputs[:, :4]
+    for name, outputs in result.items():
+        assert np.max(np.abs(np.array(outputs) - expected) / (high - low)) <= SHARE, name
 
 
 def test_the_controller_keeps_every_law(plain):

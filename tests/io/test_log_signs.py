@@ -116,8 +116,8 @@ def test_an_attitude_that_is_turned_about_z_is_named(world, body, tmp_path):
 @pytest.mark.parametrize("degrees", [-150.0, -40.0, 30.0, 100.0])
 def test_a_heading_of_the_attitude_that_differs_is_named(degrees, tmp_path):
     """As that of a compass beside the axes of motion capture."""
-    rotation = Rotation.from_euler("z", -degrees, degrees=True) * Rotation.from_matrix(FLIGHT.R)
-    table = columns(dataclasses.replace(FLIGHT, R=rotation.as_matrix()))
+    rotations = Rotation.from_euler("z", -degrees, degrees=True) * Rotation.from_matrix(FLIGHT.R)
+    table = columns(dataclasses.replace(FLIGHT, R=rotations.as_matrix()))
     with pytest.raises(LogError, match=rf"with attitude.heading = {degrees:.0f} they would"):
         read(tmp_path, table)
     is_the_flight(read(tmp_path, table, attitude__heading=f"{degrees:.0f}"))
@@ -142,10 +142,10 @@ def test_axes_of_any_kind(world, body, tmp_path):
     """Right-handed and left-handed, as those of game engines; y upwards, as motion capture has it."""
     W, B = to_world(world), to_body(body)
     spin = np.linalg.det(B) * B
-    rotation = dataclasses.replace(
+    turned_log = dataclasses.replace(
         FLIGHT, p=FLIGHT.p @ W, v=FLIGHT.v @ W, R=np.swapaxes(W[None], 1, 2) @ FLIGHT.R @ B, omega=FLIGHT.omega @ spin
     )
-    is_the_flight(read(tmp_path, columns(rotation), frames__world=f'"{world}"', frames__body=f'"{body}"'))
+    is_the_flight(read(tmp_path, columns(turned_log), frames__world=f'"{world}"', frames__body=f'"{body}"'))
 
 
 def test_an_attitude_may_have_axes_of_its_own(tmp_path):

@@ -188,8 +188,8 @@ def test_a_strong_wind_is_no_mistake_of_the_map(factor, changes, tmp_path):
 
 @pytest.mark.parametrize("form", ["matrix", "roll pitch yaw"])
 def test_a_strong_wind_is_no_mistake_of_other_attitudes(form, tmp_path):
-    rotation, table = Rotation.from_matrix(WINDY.R), columns(WINDY)
-    values = WINDY.R.reshape(-1, 9) if form == "matrix" else rotation.as_euler("ZYX")[:, ::-1]
+    attitudes, table = Rotation.from_matrix(WINDY.R), columns(WINDY)
+    values = WINDY.R.reshape(-1, 9) if form == "matrix" else attitudes.as_euler("ZYX")[:, ::-1]
     table |= {f"r{i}": values[:, i] for i in range(values.shape[1])}
     fields = str([f"r{i}" for i in range(values.shape[1])]).replace("'", '"')
     log = read(
@@ -258,8 +258,8 @@ def ned(table):
 
 
 def frd(table):
-    rotation = turned_frames(FLIGHT)
-    return columns(dataclasses.replace(FLIGHT, R=FLIGHT.R @ np.diag([1.0, -1.0, -1.0]), omega=rotation.omega))
+    turned_flight = turned_frames(FLIGHT)
+    return columns(dataclasses.replace(FLIGHT, R=FLIGHT.R @ np.diag([1.0, -1.0, -1.0]), omega=turned_flight.omega))
 
 
 DAMAGED_TABLES = {

@@ -13,9 +13,9 @@ N = 40
 
 def recording():
     rng = np.random.default_rng(0)
-    rotation = np.linalg.qr(rng.normal(size=(2, N, 3, 3)))[0]
-    rotation *= np.linalg.det(rotation)[..., None, None]
-    states = [np.concatenate([rng.normal(size=(N, 3)), R.reshape(N, 9), rng.normal(size=(N, 3))], 1) for R in rotation]
+    rotations = np.linalg.qr(rng.normal(size=(2, N, 3, 3)))[0]
+    rotations *= np.linalg.det(rotations)[..., None, None]
+    states = [np.concatenate([rng.normal(size=(N, 3)), R.reshape(N, 9), rng.normal(size=(N, 3))], 1) for R in rotations]
     events = [Event(0.3, "policy", "version 1"), Event(0.1, "knobs", "push 1 0 0")]
     return Recording(
         0.02 * np.arange(N), *states, np.full(N, 0.01), rng.normal(size=(N, 4)), rng.uniform(size=N),

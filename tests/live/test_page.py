@@ -60,8 +60,8 @@ def test_a_port_that_is_taken_is_left_to_who_has_it():
 def test_a_quaternion_turns_as_its_matrix_does(vector):
     w, *u = quaternion(np.asarray(so3.exp(jnp.array(vector))))
     x = np.array([0.3, -0.5, 0.8])
-    rotation = x + 2.0 * np.cross(u, np.cross(u, x) + w * x)
-    np.testing.assert_allclose(rotation, np.asarray(so3.exp(jnp.array(vector))) @ x, atol=1e-12)
+    turned_x = x + 2.0 * np.cross(u, np.cross(u, x) + w * x)
+    np.testing.assert_allclose(turned_x, np.asarray(so3.exp(jnp.array(vector))) @ x, atol=1e-12)
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ AT = 1.4  # [s]
 
 
 @pytest.fixture(scope="module")
-def origin():
+def setups():
     """A set-up on the circle, what it starts from, and the controller."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(brief_preset("track/retrim"), "circle")
@@ -49,8 +49,8 @@ def origin():
 
 
 @pytest.fixture(scope="module")
-def table(origin):
-    return transition_between(origin[0].flight_reference, figure8(), AT, origin[0].vehicle)
+def table(setups):
+    return transition_between(setups[0].flight_reference, figure8(), AT, setups[0].vehicle)
 
 
 def message(table, controller, version=1, computed_from=AT - 0.8):
@@ -84,26 +84,26 @@ class Flight:
 # ---- the process that flies
 
 
-def test_what_is_followed_is_a_parameter_of_the_controller(origin, table):
-    one, other = Flight(origin[2]), Flight(origin[2])
+def test_what_is_followed_is_a_parameter_of_the_controller(setups, table):
+    one, other = Flight(setups[2]), Flight(setups[2])
     for flight in (one, other):
         flight.until(0.7)
-    other.bus.publish("parameters.reference", message(table, origin[2]))
+    other.bus.publish("parameters.reference", message(table, setups[2]))
     for flight in (one, other):
         flight.until(0.96)  # what is seen 0.4 s ahead is still the old one
     np.testing.assert_allclose(one.commands, other.commands, atol=0.02)
     for t in (0.9, 2.0, 3.3, 20.0):
         np.testing.assert_allclose(other.loop.pilot.target(t), table(jnp.array(t)).p, atol=1e-9)
-        np.testing.assert_allclose(one.loop.pilot.target(t), origin[0].flight_task.target(jnp.array(t)), atol=1e-9)
+        np.testing.assert_allclose(one.loop.pilot.target(t), setups[0].flight_task.target(jnp.array(t)), atol=1e-9)
     assert other.status["versions"] == {"policy": 0, "residual": 0, REFERENCE: 1}
     assert other.status["swaps"] == []  # nothing was learnt
 
 
-def test_it_stays_whether_learning_is_flown_or_not(origin, table):
-    flight = Flight(origin[2])
+def test_it_stays_whether_learning_is_flown_or_not(setups, table):
+    flight = Flight(setups[2])
     flight.until(0.7)
     flight.loop.intake.open = False
-    flight.bus.publish("parameters.reference", message(table, origin[2]))
+    flight.bus.publish("parameters.reference", message(table, setups[2]))
     flight.until(0.8)
     expected = np.asarray(table(jnp.array(9.0)).p)
     for learner_state in (False, True, False):
@@ -112,20 +112,20 @@ def test_it_stays_whether_learning_is_flown_or_not(origin, table):
         assert flight.status["versions"][REFERENCE] == 1
 
 
-def test_one_that_comes_too_late_would_jump_and_is_refused(origin, table):
-    flight = Flight(origin[2])
+def test_one_that_comes_too_late_would_jump_and_is_refused(setups, table):
+    flight = Flight(setups[2])
     flight.until(AT)
-    flight.bus.publish("parameters.reference", message(table, origin[2]))
+    flight.bus.publish("parameters.reference", message(table, setups[2]))
     flight.until(AT + 0.1)
     assert flight.status["refused"] == {"late reference": 1}
-    np.testing.assert_allclose(flight.loop.pilot.target(9.0), origin[0].flight_task.target(jnp.array(9.0)), atol=1e-9)
+    np.testing.assert_allclose(flight.loop.pilot.target(9.0), setups[0].flight_task.target(jnp.array(9.0)), atol=1e-9)
 
 
 # ---- the learner
 
 
-def test_the_learner_learns_on_it_without_compiling_again(origin, table, tmp_path):
-    setup, state, controller = origin
+def test_the_learner_learns_on_it_without_compiling_again(setups, table, tmp_path):
+    setup, state, controller = setups
     start = tmp_path / "start.safetensors"
     save_learner_state(start, state, setup.preset)
     bus = InProcessBus(ROOM)
@@ -185,8 +185,8 @@ def poll_requests(follows, supervisor, done, version=0):
     return events
 
 
-def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(origin, tmp_path):
-    follows, supervisor = ask(origin, tmp_path)
+def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(setups, tmp_path):
+    follows, supervisor = ask(setups, tmp_path)
     assert follows.ask("circle", 1.0) == follows.ask("module:name", 1.0) == []  # followed already; not offered
     assert [event.note for event in follows.ask("figure8", 1.0)] == ["reference figure8"]
     assert follows.ask("star", 1.0) == []  # one at a time: it is asked for again below
@@ -208,15 +208,15 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(origin, tmp_path):
     expected = figure8()(jnp.array(12.0)).p
     np.testing.assert_allclose(table(jnp.array(t)).p, expected, atol=1e-3)
 
-    whole = origin[0].on(splice(follows.pieces))  # what its errors are measured by
+    whole = setups[0].on(splice(follows.pieces))  # what its errors are measured by
     x = State.at(expected)
     assert float(whole.flight_task.error(jnp.array(t), x)) < 1e-3
     assert float(whole.flight_task.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
 
 
-def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(origin, tmp_path):
+def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(setups, tmp_path):
     """A table is made for the time of the plant; by the wall's it would be of a time to come, and then too late."""
-    follows, supervisor = ask(origin, tmp_path, behind=5.0)
+    follows, supervisor = ask(setups, tmp_path, behind=5.0)
     follows.ask("figure8", 10.0)
     began = supervisor.fly()
     bus = supervisor.bus
@@ -231,8 +231,8 @@ def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(origin, tmp
     assert follows.pieces[-1][0] == pytest.approx(result.computed_from + following.LEAD)
 
 
-def test_what_leaves_the_fence_or_is_not_taken_is_told(origin, tmp_path, monkeypatch):
-    follows, supervisor = ask(origin, tmp_path, fence=0.5)
+def test_what_leaves_the_fence_or_is_not_taken_is_told(setups, tmp_path, monkeypatch):
+    follows, supervisor = ask(setups, tmp_path, fence=0.5)
     follows.ask("figure8", 1.0)
     (message,) = poll_requests(follows, supervisor, lambda: follows._coming is None)
     assert "reference figure8 cannot be followed: it passes" in message
@@ -250,13 +250,13 @@ def test_what_leaves_the_fence_or_is_not_taken_is_told(origin, tmp_path, monkeyp
     last, controller = supervisor.bus.latest("parameters.reference").data, supervisor.spec.controller
     back = Parameters.unpack(last, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=3)
     np.testing.assert_array_equal(
-        back.arrays["rows"], origin[0].flight_reference.rows
+        back.arrays["rows"], setups[0].flight_reference.rows
     )  # learners go back to what is flown
 
 
-def test_only_who_sees_its_reference_has_a_choice(origin):
-    assert choices(origin[0], "circle") == ("circle", "figure8", "lissajous", "star")
-    assert choices(origin[0], "my.csv") == ("my.csv", "circle", "figure8", "lissajous", "star")
+def test_only_who_sees_its_reference_has_a_choice(setups):
+    assert choices(setups[0], "circle") == ("circle", "figure8", "lissajous", "star")
+    assert choices(setups[0], "my.csv") == ("my.csv", "circle", "figure8", "lissajous", "star")
     assert choices(Setup.from_preset("track/blind"), "figure8") == ()
     assert choices(Setup.from_preset("track/paper"), "figure8") == ("figure8", "circle", "lissajous", "star")
     assert choices(Setup.from_preset("hover/retrim"), "") == ()
@@ -265,15 +265,15 @@ def test_only_who_sees_its_reference_has_a_choice(origin):
     assert pictures["star"].shape == (400, 3)
 
 
-def test_a_set_up_on_another_reference_is_the_same_but_for_it(origin, table):
-    other = origin[0].on(table)
+def test_a_set_up_on_another_reference_is_the_same_but_for_it(setups, table):
+    other = setups[0].on(table)
     assert other.flight_reference is table
-    assert other.env is origin[0].env
+    assert other.env is setups[0].env
     assert (
-        dataclasses.replace(other, flight_task=origin[0].flight_task, learner=origin[0].learner).preset
-        == origin[0].preset
+        dataclasses.replace(other, flight_task=setups[0].flight_task, learner=setups[0].learner).preset
+        == setups[0].preset
     )
-    back = other.on(origin[0].flight_reference)
+    back = other.on(setups[0].flight_reference)
     jax.tree.map(
-        np.testing.assert_array_equal, jax.tree.leaves(back.flight_task), jax.tree.leaves(origin[0].flight_task)
+        np.testing.assert_array_equal, jax.tree.leaves(back.flight_task), jax.tree.leaves(setups[0].flight_task)
     )

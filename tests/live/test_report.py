@@ -94,8 +94,8 @@ def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(requests):
 def test_a_log_that_is_shorter_than_the_flight_is_a_fault_and_missed_ticks_are_none(requests):
     rows = fly_once(requests, ticks=340)
 
-    def lose(rest, ticks=340, **control):
-        return missing(rest, Status(1.0, control, {}, {}, {}, "landed", [], False, 0, None, ticks=ticks), DT)
+    def lose(rows, ticks=340, **control):
+        return missing(rows, Status(1.0, control, {}, {}, {}, "landed", [], False, 0, None, ticks=ticks), DT)
 
     assert lose(rows) == lose(rows[:-5]) == lose(rows[20:]) == lose(rows, ticks=0) == []
     text = "the log is shorter than the flight: it holds"

@@ -329,8 +329,8 @@ def test_re_training_goes_on_from_chunk_to_chunk_and_forgets_the_first(monkeypat
 
     def chunk(state, env, key, optimiser, updates, envs):
         calls.append((state, env, random.key_data(key).tolist(), updates, envs))
-        shift = jax.tree.map(lambda leaf: leaf + 1.0, state.policy.params)
-        return design.PolicyState(state.policy.with_params(shift), state.optimiser), jnp.zeros(updates)
+        params = jax.tree.map(lambda leaf: leaf + 1.0, state.policy.params)
+        return design.PolicyState(state.policy.with_params(params), state.optimiser), jnp.zeros(updates)
 
     monkeypatch.setattr(design, "train_chunk", chunk)
     result = design.retrain(setup, policy, logs, random.key(1), design.CHOICES["low fidelity, res-fwd"],

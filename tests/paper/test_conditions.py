@@ -76,9 +76,9 @@ def test_other_sensors_measure_every_condition_that_names_none_and_has_some(pres
 
 @pytest.mark.parametrize(("preset", "own"), [("track/retrim", small), ("track/fast", kingfisher)])
 def test_every_reference_is_flown_in_every_weather_and_the_first_on_other_vehicles(preset, own):
-    trained_policy = PRESETS[preset]
-    references = trained_policy.track.reference.split("+")
-    result = conditions(trained_policy)
+    base = PRESETS[preset]
+    references = base.track.reference.split("+")
+    result = conditions(base)
     assert {scenario.reference for scenario in result.values()} == set(references)
     for name, scenario in result.items():
         reference, _, what = name.rpartition("/")

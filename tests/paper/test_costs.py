@@ -145,7 +145,7 @@ def test_the_best_settings_stand_below_the_present_ones():
 
 
 def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets, monkeypatch):
-    done, log_records, trained_policy, watching = Imaginary(None), [], [], Watching()
+    done, log_records, trainings, watching = Imaginary(None), [], [], Watching()
     monkeypatch.setattr(design, "train_all", done.train)
 
     def fly(setup, policy, n, seconds, seed):
@@ -153,7 +153,7 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
         return [f"log {seed}.{k}" for k in range(n)]
 
     def retrained(setup, policy, logs, key, choice, *, epochs):
-        trained_policy.append((policy, tuple(logs), choice, epochs, jax.random.key_data(key).tolist()))
+        trainings.append((policy, tuple(logs), choice, epochs, jax.random.key_data(key).tolist()))
         return Retraining(f"re-{policy}", 2.0, [0.5, 0.7], 0.25)
 
     monkeypatch.setattr(design, "fly_batch_of_policy", fly)
@@ -167,7 +167,7 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
         first, *others = log_records[k * (n + 1) : (k + 1) * (n + 1)]
         assert first == (f"policy {seed}", design.ROLLOUTS, design.ROLLOUT_S, 1000 + seed)
         assert others == [(f"re-policy {seed}", 5, design.SCORED_S, seed)] * n
-        mine = trained_policy[k * n : (k + 1) * n]
+        mine = trainings[k * n : (k + 1) * n]
         assert [choice for _, _, choice, *_ in mine] == list(design.CHOICES.values())
         assert all(
             (policy, logs[0], len(logs), epochs) == (f"policy {seed}", f"log {1000 + seed}.0", design.ROLLOUTS, 30)

@@ -98,8 +98,8 @@ def test_the_gauntlet_of_faults_compares_adapting_with_not_adapting(tmp_path, im
         [("late",), ("gaps",)],
         [("late", "gaps")],
     )
-    rest = json.loads((tmp_path / "results.json").read_text())["promise"]
-    assert [(row["scenario"], row["crashed_although_base_survived"], row["holds"]) for row in rest] == [
+    promise = json.loads((tmp_path / "results.json").read_text())["promise"]
+    assert [(row["scenario"], row["crashed_although_base_survived"], row["holds"]) for row in promise] == [
         ("late", STARTS, False), ("gaps", 0, True),
     ]  # fmt: skip
     text = (tmp_path / "faults.md").read_text()
@@ -306,8 +306,8 @@ def test_where_nothing_that_is_drawn_has_landed_the_rest_is_kept(tmp_path, imagi
     """As after a Ctrl-C early on: other methods' flights have landed, and no picture can be made."""
     done = imagine(reversing, lambda spec: 0.1)
     fly = reversing.fly_all
-    rest = lambda *a, **k: Flights([f for f in fly(*a, **k).flights if f.spec.method == "indi"], True)  # noqa: E731
-    monkeypatch.setattr(reversing, "fly_all", rest)
+    fly_indi = lambda *a, **k: Flights([f for f in fly(*a, **k).flights if f.spec.method == "indi"], True)  # noqa: E731
+    monkeypatch.setattr(reversing, "fly_all", fly_indi)
     reversing.reversing(Run("test", tmp_path), Silent(), plant="simple", seeds=SEEDS, seconds=45.0, starts=STARTS)
     assert done.flights
     assert [row["method"] for row in results(tmp_path, "reversing.json")["rows"]] == ["indi"]

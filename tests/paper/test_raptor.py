@@ -74,8 +74,8 @@ def test_it_does_not_care_which_way_is_north(sample_flight):
     at = jnp.array(GOAL)
     path = sample_flight(State.at(at + offset), jnp.array(0.0), Command.hover(float))
     x0 = State(at + Q @ offset, Q, jnp.zeros(3))
-    rotation = sample_flight(x0, jnp.array(turn), Command.hover(float))
-    np.testing.assert_allclose(rotation.p - at[None], (path.p - at[None]) @ Q.T, atol=1e-5)
+    turned_flight = sample_flight(x0, jnp.array(turn), Command.hover(float))
+    np.testing.assert_allclose(turned_flight.p - at[None], (path.p - at[None]) @ Q.T, atol=1e-5)
 
 
 def test_it_flies_as_a_method_and_commands_no_rates(policies):

@@ -194,6 +194,6 @@ def test_rates_lag_as_thrust_does():
     """R after a tick of a roll command: the mean rate, exactly, since the axis stays."""
     u = Command(jnp.array(9.81), jnp.array([2.0, 0.0, 0.0]))
     s = lag_model().step(lag_model().init(State.at(jnp.array(GOAL))), u, STILL)
-    rotation = 2.0 * (DT - TAU * (1.0 - np.exp(-DT / TAU)))
-    np.testing.assert_allclose(so3.log(s.inner.R), [rotation, 0.0, 0.0], atol=1e-12)
+    angle = 2.0 * (DT - TAU * (1.0 - np.exp(-DT / TAU)))
+    np.testing.assert_allclose(so3.log(s.inner.R), [angle, 0.0, 0.0], atol=1e-12)
     assert float(f_a(s.inner, u, STILL).v[1]) < 0.0  # rolled to the right: -y

@@ -44,8 +44,8 @@ def bem(request):
     return strong(BemQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0))
 
 
-def effects(**argument):
-    return ExternalEffects.of(jnp.dtype(float), **strong(argument))
+def effects(**values):
+    return ExternalEffects.of(jnp.dtype(float), **strong(values))
 
 
 def command(c=G, omega=ZERO):
@@ -90,9 +90,9 @@ def loads(model, b, motors, effects):
     return model.loads(b, motors, blades, effects), blades
 
 
-def hovering(model, x=None, **argument):
+def hovering(model, x=None, **options):
     motors = start(model, state()).body.motors
-    return loads(model, body(x or state(), motors), motors, effects(**argument))[0]
+    return loads(model, body(x or state(), motors), motors, effects(**options))[0]
 
 
 # ---- balance
@@ -297,8 +297,8 @@ def test_gradients_over_the_envelope(bem, key):
         slope = (dx.v + du.omega) @ d + du.c * d[0]
         assert float(high - low) / 2.0 == pytest.approx(float(slope), rel=1e-4, abs=1e-10)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((dx, du)))
-    rest = tick(bem, start(bem, state()), state(), command(), weights)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rest))
+    after = tick(bem, start(bem, state()), state(), command(), weights)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
 
 
 def test_hybrid_and_straight_through(key):

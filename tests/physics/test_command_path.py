@@ -69,11 +69,11 @@ def test_second_order_step(zeta):
     omega_n = 2.0 * zeta / lag
     root = np.sqrt(complex(1.0 - zeta**2))
     if abs(zeta - 1.0) < 1e-9:
-        rest = np.exp(-omega_n * times) * (1.0 + omega_n * times)
+        remainder = np.exp(-omega_n * times) * (1.0 + omega_n * times)
     else:
         swing = np.cos(omega_n * root * times) + zeta / root * np.sin(omega_n * root * times)
-        rest = np.real(np.exp(-zeta * omega_n * times) * swing)
-    np.testing.assert_allclose(s.command.omega[:, 0], 1.0 - rest, atol=2e-10)  # the textbook cancels near 1
+        remainder = np.real(np.exp(-zeta * omega_n * times) * swing)
+    np.testing.assert_allclose(s.command.omega[:, 0], 1.0 - remainder, atol=2e-10)  # the textbook cancels near 1
     overshoot = float(s.command.omega[:, 0].max()) - 1.0
     expected = np.exp(-np.pi * zeta / np.sqrt(1.0 - zeta**2)) if zeta < 1.0 else 0.0
     assert overshoot == pytest.approx(expected, abs=5e-3)
@@ -219,15 +219,15 @@ def mixture(path, us, start, weights):
 def test_gradients_against_finite_differences(kappa, key):
     """In commands, start, delay, lags, gains and damping; near the critical damping, too."""
     response = ActuatorResponse.of(0.05, jnp.array([0.03, 0.06, 0.2]), inverse_damping=kappa, thrust_gain=1.1)
-    argument = (CommandPath.of(0.033, response), commands(key, 8), random_command(random.key(5)))
-    cost = jax.jit(lambda argument: mixture(*argument, jnp.array([0.7])))
-    slope = jax.grad(cost)(argument)
-    leaves, shape = jax.tree.flatten(argument)
+    arguments = (CommandPath.of(0.033, response), commands(key, 8), random_command(random.key(5)))
+    cost = jax.jit(lambda arguments: mixture(*arguments, jnp.array([0.7])))
+    slope = jax.grad(cost)(arguments)
+    leaves, shape = jax.tree.flatten(arguments)
     for k in random.split(key, 5):
         way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
         way = shape.unflatten([0.02 * each for each in way])
         h = 1e-5
-        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, argument, way)) for s in (h, -h))
+        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, arguments, way)) for s in (h, -h))
         expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
         assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-5, abs=1e-8)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
@@ -240,10 +240,10 @@ def test_gradients_against_finite_differences(kappa, key):
 )
 def test_gradients_are_finite_at_the_edges(lag, kappa, delay, key):
     response = ActuatorResponse.of(lag, lag, inverse_damping=kappa)
-    argument = (CommandPath.of(delay, response), commands(key, 5), Command.hover(float))
+    arguments = (CommandPath.of(delay, response), commands(key, 5), Command.hover(float))
     for dtype in (jnp.float64, jnp.float32):
-        cast = jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), argument)
-        slope = jax.jit(jax.grad(lambda argument: mixture(*argument, jnp.array([0.7], argument[1].c.dtype))))(cast)
+        cast = jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), arguments)
+        slope = jax.jit(jax.grad(lambda arguments: mixture(*arguments, jnp.array([0.7], arguments[1].c.dtype))))(cast)
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
 
 

@@ -178,10 +178,8 @@ def test_dryden_refuses(mean, altitude, key):
 
 
 def fan(key, **changes):
-    argument = {"speed": 6.0, "width": 0.3, "intensity": 0.0, **changes}
-    return Fan.of(
-        jnp.array([1.0, 2.0, 1.0]), jnp.array(argument.pop("direction", (3.0, 4.0, 0.0))), key=key, **argument
-    )
+    options = {"speed": 6.0, "width": 0.3, "intensity": 0.0, **changes}
+    return Fan.of(jnp.array([1.0, 2.0, 1.0]), jnp.array(options.pop("direction", (3.0, 4.0, 0.0))), key=key, **options)
 
 
 def jet(fan, along, off=0.0):

@@ -92,11 +92,11 @@ def test_a_scenario_fits_the_disturbance_to_its_vehicle():
 def test_hover_commands_rise_near_a_surface_and_sink_under_a_second_vehicle():
     cases = (("table-edge", (1.5, 0.0, 1.0), 1), ("ceiling", (0.0, 0.0, 1.0), 1), ("downwash", (2.0, 0.0, 1.0), -1))
     for name, place, sign in cases:
-        shift = []
+        heights = []
         for case in (name, "none"):
             with Scenario(case, vehicle="large", thrust_error=0.0).make() as plant:
                 plant.reset(State.at(jnp.array(place)))
                 for _ in range(10):
                     measurement, _ = plant.step(Command.hover(jnp.zeros(0).dtype))
-            shift.append(float(measurement.p[2]))
-        assert sign * (shift[0] - shift[1]) > 1e-3, name
+            heights.append(float(measurement.p[2]))
+        assert sign * (heights[0] - heights[1]) > 1e-3, name

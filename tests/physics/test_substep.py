@@ -56,5 +56,5 @@ def test_a_model_need_have_neither(key):
     x = replace_fields(random_state(key), R=jnp.eye(3))
     assert CheapModel().command_limits is None
     assert CheapModel().rotor_state(x) is None
-    shift = CheapModel().step(x, Command.hover(), jnp.zeros(3))
-    np.testing.assert_allclose(shift.p, x.p + 0.02 * x.v, rtol=1e-12)
+    after = CheapModel().step(x, Command.hover(), jnp.zeros(3))
+    np.testing.assert_allclose(after.p, x.p + 0.02 * x.v, rtol=1e-12)

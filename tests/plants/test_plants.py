@@ -109,9 +109,9 @@ def test_command_acts_after_the_delay_and_is_accepted(plant):
 @pytest.mark.parametrize("axis", range(3))
 def test_rates_turn_it_about_its_own_axes(plant, axis):
     """1 rad/s for 0.4 s, less the delay and the rate loop's lag."""
-    rotation = so3.log(after(plant, 20, omega=jnp.zeros(3).at[axis].set(1.0)).R)
-    assert 0.25 < float(rotation[axis]) < 0.4
-    assert float(jnp.linalg.norm(rotation)) == pytest.approx(float(rotation[axis]), rel=0.05)
+    angles = so3.log(after(plant, 20, omega=jnp.zeros(3).at[axis].set(1.0)).R)
+    assert 0.25 < float(angles[axis]) < 0.4
+    assert float(jnp.linalg.norm(angles)) == pytest.approx(float(angles[axis]), rel=0.05)
 
 
 def test_it_measures_how_fast_it_turns_and_how_it_is_accelerated(plant):
@@ -121,11 +121,11 @@ def test_it_measures_how_fast_it_turns_and_how_it_is_accelerated(plant):
         rates = jnp.array([1.5, -1.0, 0.5]) * (1.0 if k < 8 else -1.0)
         elapsed_time.append(plant.step(Command(jnp.array(11.0), rates))[0])
     for before, now in pairwise(elapsed_time):
-        rotation = so3.log(before.R.T @ now.R) / plant.dt
+        rates = so3.log(before.R.T @ now.R) / plant.dt
         ends = np.stack([before.omega, now.omega])
         slack = 0.15 + 0.25 * np.ptp(ends, axis=0)  # it may have turned faster within the tick
-        assert np.all(rotation > ends.min(axis=0) - slack)
-        assert np.all(rotation < ends.max(axis=0) + slack)
+        assert np.all(rates > ends.min(axis=0) - slack)
+        assert np.all(rates < ends.max(axis=0) + slack)
         np.testing.assert_allclose(now.a, (now.v - before.v) / plant.dt, atol=0.02)
     assert float(jnp.linalg.norm(elapsed_time[8].omega)) > 1.0
     assert float(elapsed_time[-1].omega @ elapsed_time[8].omega) < 0.0
@@ -298,9 +298,9 @@ def test_a_command_beyond_the_limits_is_clipped_and_reported(name):
         plant.reset(START)
         _, accepted_command = plant.step(wild)
         np.testing.assert_allclose(accepted_command.vector(), within)
-        shift = after(plant, 5, wild.c, wild.omega)
+        state = after(plant, 5, wild.c, wild.omega)
         np.testing.assert_array_equal(
-            shift.vector(), after(plant, 5, accepted_command.c, accepted_command.omega).vector()
+            state.vector(), after(plant, 5, accepted_command.c, accepted_command.omega).vector()
         )
 
 

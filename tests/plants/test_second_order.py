@@ -175,22 +175,22 @@ def test_another_vehicle_is_never_another_program():
 def test_gradients_against_finite_differences():
     """Of the last state, in commands, start, delay and response."""
     us = draw(8)
-    argument, simulation = (jnp.array(0.033), SLOW, us), plant().simulation
+    arguments, simulation = (jnp.array(0.033), SLOW, us), plant().simulation
 
-    def cost(argument):
-        delay, response, us = argument
+    def cost(arguments):
+        delay, response, us = arguments
         vehicle = dataclasses.replace(simulation.model, response=response)
         x, rates = fly(dataclasses.replace(simulation, delay=delay, model=vehicle), us)
         return jnp.sum(x.p[-1] + 0.3 * x.v[-1] + 0.1 * rates[-1]) + jnp.sum(x.R[-1, 2])
 
     cost = jax.jit(cost)
-    slope = jax.grad(cost)(argument)
-    leaves, shape = jax.tree.flatten(argument)
+    slope = jax.grad(cost)(arguments)
+    leaves, shape = jax.tree.flatten(arguments)
     for k in random.split(random.key(3), 4):
         way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
         way = shape.unflatten([0.01 * each for each in way])
         h = 1e-3
-        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, argument, way)) for s in (h, -h))
+        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, arguments, way)) for s in (h, -h))
         expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
         assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-4)
     assert abs(float(slope[0])) > 1e-3

@@ -111,9 +111,9 @@ def test_rates_acceleration_and_rotor_speeds_are_the_models(name):
     for _ in range(10):
         measurement, _ = plant.step(WILD)
         np.testing.assert_allclose(measurement.a, (measurement.v - before.v) / 0.02, atol=1e-9)
-        rotation = so3.log(before.R.T @ measurement.R) / 0.02  # the mean over the tick
+        omega = so3.log(before.R.T @ measurement.R) / 0.02  # the mean over the tick
         low, high = jnp.minimum(before.omega, measurement.omega), jnp.maximum(before.omega, measurement.omega)
-        assert bool(jnp.all((rotation > low - 0.1) & (rotation < high + 0.1)))
+        assert bool(jnp.all((omega > low - 0.1) & (omega < high + 0.1)))
         before = measurement
     np.testing.assert_allclose(measurement.omega, WILD.omega, atol=0.35)
     assert bool(jnp.all(measurement.motor_speeds > first.motor_speeds))

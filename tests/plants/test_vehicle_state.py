@@ -36,8 +36,8 @@ def test_what_is_new_stays_as_it_is():
 @given(ages, st.lists(st.floats(-8.0, 8.0), min_size=3, max_size=3))
 def test_it_turns_by_its_body_rates(age, omega):
     x = state(age, omega)
-    rotation = x.extrapolate(9.81).R
-    np.testing.assert_allclose(rotation, x.R @ Rotation.from_rotvec(age * np.array(omega)).as_matrix(), atol=1e-9)
+    R = x.extrapolate(9.81).R
+    np.testing.assert_allclose(R, x.R @ Rotation.from_rotvec(age * np.array(omega)).as_matrix(), atol=1e-9)
 
 
 @given(ages)

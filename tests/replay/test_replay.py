@@ -173,8 +173,8 @@ def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, m
     calls = Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True, vehicle=vehicle)
     replay(path, calls, Run("replay", tmp_path), Silent())
     assert "0.3 1/s" in (tmp_path / "vehicle.toml").read_text()
-    message, rest = read_vehicle(tmp_path / "vehicle.toml"), read_vehicle(tmp_path / "heavy.toml")
-    assert message == dataclasses.replace(rest, name="heavy-identified")
+    identified_one, heavy = read_vehicle(tmp_path / "vehicle.toml"), read_vehicle(tmp_path / "heavy.toml")
+    assert identified_one == dataclasses.replace(heavy, name="heavy-identified")
 
 
 def test_no_vehicle_file_is_written_of_a_log_that_says_nothing(brief, files, tmp_path, monkeypatch):

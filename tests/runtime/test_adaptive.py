@@ -182,8 +182,8 @@ def test_learners_are_offered_windows_on_schedule_and_reset_at_each_flight(train
         assert int(window.valid.sum()) == tick + 1  # nothing of an earlier flight
         np.testing.assert_allclose(window.t[np.asarray(window.valid)], 0.02 * np.arange(11), atol=1e-9)
         tick, window = other.windows[-1]
-        rest = log.window(12, end=16)
-        for a, b in zip(jax.tree.leaves(window), jax.tree.leaves(rest), strict=True):
+        expected = log.window(12, end=16)
+        for a, b in zip(jax.tree.leaves(window), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
@@ -215,12 +215,12 @@ def test_windows_are_of_measured_states_and_accepted_commands(trained_policy):
     plant = Odd(limit=limit, sensors="rough")
     log = fly(plant, queue_pilot(setup, policy, learner), setup.flight_starts(1)[0], ticks=16)
     tick, window = learner.windows[-1]
-    rest = log.window(12, end=tick + 1)
-    np.testing.assert_array_equal(window.x.p, rest.x.p)
+    expected = log.window(12, end=tick + 1)
+    np.testing.assert_array_equal(window.x.p, expected.x.p)
     np.testing.assert_array_equal(window.x.v, log.measured.v[4:16])
     assert not np.allclose(window.x.p, log.p[4:16], atol=1e-6)
     # The last command was issued, but not accepted yet; no fit uses it.
-    np.testing.assert_array_equal(window.u.c[:-1], rest.u.c[:-1])
+    np.testing.assert_array_equal(window.u.c[:-1], expected.u.c[:-1])
     np.testing.assert_array_equal(window.u.omega[:-1], log.u[5:16, 1:])
     assert float(window.u.c.max()) <= 9.9 or float(window.u.c[-1]) > 9.9
 

@@ -186,10 +186,10 @@ def test_a_log_gives_the_window_that_was_seen_in_flight(key):
             buffer.accepted(u)
 
     log = fly(Odd(sensors="rough", limit=limit), Keeping(), START, ticks=15)
-    observation, rest = buffer.window(), log.window(10)
-    for a, b in zip(jax.tree.leaves(observation), jax.tree.leaves(rest), strict=True):
+    observation, window = buffer.window(), log.window(10)
+    for a, b in zip(jax.tree.leaves(observation), jax.tree.leaves(window), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
-    assert not np.allclose(rest.x.p, log.p[5:15], atol=1e-6)  # measured, not true
+    assert not np.allclose(window.x.p, log.p[5:15], atol=1e-6)  # measured, not true
     earlier = log.window(4, end=9)
     np.testing.assert_array_equal(earlier.x.p, log.measured.p[5:9])
     np.testing.assert_array_equal(earlier.u.c, log.u[6:10, 0])

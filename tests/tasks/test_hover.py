@@ -88,8 +88,8 @@ def test_starts_keep_to_their_bounds(heading):
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
     tilt = np.arccos(np.asarray(x.R)[:, 2, 2])
     assert tilt.max() <= math.hypot(0.1 * math.pi, 0.1 * math.pi)
-    rotation = np.abs(np.arctan2(np.asarray(x.R)[:, 1, 0], np.asarray(x.R)[:, 0, 0]))
-    assert 0.9 * heading < rotation.max() <= heading + 0.15
+    yaw = np.abs(np.arctan2(np.asarray(x.R)[:, 1, 0], np.asarray(x.R)[:, 0, 0]))
+    assert 0.9 * heading < yaw.max() <= heading + 0.15
     assert np.asarray(x.v).std() == pytest.approx(0.1, rel=0.05)
 
 

@@ -109,16 +109,16 @@ def test_frames(key):
     frame, t = EffectiveGravityFrame.of(PUSH), jnp.array(4.0)
     x, u = random_state(key), Command.of(jnp.array([10.0, 0.1, 0.2, -0.1]))
     task = moving()
-    rotation = task.in_frame(frame)
-    np.testing.assert_allclose(rotation.target(t), frame.vector(task.target(t)), rtol=1e-12)
-    np.testing.assert_allclose(rotation.error(t, frame.state(x)), frame.scale * task.error(t, x), rtol=1e-9)
+    task_in_frame = task.in_frame(frame)
+    np.testing.assert_allclose(task_in_frame.target(t), frame.vector(task.target(t)), rtol=1e-12)
+    np.testing.assert_allclose(task_in_frame.error(t, frame.state(x)), frame.scale * task.error(t, x), rtol=1e-9)
     own = Height(StateObs(jnp.zeros(3), jnp.full(3, 6.0), 0))
     in_frame = own.in_frame(frame)
     np.testing.assert_allclose(in_frame.target(t), frame.vector(own.target(t)), rtol=1e-12)
     np.testing.assert_allclose(in_frame.reward(t, frame.state(x), u), own.reward(t, x, u), rtol=1e-9)
     np.testing.assert_allclose(in_frame.error(t, frame.state(x)), own.error(t, x), rtol=1e-9)
     with pytest.raises(FrameError, match="twice"):
-        rotation.in_frame(frame)
+        task_in_frame.in_frame(frame)
 
 
 def test_only_a_task_without_a_moving_target_rests():

@@ -192,8 +192,8 @@ def check_heading(reference, first, last):
     step = 1e-3
     times = np.arange(first, last, step)
     points = at(reference, times)
-    rotation = turned_by(np.diff(points.heading))
-    np.testing.assert_allclose(rotation / step, 0.5 * (points.heading_rate[1:] + points.heading_rate[:-1]), atol=0.1)
+    turns = turned_by(np.diff(points.heading))
+    np.testing.assert_allclose(turns / step, 0.5 * (points.heading_rate[1:] + points.heading_rate[:-1]), atol=0.1)
 
 
 @winding

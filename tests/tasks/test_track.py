@@ -231,9 +231,9 @@ def test_observed_tracking_errors_by_hand(kind, history, loop, key):
 def test_a_place_is_observed_by_a_policy_that_observes_both_alone(kind, loop, key):
     """Shape and vehicle are moved together: the error stays, and absolute positions do not."""
     by, x = jnp.array([3.0, -7.0, 2.0]), random_state(key)
-    shift = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
+    shifted_loop = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
     see = jax.jit(lambda reference, x: observe_by(observe(kind, reference, 1), 4.4, x)[0])
-    here, there = see(loop, x), see(shift, replace_fields(x, p=x.p + by))
+    here, there = see(loop, x), see(shifted_loop, replace_fields(x, p=x.p + by))
     np.testing.assert_allclose(there[:3] - here[:3], (0.0 if kind == "relative" else by / 1.5), atol=1e-9)
     np.testing.assert_allclose(there[3:], here[3:], atol=1e-9)
 
@@ -247,12 +247,12 @@ def test_preview_shows_the_heading(nose):
 def test_preview_knows_no_place(loop, key):
     """Shape and vehicle moved together: it sees the same. Only one of them moved: it does not."""
     by = jnp.array([3.0, -7.0, 2.0])
-    shift = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
+    shifted_loop = eqx.tree_at(lambda r: r.rows, loop, loop.rows.at[:, :3].add(by))
     x = random_state(key)
     see = jax.jit(lambda reference, x: observe_by(Preview(reference, small().omega_max, 1), 4.4, x)[0])
     there = replace_fields(x, p=x.p + by)
-    np.testing.assert_allclose(see(shift, there), see(loop, x), atol=1e-12)
-    assert float(jnp.abs(see(shift, x) - see(loop, x)).max()) > 1.0
+    np.testing.assert_allclose(see(shifted_loop, there), see(loop, x), atol=1e-12)
+    assert float(jnp.abs(see(shifted_loop, x) - see(loop, x)).max()) > 1.0
 
 
 @pytest.mark.parametrize("t0", [0.0, 1.7, 5.95])

@@ -15,13 +15,13 @@ AT = 7.3
 
 
 @pytest.fixture(scope="module")
-def origin():
+def references():
     return {"circle": circle(), "figure8": figure8(), "star": star()}
 
 
 @pytest.fixture(scope="module")
-def table(origin):
-    return transition_between(origin["circle"], origin["figure8"], AT, small())
+def table(references):
+    return transition_between(references["circle"], references["figure8"], AT, small())
 
 
 def rows(reference):
@@ -33,19 +33,19 @@ def over(table):
     return float(table.lap[0])
 
 
-def test_it_is_the_old_one_before_and_the_new_one_after(origin, table):
+def test_it_is_the_old_one_before_and_the_new_one_after(references, table):
     before = np.linspace(AT - BEFORE, AT - 0.02, 40)
-    for leaf, other in zip(at(table, before), at(origin["circle"], before), strict=True):
+    for leaf, other in zip(at(table, before), at(references["circle"], before), strict=True):
         np.testing.assert_allclose(leaf, other, atol=0.02)  # both are linear between rows of their own
     after = over(table) + np.linspace(0.0, 20.0, 200)
-    np.testing.assert_allclose(at(table, after).p, at(origin["figure8"], after - AT).p, atol=1e-3)
-    np.testing.assert_allclose(at(table, after).heading, at(origin["figure8"], after - AT).heading, atol=1e-9)
+    np.testing.assert_allclose(at(table, after).p, at(references["figure8"], after - AT).p, atol=1e-3)
+    np.testing.assert_allclose(at(table, after).heading, at(references["figure8"], after - AT).heading, atol=1e-9)
 
 
 @pytest.mark.parametrize("pair", [("circle", "figure8"), ("figure8", "star"), ("star", "circle")])
-def test_rates_are_the_derivatives(origin, pair):
+def test_rates_are_the_derivatives(references, pair):
     """Velocity, acceleration and jerk of the table by differences of the ones before, where both shapes are smooth."""
-    table = transition_between(origin[pair[0]], origin[pair[1]], AT, small())
+    table = transition_between(references[pair[0]], references[pair[1]], AT, small())
     t = float(table.since) + float(table.every) * np.arange(rows(table).shape[0])
     flat = rows(table)
     smooth = np.flatnonzero((t > AT + 0.1) & (t < AT + 2.4) & (np.abs(flat[:, 14:17]).max(1) < 60.0))
@@ -58,24 +58,24 @@ def test_rates_are_the_derivatives(origin, pair):
     )
 
 
-def test_the_vehicle_can_fly_it_if_it_is_given_the_time(origin):
+def test_the_vehicle_can_fly_it_if_it_is_given_the_time(references):
     """A second from rest at the other end of a large figure is too much for two seconds."""
     far = figure8_at(8.0)
     vehicle = small()
-    table = transition_between(origin["circle"], far, AT, vehicle)
+    table = transition_between(references["circle"], far, AT, vehicle)
     assert rows(table)[:, 6].max() <= float(vehicle.command_max.c)
     assert (np.abs(rows(table)[:, 7:10]) <= np.asarray(vehicle.omega_max)).all()
     assert over(table) - AT >= LASTING[0]
 
 
-def test_it_takes_the_place_of_the_old_one_in_a_program(origin, table):
-    for reference in (table, transition_between(table, origin["star"], 20.0, small())):
-        for leaf, other in zip(jax.tree.leaves(reference), jax.tree.leaves(origin["circle"]), strict=True):
+def test_it_takes_the_place_of_the_old_one_in_a_program(references, table):
+    for reference in (table, transition_between(table, references["star"], 20.0, small())):
+        for leaf, other in zip(jax.tree.leaves(reference), jax.tree.leaves(references["circle"]), strict=True):
             assert (leaf.shape, leaf.dtype, leaf.weak_type) == (other.shape, other.dtype, other.weak_type)
-        assert jax.tree.structure(reference) == jax.tree.structure(origin["circle"])
+        assert jax.tree.structure(reference) == jax.tree.structure(references["circle"])
 
 
-def test_the_shortest_way_round_is_taken_by_the_nose(origin):
+def test_the_shortest_way_round_is_taken_by_the_nose(references):
     """The old reference has turned by 6 rad, the new one looks along x: the nose goes on to 2 pi, not back to 0."""
     turning = Reference.of(lambda t: [0.0, 0.0, 1.0, min(t, 6.0)], seconds=20.0)
     table = transition_between(turning, circle(), 12.0, small())
@@ -97,31 +97,31 @@ def nose_along(fold):
 @pytest.mark.parametrize("begins", [7.3, 8.0, 9.1])
 @pytest.mark.parametrize("fold", [False, True])
 @pytest.mark.parametrize("winds", ["old", "new", "both"])
-def test_a_heading_that_winds_turns_steadily(origin, winds, fold, begins):
+def test_a_heading_that_winds_turns_steadily(references, winds, fold, begins):
     """Whatever laps end meanwhile, the rate of the heading is its derivative but for whole turns."""
-    old, new = (nose_along(fold) if winds in (which, "both") else origin["figure8"] for which in ("old", "new"))
+    old, new = (nose_along(fold) if winds in (which, "both") else references["figure8"] for which in ("old", "new"))
     table = transition_between(old, new, begins, small())
     t = np.arange(begins - BEFORE, over(table) + 7.0, 1e-3)
     result = at(table, t)
-    rotation = np.remainder(np.diff(result.heading) + np.pi, 2.0 * np.pi) - np.pi
-    np.testing.assert_allclose(rotation / 1e-3, 0.5 * (result.heading_rate[1:] + result.heading_rate[:-1]), atol=0.1)
+    turns = np.remainder(np.diff(result.heading) + np.pi, 2.0 * np.pi) - np.pi
+    np.testing.assert_allclose(turns / 1e-3, 0.5 * (result.heading_rate[1:] + result.heading_rate[:-1]), atol=0.1)
 
 
-def test_roll_outs_start_on_the_new_lap(origin, table):
+def test_roll_outs_start_on_the_new_lap(references, table):
     np.testing.assert_allclose(table.joins, np.tile(table.lap, (3, 1)))
     once = transition_between(
-        origin["circle"], Reference.of(lambda t: [0.1 * np.sin(t) ** 4, 0.0, 1.0], seconds=np.pi), 5.0, small()
+        references["circle"], Reference.of(lambda t: [0.1 * np.sin(t) ** 4, 0.0, 1.0], seconds=np.pi), 5.0, small()
     )
     assert float(once.lap[0]) == float(once.lap[1]) >= 5.0 + LASTING[0]
     np.testing.assert_allclose(at(once, [30.0]).v, 0.0, atol=1e-12)
 
 
-def test_pieces_are_one_reference(origin, table):
-    whole = splice([(0.0, origin["circle"]), (AT - 0.5, table)])
+def test_pieces_are_one_reference(references, table):
+    whole = splice([(0.0, references["circle"]), (AT - 0.5, table)])
     t = np.linspace(0.0, 30.0, 400)
     early = t < AT - 0.5
     result = at(whole, t)
-    np.testing.assert_allclose(result.p[early], at(origin["circle"], t[early]).p, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(result.p[early], at(references["circle"], t[early]).p, rtol=0, atol=1e-12)
     np.testing.assert_allclose(result.p[~early], at(table, t[~early]).p, rtol=0, atol=1e-12)
-    for place in (at(origin["circle"], [5.0]).p[0], at(origin["figure8"], [9.0]).p[0]):
+    for place in (at(references["circle"], [5.0]).p[0], at(references["figure8"], [9.0]).p[0]):
         assert float(whole.distance(jnp.asarray(place))) < 1e-3

@@ -87,8 +87,8 @@ def test_an_invalid_row_does_not_count(key):
         np.testing.assert_array_equal(a, b)
     nothing = dataclasses.replace(rows, valid=jnp.zeros(N, dtype=bool))
     state, _ = fit(MODEL, MODEL.init(key), rows)
-    rest, _ = fit(MODEL, state, nothing)
-    jax.tree.map(np.testing.assert_array_equal, rest, state)
+    after, _ = fit(MODEL, state, nothing)
+    jax.tree.map(np.testing.assert_array_equal, after, state)
 
 
 def test_single_precision_is_enough(key):

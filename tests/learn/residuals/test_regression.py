@@ -118,8 +118,8 @@ def test_it_turns_with_the_world(key):
     Q = so3.exp(random.normal(key, (3,)))
     rows = rows_of(0.5 * random.normal(key, (10,)) * MODEL.prior, key, noise=0.2)
     x = jax.vmap(lambda x: type(x)(so3.act(Q, x.p), so3.mul(Q, x.R), so3.act(Q, x.v)))(rows.x)
-    rotation = Targets(x, rows.u, rows.a_res @ Q.T, rows.omega, rows.valid)
-    here, there = fit(isotropic, rows)[0], fit(isotropic, rotation)[0]
+    turned_rows = Targets(x, rows.u, rows.a_res @ Q.T, rows.omega, rows.valid)
+    here, there = fit(isotropic, rows)[0], fit(isotropic, turned_rows)[0]
     one = jax.tree.map(lambda leaf: leaf[3], rows.x), jax.tree.map(lambda leaf: leaf[3], rows.u)
     other = jax.tree.map(lambda leaf: leaf[3], x), one[1]
     np.testing.assert_allclose(MODEL.predict(there, *other), so3.act(Q, MODEL.predict(here, *one)), atol=1e-9)

@@ -92,12 +92,12 @@ def test_rows_wait_until_the_lag_has_settled(tau, filling, key):
     """The first ceil(3 tau / dt) valid rows: until then the lag still remembers the hover that it assumed."""
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=1)
     window = replace_fields(window, valid=jnp.arange(30) >= filling)
-    has_settled = residual_targets(window, LaggedModel(PointMass(DT), first_order(tau)), delay_ticks=1).valid
+    valid = residual_targets(window, LaggedModel(PointMass(DT), first_order(tau)), delay_ticks=1).valid
     plain = residual_targets(window, PointMass(DT), delay_ticks=1).valid
     assert np.argmax(plain) == filling  # without a lag every valid row counts
     assert np.sum(plain) == 28 - filling
     ticks = math.ceil(3.0 * tau / DT - 0.01)
-    np.testing.assert_array_equal(np.flatnonzero(has_settled), np.arange(filling + ticks, 28))
+    np.testing.assert_array_equal(np.flatnonzero(valid), np.arange(filling + ticks, 28))
 
 
 # ---- windows
