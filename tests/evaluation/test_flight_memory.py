@@ -12,7 +12,7 @@ from helpers import tiny_preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.errors import CheckpointError, ConfigError
-from retrim.runkit.flight_memory import FlightMemory
+from retrim.runkit.flight_memory import FlightMemory, recall_flight
 from retrim.runkit.flights import Flight, FlightSpec
 from retrim.runtime.flight import Log, States
 
@@ -65,7 +65,7 @@ def test_the_next_flight_starts_with_the_map(tmp_path, setup, policy, state):
     memory = FlightMemory(tmp_path / "hall", "small")
     assert memory.state(setup, policy, "full", 0) is None
     assert "no earlier flight" in memory.describe(setup)
-    (file,) = memory.write([flight(state)], setup)
+    (file,) = memory.write([flight(state)], setup, [])
     assert file.parent == tmp_path / "hall"
     assert "0.0 h ago" in memory.describe(setup)
     start = memory.state(setup, policy, "full", 0)
@@ -77,14 +77,14 @@ def test_the_next_flight_starts_with_the_map(tmp_path, setup, policy, state):
 @pytest.mark.parametrize("method", ["full", "lora"])
 def test_the_state_has_the_shapes_of_a_new_one(tmp_path, setup, policy, state, method):
     memory = FlightMemory(tmp_path, "small")
-    memory.write([flight(state)], setup)
+    memory.write([flight(state)], setup, [])
     recalled = memory.state(setup, policy, method, 0)
     pilot = setup.pilot(policy, method, random.key(1))
     assert jax.tree.map(jnp.shape, recalled) == jax.tree.map(jnp.shape, pilot.state)
 
 
 def test_each_vehicle_has_its_own_memory(tmp_path, setup, policy, state):
-    FlightMemory(tmp_path, "small").write([flight(state)], setup)
+    FlightMemory(tmp_path, "small").write([flight(state)], setup, [])
     assert FlightMemory(tmp_path, "large").state(setup, policy, "full", 0) is None
 
 
@@ -95,15 +95,41 @@ def test_a_map_without_evidence_remains_unused(setup, state):
 
 
 def test_lost_flights_leave_no_memory(tmp_path, setup, state):
-    memory = FlightMemory(tmp_path, "small")
-    assert memory.write([flight(state, terminated=True), flight(None)], setup) == []
+    memory, faults = FlightMemory(tmp_path, "small"), []
+    assert memory.write([flight(state, terminated=True), flight(None)], setup, faults) == []
     assert list(tmp_path.iterdir()) == []
+    assert "unchanged" in faults[0]
+
+
+def test_a_folder_that_cannot_be_written_is_a_fault_after_the_flight(tmp_path, setup, state):
+    (tmp_path / "hall").touch()
+    faults = []
+    assert FlightMemory(tmp_path / "hall", "small").write([flight(state)], setup, faults) == []
+    assert "cannot be written" in faults[0]
+
+
+def test_a_file_instead_of_a_folder_is_refused_before_the_flight(tmp_path, setup, policy):
+    (tmp_path / "hall").touch()
+    with pytest.raises(ConfigError, match="must be a folder"):
+        recall_flight(tmp_path / "hall", setup, Scenario(), policy, None, "full", 0, print)
+
+
+@pytest.mark.parametrize("factor", [100.0, -1e3])
+def test_a_map_with_impossible_accelerations_is_refused(tmp_path, setup, policy, state, factor):
+    """The numbers are finite and the checksum is right."""
+    place_map = state.residual.map
+    changes = {"moment": 1e3 * place_map.moment} if factor > 0 else {"precision": factor * place_map.precision}
+    residual = dataclasses.replace(state.residual, map=dataclasses.replace(place_map, **changes))
+    memory = FlightMemory(tmp_path, "small")
+    memory.write([flight(dataclasses.replace(state, residual=residual))], setup, [])
+    with pytest.raises(CheckpointError, match="remove the file"):
+        memory.state(setup, policy, "full", 0)
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-9], lambda data: b"MZ" + data[2:], lambda data: b""])
 def test_a_damaged_memory_is_refused_in_one_line(tmp_path, setup, policy, state, damage):
     memory = FlightMemory(tmp_path, "small")
-    (file,) = memory.write([flight(state)], setup)
+    (file,) = memory.write([flight(state)], setup, [])
     file.write_bytes(damage(file.read_bytes()))
     with pytest.raises(CheckpointError) as error:
         memory.state(setup, policy, "full", 0)

@@ -17,7 +17,7 @@ from ..evaluation.fleet import Fleet
 from ..evaluation.flight_table import figure_cells, figure_columns
 from ..evaluation.metrics import notes, rows
 from ..runkit.document import TableSection
-from ..runkit.flight_memory import FlightMemory, recall_flight
+from ..runkit.flight_memory import FlightMemory, recall_flight, write_memory
 from ..runkit.flights import Flight
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
@@ -109,7 +109,7 @@ def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, 
         outlet.write_flights(flights, preset)
         pictures = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []
         results = outlet.write_results(run, result, seeds=list(fleet.policies), preset=preset.name)
-        memories = memory.write(flights, setup) if memory else []
+        memories = write_memory(memory, flights, setup, outlet.faults)
     n, steady = result[0]["n"], min(flights[0].steady_seconds, fleet.seconds)
     title = f"{preset.task} error, last {steady:g} s of {fleet.seconds:g} s, {n} start{'s' * (n > 1)}"
     title += f", plant {scenario.plant}, sensors {scenario.sensors}"

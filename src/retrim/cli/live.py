@@ -24,7 +24,7 @@ from ..live.operator.page_opening import open_page
 from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
 from ..live.status import Status
 from ..runkit.document import TableSection
-from ..runkit.flight_memory import FlightMemory, recall_flight
+from ..runkit.flight_memory import FlightMemory, recall_flight, write_memory
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import train
@@ -131,7 +131,8 @@ def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None, memory: Flig
     pictures = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
     vehicle_path, code = save_flight_vehicle(done.flight, setup, vehicle_file)
-    show_paths([*(pictures or [])[:1], *done.paths, *vehicle_path, *(memory.write(flights, setup) if memory else [])])
+    memories = write_memory(memory, flights, setup, done.outlet.faults)
+    show_paths([*(pictures or [])[:1], *done.paths, *vehicle_path, *memories])
     codes = [refuse(fault) for fault in done.outlet.faults]
     return run.exit_code or max(codes, default=int(not done.has_landed)) or code
 

@@ -29,6 +29,7 @@ from .flights import Flight
 
 KIND = "memory"
 MOST = 1e12  # largest number in a file
+STRONGEST = 50.0  # [m/s^2], largest acceleration of a map
 MEMORY_TAG = 2**30 + 7  # folded into the seed of a flight for the parts of the state that are not remembered
 
 
@@ -45,7 +46,7 @@ class FlightMemory:
         """Return the file for a set-up: one for each vehicle, residual model and control period."""
         preset = setup.preset
         name = f"{self.vehicle}_{preset.adapt.residual}_{1000 * preset.dt:g}ms"
-        return self.folder / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name)}.safetensors"
+        return self.folder / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name).lstrip('.-')}.safetensors"
 
     def state(self, setup: Setup, policy: AbstractPolicy, method: str, seed: int) -> LearnerState | None:
         """Return the learner state at the start of the next flight; None if there is no earlier flight.
@@ -73,8 +74,15 @@ class FlightMemory:
         except MessageError as error:
             raise CheckpointError(f"{error}; remove the file to fly without it") from error
         check_size(residual, source=str(path), largest=MOST)
+        recalled = recall(residual)
+        model: Any = setup.learner.residual_model
+        if not (strength := float(model.strength(recalled))) <= STRONGEST:
+            raise CheckpointError(
+                f"{path}: its map has accelerations of {strength:.3g} m/s^2, at most {STRONGEST:g} can be flown; "
+                "remove the file to fly without it"
+            )
         fresh = setup.learner.init(learns(setup, policy, key), key)
-        return dataclasses.replace(fresh, residual=recall(residual))
+        return dataclasses.replace(fresh, residual=recalled)
 
     def describe(self, setup: Setup) -> str:
         """Return one line about the memory and its age."""
@@ -84,23 +92,31 @@ class FlightMemory:
         hours = (time.time() - path.stat().st_mtime) / 3600.0
         return f"memory: {path}, written {hours:.1f} h ago"
 
-    def write(self, flights: Sequence[Flight], setup: Setup) -> list[Path]:
+    def write(self, flights: Sequence[Flight], setup: Setup, faults: list[str]) -> list[Path]:
         """Write the memory after the first flight that learned and was not terminated; return the file, if any.
 
         Args:
             flights: Flights of one set-up.
             setup: Set-up of the flights.
-
-        Raises:
-            OSError: The file cannot be written.
+            faults: Receives one line if the file cannot be written, or if no flight can be remembered.
         """
         state = next((f.learner_state for f in flights if f.learner_state is not None and not f.log.terminated), None)
         if state is None:
+            faults.append(f"the memory in {self.folder} is unchanged: no flight that learned ended without a crash")
             return []
         about = {"vehicle": self.vehicle, "residual": setup.preset.adapt.residual, "version": this_release()}
         path = self.path(setup)
-        write_whole(path, wire.pack(state.residual, kind=KIND, about=about))
+        try:
+            write_whole(path, wire.pack(state.residual, kind=KIND, about=about))
+        except OSError as error:
+            faults.append(f"the memory cannot be written to {path} ({error.strerror or error})")
+            return []
         return [path]
+
+
+def write_memory(memory: FlightMemory | None, flights: Sequence[Flight], setup: Setup, faults: list[str]) -> list[Path]:
+    """Write a memory after its flights; return the file, if any. See :meth:`FlightMemory.write`."""
+    return [] if memory is None else memory.write(flights, setup, faults)
 
 
 def recall_flight(
@@ -133,6 +149,10 @@ def recall_flight(
         return None, state
     if state is not None:
         raise ConfigError("--memory and --resume: choose one, since each has a residual model of its own")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--memory {folder} must be a folder ({error.strerror or error})") from error
     memory = FlightMemory(folder, scenario.vehicle_name(setup.preset.vehicle))
     state = memory.state(setup, policy, method, seed)
     say(memory.describe(setup))

@@ -13,10 +13,10 @@ from jax import random
 from jaxtyping import Array, Key
 
 from retrim.config.vehicle_file import VehicleSpec
+from retrim.config.vehicles import make_vehicle
 from retrim.physics.effects import ExternalEffects
 from retrim.physics.state import Command, State
 from retrim.physics.substep import AbstractSubstepDynamics, RotorState, check_tick, rigid_body, signs
-from retrim.physics.vehicle import Vehicle
 from retrim.plants.entry import PlantEntry, PlantRequest
 from retrim.plants.plant import Plant
 from retrim.plants.sim import SimPlant
@@ -27,7 +27,7 @@ LINEAR_DRAG, QUADRATIC_DRAG = (0.3, 0.3, 0.0), 0.08  # per mass: [1/s] and [1/m]
 LOSS, LOSS_SCALE, NOISE = 0.1, 1.3, 0.02  # an input u loses LOSS (u / LOSS_SCALE)^2; its noise is NOISE sqrt(u)
 RATES_MAX = (20.0, 20.0, 3.0)  # [rad/s], of the on-board rate loop
 RATE_GAINS = (50.0, 50.0, 5.0)  # [1/s], of the on-board rate loop; the rotors have little torque about z
-YAW_SHARE = 0.3  # largest share of a rotor's mean thrust that yaw may add or remove
+YAW_SHARE = 0.8  # largest share of a rotor's mean thrust that yaw may add or remove
 
 
 class NoisyState(eqx.Module):
@@ -108,18 +108,16 @@ def vehicle_file() -> VehicleSpec:
     )
 
 
-def _limits(vehicle: Vehicle) -> tuple[Command, Command]:
-    return vehicle.command_min, vehicle.command_max
-
-
 def _make(r: PlantRequest) -> Plant:
-    model = SimplifiedQuadrotor(_limits(r.vehicle), random.key(r.seed), r.dt)
+    own = make_vehicle(vehicle_file())
+    model = SimplifiedQuadrotor((own.command_min, own.command_max), random.key(r.seed), r.dt)
     return SimPlant(model, r.disturbance, delay_s=0.0, sensors=r.sensors, fault=r.fault, seed=r.seed)
 
 
 entry = PlantEntry(
     _make,
     "the simplified quadrotor of GP-MPC and neural MPC at 1 kHz: drag, rotor losses and noise, without delay",
+    own_vehicle="simplified",
     has_sensors=True,
     has_faults=True,
 )

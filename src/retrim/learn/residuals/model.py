@@ -21,7 +21,7 @@ class ResidualModel(Protocol):
     which takes the arguments of ``predict`` and returns one standard deviation per axis [m/s^2]. A model with a part
     that depends on position has a method ``at_place``, which maps its state and a position [m] to this part [m/s^2]. A
     model that remembers over flights has a method ``recall``, which maps the state at the end of a flight to the state
-    at the start of the next one.
+    at the start of the next one, and a method ``strength``, which returns the largest acceleration in a state [m/s^2].
     """
 
     def init(self, key: Key[Array, ""]) -> Any:

@@ -173,6 +173,14 @@ class PlaceModel(eqx.Module):
             state, first=self.first.init(random.key(0)), map=faint, agreement=evidence, prediction=evidence
         )
 
+    def strength(self, state: PlaceState) -> Float[Array, ""]:
+        """Return the largest weight of a bump [m/s^2]; it is not finite if the map is unusable.
+
+        Args:
+            state: State of the model.
+        """
+        return jnp.max(jnp.abs(state.map.weights))
+
     def turning(self, state: PlaceState) -> RateFit | None:
         """Return the bias and lag of the body rates, if the first model identifies them."""
         turning = getattr(self.first, "turning", None)
