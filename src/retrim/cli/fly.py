@@ -84,10 +84,8 @@ def fly(
         setup, say = Setup.from_preset(preset, scenario.reference), RichReporter().say
         memory, state = recall_flight(flight.memory, setup, scenario, weights, state, adapt, seed, say)
         methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)
-        fleet = Fleet(
-            preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds, latency=latency,
-            state=state,
-        )  # fmt: skip
+        fleet = Fleet(preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds,
+                      latency=latency, state=state)  # fmt: skip
         run = report_start(Run("fly", out, stop=stop))
         _warn(setup, scenario)
         return _fly(fleet, scenario, run, save_vehicle, memory)
