@@ -150,7 +150,7 @@ def decide(medians: dict[str, float], losses: dict[str, int]) -> str:
 
     Args:
         medians: Median score of each column [m]; infinite if most flights were lost.
-        lost: Number of lost flights of each column.
+        losses: Number of lost flights of each column.
     """
     rivals = {name: medians[name] for name in COMPARABLE if name in medians}
     if not rivals:
