@@ -149,12 +149,12 @@ def recall_flight(
         return None, state
     if state is not None:
         raise ConfigError("--memory and --resume: choose one, since each has a residual model of its own")
+    memory = FlightMemory(folder, scenario.vehicle_name(setup.preset.vehicle))
+    state = memory.state(setup, policy, method, seed)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--memory {folder} must be a folder ({error.strerror or error})") from error
-    memory = FlightMemory(folder, scenario.vehicle_name(setup.preset.vehicle))
-    state = memory.state(setup, policy, method, seed)
     say(memory.describe(setup))
     return memory, state
 
