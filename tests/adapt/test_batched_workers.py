@@ -101,7 +101,7 @@ class Renamed(PolicyWorker):
 
 def test_a_worker_with_its_own_computation_is_not_stacked(fleet):
     learner, workers, windows = fleet
-    assert [each.stackable for each in (Worker, ResidualWorker, PolicyWorker, DoubleLinear, Renamed)] == [
+    assert [each.batch is not None for each in (Worker, ResidualWorker, PolicyWorker, DoubleLinear, Renamed)] == [
         False, True, True, False, True
     ]  # fmt: skip
     doubled = [DoubleLinear(learner, worker.state) for worker in workers]

@@ -147,5 +147,11 @@ def test_a_method_that_does_not_learn_is_refused(tmp_path, setup, policy):
         FlightMemory(tmp_path, "small").state(setup, policy, "base", 0)
 
 
+def test_vehicles_whose_file_names_are_equal_do_not_share_a_map(tmp_path, setup, policy, state):
+    FlightMemory(tmp_path, "my quad").write([flight(state)], setup, [])
+    with pytest.raises(CheckpointError, match="'my quad', expected 'my-quad'"):
+        FlightMemory(tmp_path, "my-quad").state(setup, policy, "full", 0)
+
+
 def test_names_of_vehicles_cannot_leave_the_folder(tmp_path, setup):
     assert FlightMemory(tmp_path, "../../other").path(setup).parent == tmp_path

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 
 from retrim.config.methods import find_method
+from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
 from retrim.evaluation.study import refuse_misfits
 from retrim.runkit import Run
+from retrim.runkit.flights import Flight, FlightSpec
 from retrim.runkit.reporter import Silent
+from retrim.runtime.flight import Log, States
+from retrim_paper.regimes import height_error_above_table
 from retrim_paper.tables.where_learning_pays import OPPONENTS, _cell, _methods, decide, regimes, where_learning_pays
 
 NONE_LOST = dict.fromkeys((*OPPONENTS, "adapted"), 0)
@@ -44,6 +48,17 @@ def test_a_cell_shows_lost_flights_and_millimetres():
     assert text.startswith("3.0 (2.0 to ∞)")
     assert text.endswith("1 of 3 lost")
     assert _cell(np.array([np.inf, np.inf])).startswith("∞")
+
+
+@pytest.mark.parametrize(("lowest", "touches"), [(0.99, False), (0.97, True)])
+def test_a_contact_with_the_table_counts_as_a_loss(lowest, touches):
+    """The table is 2 cm below a vehicle at 1 m."""
+    p = np.array([[1.5, 0.0, 1.0], [1.5, 0.0, lowest], [1.5, 0.0, 1.0]])
+    states = States(p, np.stack([np.eye(3)] * 3), np.zeros((3, 3)))
+    log = Log(0.02 * np.arange(3), states, states, np.zeros((3, 4)), 0.02, False)
+    spec = FlightSpec(Scenario("table-edge"), "full", 0)
+    flight = Flight(spec, "large", log, np.zeros(3), "error", 0.02, target=np.repeat(p[:1], 3, axis=0))
+    assert np.isinf(height_error_above_table(flight)) == touches
 
 
 def test_regimes_have_unique_names_and_registered_methods():

@@ -12,7 +12,7 @@ from jax import lax, random
 from jaxtyping import Array, Key
 
 from ..learn.bptt import PolicyState, policy_gradient
-from ..learn.devices import to_default_device
+from ..learn.devices import shard, to_default_device
 from ..learn.residuals.model import FittedResidual
 from ..learn.stacking import stack
 from ..learn.window import Window
@@ -33,6 +33,11 @@ class ResidualBatch(WorkerBatch):
     def __init__(self, learner: OnlineLearner) -> None:
         self.learner = learner
 
+    @classmethod
+    def of(cls, workers: Sequence[Any]) -> "ResidualBatch":
+        """Return the batch of residual workers with one learner."""
+        return cls(workers[0].learner)
+
     def learn(self, states: Any, windows: Window, incumbents: Any = None) -> BatchUpdate:
         """Fit the residual of each vehicle; ``states`` are the states of the residual models."""
         residuals, reports = _fit_all(self.learner, states, windows)
@@ -48,6 +53,11 @@ class PolicyBatch(WorkerBatch):
 
     def __init__(self, learner: OnlineLearner, keys: Key[Array, " n"]) -> None:
         self.learner, self.keys = learner, keys
+
+    @classmethod
+    def of(cls, workers: Sequence[Any]) -> "PolicyBatch":
+        """Return the batch of policy workers with one learner, which starts from their random keys."""
+        return cls(workers[0].learner, shard(jnp.stack([worker.key for worker in workers])))
 
     def learn(self, states: LearnerState, windows: Window, incumbents: Any = None) -> BatchUpdate:
         """Re-train the policy of each vehicle; a vehicle keeps its old policy if the gate refuses the new one."""
@@ -68,7 +78,7 @@ def learn_together(
 ) -> list[Update]:
     """Learn from one window for each of several vehicles.
 
-    Workers that are not stackable learn one after another. Each vehicle's result equals that of its worker alone, up to
+    Workers without a batch learn one after another. Each vehicle's result equals that of its worker alone, up to
     rounding. Programs are compiled for batch sizes that are powers of two. Copies pad the batch to the next power, and
     their results are dropped, so any number of vehicles may be due.
 
@@ -81,10 +91,11 @@ def learn_together(
     Returns:
         The update of each vehicle.
     """
-    if not workers[0].stackable:
+    kind = workers[0].batch
+    if kind is None:
         return [worker.learn(window) for worker, window in zip(workers, windows, strict=True)]
     numbers = _pad_numbers(len(workers))
-    batch = type(workers[0]).stack([workers[i] for i in numbers])
+    batch = kind.of([workers[i] for i in numbers])
     states = [worker.state for worker in workers]
     incumbents = None if base is None else stack([states[i].policy.policy for i in numbers])
     together = stack([states[i] if base is None else _on(states[i], base) for i in numbers])

@@ -26,6 +26,11 @@ class BatchUpdate(NamedTuple):
 class WorkerBatch(abc.ABC):
     """Workers of several vehicles, whose computations run as one program."""
 
+    @classmethod
+    @abc.abstractmethod
+    def of(cls, workers: Sequence[Any]) -> "WorkerBatch":
+        """Return the batch of workers of one class with one learner."""
+
     @abc.abstractmethod
     def learn(self, states: Any, windows: Window, incumbents: Any = None) -> BatchUpdate:
         """Learn from the window of each vehicle; all arrays have a leading axis of vehicles.
@@ -47,20 +52,21 @@ class Worker(abc.ABC):
     A worker's state advances only when the worker receives its own update after publication. A result that is dropped
     on the way (because of a new flight or a lost message) therefore never becomes the base of the next result.
 
-    A class of workers that can also learn as one batch defines ``stack`` and ``state``. A subclass that changes
-    ``learn`` does not inherit this ability.
+    A class of workers that can also learn as one batch defines ``batch`` and ``state``. A subclass that changes
+    ``learn`` does not inherit ``batch``.
     """
 
     layer: Layer
     learner: Any
     """Online learner of the reference. Workers that form a batch share one learner."""
-    stackable: ClassVar[bool] = False
-    """Whether workers of this class can learn as one batch."""
+    batch: ClassVar[type[WorkerBatch] | None] = None
+    """Batch that several workers of this class form; None if each worker learns alone."""
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Determine whether the class has a batch that computes the same as ``learn``."""
+        """Drop an inherited batch, which does not compute the same as a new ``learn``."""
         super().__init_subclass__(**options)
-        cls.stackable = "stack" in vars(cls) or (cls.stackable and "learn" not in vars(cls))
+        if "learn" in vars(cls) and "batch" not in vars(cls):
+            cls.batch = None
 
     @abc.abstractmethod
     def learn(self, window: Window) -> Update:
@@ -77,15 +83,6 @@ class Worker(abc.ABC):
             learner: Online learner of the new reference.
         """
         self.learner = learner
-
-    @classmethod
-    def stack(cls, workers: Sequence[Any]) -> WorkerBatch:
-        """Return workers of this class with one learner as a batch.
-
-        Raises:
-            NotImplementedError: The class is not ``stackable``.
-        """
-        raise NotImplementedError(f"{cls.__name__}: workers must be stackable to form a batch; let each learn alone")
 
     @property
     def state(self) -> Any:

@@ -1,16 +1,14 @@
 """The two workers of an online learner: one fits the residual, and one re-trains the policy."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Key
 
 from ..control.lora import LoraPolicy
 from ..learn.bptt import PolicyState
-from ..learn.devices import shard, suitable_device
+from ..learn.devices import suitable_device
 from ..learn.window import Window
 from .batched_workers import PolicyBatch, ResidualBatch
 from .learner import OnlineLearner
@@ -23,6 +21,7 @@ class ResidualWorker(Worker):
     """Fits the residual model, starting from its last published fit."""
 
     layer: Layer = "residual"
+    batch = ResidualBatch
 
     def __init__(self, learner: OnlineLearner, state: LearnerState) -> None:
         self.learner, self._residual = learner, state.residual
@@ -35,11 +34,6 @@ class ResidualWorker(Worker):
     def state_in(self, state: LearnerState) -> Any:
         """Return the residual's state."""
         return state.residual
-
-    @classmethod
-    def stack(cls, workers: Sequence[Any]) -> ResidualBatch:
-        """Return the workers as a batch."""
-        return ResidualBatch(workers[0].learner)
 
     def learn(self, window: Window) -> ResidualUpdate | Rejection:
         """Fit the residual to ``window``."""
@@ -57,6 +51,7 @@ class PolicyWorker(Worker):
     """Re-trains the policy in the nominal model plus the last published residual."""
 
     layer: Layer = "policy"
+    batch = PolicyBatch
 
     def __init__(self, learner: OnlineLearner, state: LearnerState, key: Key[Array, ""]) -> None:
         self.learner, self.key = learner, key
@@ -72,11 +67,6 @@ class PolicyWorker(Worker):
     def low_rank(self) -> LoraPolicy | None:
         """Policy from which the next update starts, if it is a low-rank policy."""
         return self._policy.policy if isinstance(self._policy.policy, LoraPolicy) else None
-
-    @classmethod
-    def stack(cls, workers: Sequence[Any]) -> PolicyBatch:
-        """Return the workers as a batch, which starts from their random keys."""
-        return PolicyBatch(workers[0].learner, shard(jnp.stack([worker.key for worker in workers])))
 
     def learn(self, window: Window) -> PolicyUpdate | Rejection:
         """Re-train the policy; the window provides starts for the gate."""

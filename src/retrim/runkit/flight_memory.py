@@ -70,9 +70,13 @@ class FlightMemory:
         key: Key[Array, ""] = random.fold_in(random.key(seed), MEMORY_TAG)
         like = jax.eval_shape(setup.learner.residual_model.init, key)
         try:
-            residual: Any = wire.unpack(read_bounded(path, "a flight writes it"), like, kind=KIND, source=str(path))
+            data = read_bounded(path, "a flight writes it")
+            owner = wire.describe(data, kind=KIND, source=str(path)).get("vehicle", "")
+            residual: Any = wire.unpack(data, like, kind=KIND, source=str(path))
         except MessageError as error:
             raise CheckpointError(f"{error}; remove the file to fly without it") from error
+        if owner != self.vehicle:  # two names may differ only in characters that a file name cannot have
+            raise CheckpointError(f"{path}: is the memory of vehicle {owner!r}, expected {self.vehicle!r}")
         check_size(residual, source=str(path), largest=MOST)
         recalled = recall(residual)
         model: Any = setup.learner.residual_model

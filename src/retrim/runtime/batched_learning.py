@@ -129,9 +129,9 @@ def fly_and_learn(
 
 
 def _stack(plans: Sequence[Plan]) -> list[WorkerBatch]:
-    """Return the batch of each layer."""
-    layers = zip(*(plan.workers for plan in plans), strict=True)
-    return [type(workers[0]).stack(workers) for workers in layers]
+    """Return the batch of each layer; plans contain only workers that form batches."""
+    layers = list(zip(*(plan.workers for plan in plans), strict=True))
+    return [kind.of(workers) for workers in layers if (kind := workers[0].batch) is not None]
 
 
 def _compile(batch: Batch, plans: Sequence[Plan], state: LearnerState) -> None:

@@ -30,8 +30,8 @@ class LockstepLearner(Learner):
 
     @property
     def batchable(self) -> tuple[Worker, int] | None:
-        """The worker if it is stackable, and its latency [ticks] if it does not depend on the compute time."""
-        if self.latency_s is None or not self.worker.stackable:
+        """The worker if its class forms batches, and its latency [ticks] if it does not depend on the compute time."""
+        if self.latency_s is None or self.worker.batch is None:
             return None
         return self.worker, self.ticks(self.latency_s)
 

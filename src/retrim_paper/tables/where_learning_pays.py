@@ -35,7 +35,7 @@ infinite. No method knows the disturbance. "INDI, wrong by two": INDI that assum
 the worse of the two. "adapted": learned in flight, charged to flight time by the preset's fixed latencies; in the rows
 S1 to S3, one policy for many vehicles with the identification of the vehicle (`base-id`), and otherwise all weights
 (`full`). The verdict follows from the numbers: learning pays if the adapted flights have less than 0.7 times the error
-of the best opponent that has no vehicle file of its own (observer, geometric + I, INDI, MPPI + L1), and by more than
+of the best opponent (observer, geometric + I, INDI, MPPI + L1) among those that lost no more flights, and by more than
 1 mm; it is a tie within 1 mm; otherwise the best opponent is named."""
 
 
@@ -109,7 +109,7 @@ def _line(
         worst = max(OPPONENTS[column], key=lambda method: (float(np.median(scores[method])), np.sum(scores[method])))
         cells[column], medians[column] = _cell(scores[worst]), float(np.median(scores[worst]))
     cells[ADAPTED], medians[ADAPTED] = _cell(scores[row.adapted]), float(np.median(scores[row.adapted]))
-    verdict = decide(medians, {name: _losses(scores, columns, name, row) for name in medians})
+    verdict = decide(medians, {name: _losses(scores, name, row) for name in medians})
     line = (row.name, row.about, row.score.about, *cells.values(), row.published, verdict)
     rows = [
         {"regime": row.name, "method": method, "score_m": [value if np.isfinite(value) else None for value in values]}
@@ -123,7 +123,7 @@ def _scores(row: Regime, flights: Sequence[Flight], method: str) -> np.ndarray:
     return np.array([np.inf if flight.log.terminated else row.score.of(flight) for flight in own])
 
 
-def _losses(scores: dict[str, np.ndarray], columns: Sequence[str], name: str, row: Regime) -> int:
+def _losses(scores: dict[str, np.ndarray], name: str, row: Regime) -> int:
     methods = (row.adapted,) if name == ADAPTED else OPPONENTS[name]
     return max(int(np.sum(np.isinf(scores[method]))) for method in methods)
 

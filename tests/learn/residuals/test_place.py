@@ -103,7 +103,7 @@ def test_one_fit_is_the_regression_on_all_rows_at_once():
     phi = np.concatenate([bumps, np.ones((ROWS, 1))], axis=1)
     variance = np.full(phi.shape[1], 2.0**2)
     variance[-1] += WANDER**2 * EVERY
-    drag = jax.vmap(lambda x: MODEL._drag(state.first, x))(rows.x)
+    drag = jax.vmap(lambda x: MODEL._predict_drag(state.first, x))(rows.x)
     target = np.asarray(rows.a_res - drag)
     weights = np.linalg.solve(np.diag(1.0 / variance) + phi.T @ phi / 0.5**2, phi.T @ target / 0.5**2)
     np.testing.assert_allclose(np.asarray(state.map.weights)[np.append(used, True)], weights, atol=1e-8)

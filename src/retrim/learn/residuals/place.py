@@ -23,10 +23,9 @@ CENTRES = 192  # number of bumps; the least recently visited one is replaced
 SPACING = 0.7  # distance between centres along the path [lengths]
 WANDER = 0.3  # [m/s^2], random walk of the part that does not depend on position, in one second
 EVIDENCE = 20.0  # [m^2/s^4], sum over rows of the squared prediction, after which the evidence for the map is 1/e
-RECALLED = 2.0  # [m^2/s^4], evidence for the map of an earlier flight
-FAINT = 0.1  # share of the information of an earlier flight that remains
+RECALL_EVIDENCE = 2.0  # [m^2/s^4], evidence for the map of an earlier flight
+RECALL_INFORMATION = 0.1  # share of the information of an earlier flight that remains
 DOUBT = 1.0  # [m^2/s^4], prior evidence against the map
-
 
 Centres = tuple[Float[Array, "m 3"], Int[Array, " m"], Bool[Array, " m"]]
 """Centres, number of their last visit, and whether they are new."""
@@ -132,8 +131,8 @@ class PlaceModel(eqx.Module):
         first, _ = self.first.fit(state.first, rest)
         age = jnp.arange(rows.valid.shape[0] - 1, -1, -1)
         new = rows.valid & ((age < round(self.every / self.dt)) | (state.fits == 0))
-        remainder = rows.a_res - jax.vmap(lambda x: self._drag(first, x))(rows.x)
-        agreement, prediction = self._evidence(state, forecast, remainder - state.map.weights[-1:], new)
+        remainder = rows.a_res - jax.vmap(lambda x: self._predict_drag(first, x))(rows.x)
+        agreement, prediction = self._update_evidence(state, forecast, remainder - state.map.weights[-1:], new)
         after = self._learn(state.map, p, remainder, new, state.fits)
         new_state = PlaceState(first, after, agreement, prediction, state.fits + 1)
         error = rows.a_res - jax.vmap(lambda x, u: self.predict(new_state, x, u))(rows.x, rows.u)
@@ -163,14 +162,17 @@ class PlaceModel(eqx.Module):
         Args:
             state: State at the end of the earlier flight.
         """
-        evidence = jnp.where(state.share > 0.5, RECALLED, 0.0).astype(state.agreement.dtype)
+        evidence = jnp.where(state.share > 0.5, RECALL_EVIDENCE, 0.0).astype(state.agreement.dtype)
         before, eye = state.map, jnp.eye(CENTRES + 1, dtype=state.agreement.dtype)
-        precision, moment = FAINT * before.precision + (1.0 - FAINT) * eye, FAINT * before.moment
-        faint = dataclasses.replace(
-            before, precision=precision, moment=moment, weights=self._weights(precision, moment)
+        precision, moment = (
+            RECALL_INFORMATION * before.precision + (1.0 - RECALL_INFORMATION) * eye,
+            RECALL_INFORMATION * before.moment,
+        )
+        weak_map = dataclasses.replace(
+            before, precision=precision, moment=moment, weights=self._solve(precision, moment)
         )
         return dataclasses.replace(
-            state, first=self.first.init(random.key(0)), map=faint, agreement=evidence, prediction=evidence
+            state, first=self.first.init(random.key(0)), map=weak_map, agreement=evidence, prediction=evidence
         )
 
     def strength(self, state: PlaceState) -> Float[Array, ""]:
@@ -190,7 +192,7 @@ class PlaceModel(eqx.Module):
         square = jnp.sum((p[:, None] - place_map.centres[None]) ** 2, axis=2)
         return jnp.exp(-0.5 * square / self.length**2) * (place_map.visited >= 0)[None].astype(p.dtype)
 
-    def _drag(self, first: Any, x: State) -> Float[Array, "3"]:
+    def _predict_drag(self, first: Any, x: State) -> Float[Array, "3"]:
         """Return the part of the first model that depends on velocity and attitude.
 
         Its part that depends on the command belongs to the map: while a local force acts, the command compensates it,
@@ -199,7 +201,7 @@ class PlaceModel(eqx.Module):
         hover = Command.hover(x.p.dtype)
         return self.first.predict(first, x, hover) - self.first.predict(first, State.at(x.p), hover)
 
-    def _evidence(
+    def _update_evidence(
         self,
         state: PlaceState,
         forecast: Float[Array, "rows 3"],
@@ -234,9 +236,9 @@ class PlaceModel(eqx.Module):
         weight = new.astype(p.dtype)[:, None] / self.noise**2
         precision = precision + bumps.T @ (weight * bumps)
         moment = moment + bumps.T @ (weight * target)
-        return PlaceMap(place_map.centres, place_map.visited, precision, moment, self._weights(precision, moment))
+        return PlaceMap(place_map.centres, place_map.visited, precision, moment, self._solve(precision, moment))
 
-    def _weights(self, precision: Float[Array, "n n"], moment: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    def _solve(self, precision: Float[Array, "n n"], moment: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         weights: Array = self.prior * jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(precision), moment)
         return weights
 
