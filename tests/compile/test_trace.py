@@ -161,6 +161,7 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
         ("hover/paper", None),
         ("track/retrim", "figure8"),
         ("track/fast", "star"),
+        ("track/paced", "figure8=max"),
         ("vision/retrim", None),
         ("vision/ideal", None),
     ],

@@ -215,6 +215,9 @@ OURS["track/fast"] = OURS["track/retrim"] | {
     "vehicle": "kingfisher",
     "track": OURS["track/retrim"]["track"] | {"reference": "circle=8+figure8=8+circle=4+figure8=4+star=1.5"},
 }
+OURS["track/paced"] = OURS["track/retrim"] | {
+    "track": OURS["track/retrim"]["track"] | {"reference": "circle=max+figure8=max+star=max", "gravity_copies": 3},
+}
 OURS["hover/any"] = OURS["hover/retrim"] | {
     "reward": "stiff",
     "axes": "heading",

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from retrim.config.loading import load
+from retrim.config.loading import changed, load
+from retrim.config.pacing import is_paced, plain_name
 from retrim.config.references import REFERENCES, make_reference
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
@@ -93,3 +94,27 @@ def test_limits_are_those_of_the_vehicle_that_flies():
         assert setup.limits_exceeded(flies) == hasty.infeasibility({"large": large()}.get(vehicle, small()))
     assert setup.limits_exceeded() == hasty.infeasibility(small())
     assert Setup.from_preset("hover/fast").limits_exceeded() is None
+
+
+@pytest.mark.parametrize("name", ["circle=max", "{}=max", "{}:once=max"])
+def test_a_paced_reference_has_the_path_of_its_name(lap, name):
+    name = name.format(lap)
+    paced, plain = make_reference(name), make_reference(plain_name(name))
+    np.testing.assert_array_equal(paced.rows, plain.rows)
+    assert is_paced(name) and not is_paced(plain_name(name)) and not is_paced(f"{name}+circle=max")  # noqa: PT018
+
+
+def test_a_paced_flight_trains_on_the_references_of_pretraining():
+    setup = Setup.from_preset("track/paced", "star=max")
+    assert setup.pace is not None
+    assert setup.learner.env.task.reference is setup.env.task.reference
+    assert setup.env.task.reference.joins.shape[0] == 24  # 3 references, 2 tables of each, with 3 copies of each table
+    assert Setup.from_preset("track/paced", "star").pace is None
+    assert Setup.from_preset("track/paced").pace is None  # a family
+    single = changed(load("track/paced"), track={"reference": "star=max", "gravity_copies": 0})
+    assert Setup.from_preset(single).pace is not None
+
+
+def test_an_unknown_paced_reference_is_refused():
+    with pytest.raises(ConfigError, match="no reference 'circel'"):
+        make_reference("circel=max")

@@ -76,7 +76,7 @@ def test_the_model_has_the_presets_delay_and_lag(case):
     assert preset.delay_ticks == delays.get(preset.name, 1)
     for env in (setup.env, setup.learner.env):
         assert float(env.delay) == pytest.approx(preset.delay_ticks * preset.dt)
-        if preset.name in ("track/preview", "track/retrim", "track/any", "track/fast", "vision/retrim"):
+        if preset.name in ("track/preview", "track/retrim", "track/any", "track/fast", "track/paced", "vision/retrim"):
             assert isinstance(env.dynamics, LaggedModel)
             assert preset.actuator_tau == 0.033
             assert {float(env.dynamics.response.thrust_lag), *env.dynamics.response.rate_lag.tolist()} == {0.033}

@@ -98,6 +98,7 @@ SIZES |= {
     "track/retrim": 49,
     "track/any": 80,
     "track/fast": 49,
+    "track/paced": 49,
     "vision/ideal": 89,
     "vision/occluded": 89,
     "vision/retrim": 89,

@@ -22,7 +22,7 @@ from ..tasks.task import Start
 from .gate import Verdict, all_finite, judge
 from .learner_state import FitReport, LearnerState
 from .optimisers import AbstractPolicyOptimiser
-from .starts import AbstractStarts, TaskStarts, sample_starts
+from .starts import AbstractStarts, TaskStarts
 from .trim import AbstractTrim, NoTrim
 from .updates import Layer
 from .vehicles import AbstractVehicles, OwnVehicle
@@ -145,7 +145,7 @@ class OnlineLearner(eqx.Module):
         test_starts = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
             jax.vmap(self.env.task.reset)(random.split(k_gate, HELD_OUT // 2)),
-            sample_starts(window, k_window, (HELD_OUT // 2,)),
+            self.starts.recent(self.env.task, window, k_window, HELD_OUT // 2),
         )
         incumbent = state.policy if active is None else active
         test_starts = self.vehicles.assign_vehicles(test_starts, vehicle, random.fold_in(k_gate, VEHICLES))

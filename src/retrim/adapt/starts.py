@@ -22,6 +22,11 @@ class AbstractStarts(eqx.Module):
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
         """Return starts with two leading axes, updates x environments; the key is consumed."""
 
+    def recent(self, task: AbstractTask, window: Window, key: Key[Array, ""], n: int) -> Start:
+        """Return ``n`` starts on which an update is judged; by default, states of the window. The key is consumed."""
+        del task
+        return sample_starts(window, key, (n,))
+
 
 class TaskStarts(AbstractStarts):
     """Uses the starts of pretraining (as in the paper)."""
@@ -29,6 +34,14 @@ class TaskStarts(AbstractStarts):
     def __call__(self, task: AbstractTask, window: Window, key: Key[Array, ""], updates: int, envs: int) -> Start:
         """Draw the starts from the task."""
         return random_starts(task, key, updates, envs)
+
+
+class TaskOnlyStarts(TaskStarts):
+    """Uses only starts of the task, for a task whose times are not those of the flight."""
+
+    def recent(self, task: AbstractTask, window: Window, key: Key[Array, ""], n: int) -> Start:
+        """Draw the starts from the task."""
+        return jax.vmap(task.reset)(random.split(key, n))
 
 
 class WindowStarts(AbstractStarts):

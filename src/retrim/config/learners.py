@@ -17,6 +17,8 @@ from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
 from ..control.gravity_frame import GravityFrame, PoseFrame, lead_of
+from ..control.monitor import Monitor
+from ..control.policy import AbstractPolicy
 from ..errors import ConfigError, FrameError
 from ..estimation.command_path import PathEstimator
 from ..estimation.disturbance_observer import DisturbanceObserver
@@ -28,6 +30,7 @@ from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.vehicle import Vehicle
 from ..tasks.task import AbstractTask
 from .command_paths import declared_path, longest_delay, response_of
+from .families import identify_vehicle, policy_controller, track_actuators
 from .presets import Preset, Pretrain
 from .tasks import find_task
 
@@ -146,3 +149,27 @@ def effective_gravity_frame(
     return GravityFrame(
         controller, observer, known_residual, rate_bias=bias, place=place, lead=lead_of(path, preset.dt)
     )
+
+
+def adapted_flight(
+    preset: Preset, task: AbstractTask, vehicle: Vehicle, policy: AbstractPolicy, residual: FittedResidual
+) -> AbstractController[Any]:
+    """Return the controller of an adapting policy, with the policy's observation and in the preset's frame.
+
+    In the frame of effective gravity, a monitor reverts learned parameters that make the flight worse.
+
+    Args:
+        preset: Preset of the policy.
+        task: Task of the flight.
+        vehicle: Vehicle with the command limits.
+        policy: Policy of the flight.
+        residual: Learned residual.
+    """
+    plain = policy_controller(preset, task, policy)
+    if preset.adapt.frame == "world":
+        return track_actuators(plain, preset)
+    frame = effective_gravity_frame(plain, preset, vehicle, residual)
+    if not isinstance(frame, GravityFrame):
+        return frame
+    monitor = track_actuators(Monitor(frame, task), preset)
+    return monitor if preset.family is None else identify_vehicle(monitor, preset)

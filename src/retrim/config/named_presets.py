@@ -97,6 +97,13 @@ TRACK_FAST = dataclasses.replace(
     track=dataclasses.replace(GRAVITY_TRACK, reference="circle=8+figure8=8+circle=4+figure8=4+star=1.5"),
 )
 
+# Two tables for each reference, and fewer copies of each: the pace of a table grows up to the limits of the vehicle.
+TRACK_PACED = dataclasses.replace(
+    TRACK_RETRIM,
+    name="track/paced",
+    track=dataclasses.replace(GRAVITY_TRACK, reference="circle=max+figure8=max+star=max", gravity_copies=3),
+)
+
 OCCLUDED = dataclasses.replace(
     VISION,
     name="vision/occluded",
@@ -130,6 +137,8 @@ PRESETS: dict[str, Preset] = {
     "track/any": TRACK_ANY,
     # The same at up to 8 m/s, for the kingfisher.
     "track/fast": TRACK_FAST,
+    # The same at growing pace, for references that are followed as fast as the vehicle permits.
+    "track/paced": TRACK_PACED,
     # The paper's loop with one tick of delay, the last two commands, and a small budget with the same final error.
     "hover/fast": FAST,
     # The delay and the observation of the authors' code: 2 ticks, the last three commands, 200 x 200 x 150.

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from ..adapt.learner import OnlineLearner
 from ..adapt.optimisers import AbstractPolicyOptimiser, CarriedAdam, FreshAdam
+from ..adapt.starts import TaskOnlyStarts
 from ..errors import ConfigError
 from ..learn.env import Env
 from ..learn.residuals.model import ResidualModel
@@ -27,7 +28,10 @@ class LearnerRequest:
     model: ResidualModel
     """Residual model."""
     env: Env
-    """Environment of the flight: task, nominal model and delay."""
+    """Environment of the learner: task, nominal model and delay."""
+    paced: bool = False
+    """Whether the reference of the flight has a variable pace. The learner then trains on the references of
+    pretraining, which contain every pace."""
 
     def create(self, kind: Callable[..., L], **settings: Any) -> L:
         """Return a learner with the settings of the preset.
@@ -41,6 +45,8 @@ class LearnerRequest:
         """
         make = OPTIMISERS.find(self.preset.adapt.optimiser)
         result = learner_settings(self.preset, self.env, make)
+        if self.paced:
+            result["starts"] = TaskOnlyStarts()
         return kind(**{"env": self.env, "residual_model": self.model, **result, **settings})
 
 

@@ -111,7 +111,8 @@ class Track:
     """Parameters of the tracking task."""
 
     reference: Printable = "circle"
-    """Training reference: circle, figure8, star, a CSV file, module:name, or several of these joined by +."""
+    """Training reference: circle, figure8, star, a CSV file, module:name, or several of these joined by +. With the
+    suffix =max, the pace grows up to the limits of the vehicle."""
     observation: Literal["blind", "relative", "both", "preview", "flat"] = "both"
     """Observation. blind: o = [p, R, v], without the reference; relative: o = [p - p_ref, R, v - v_ref]; both: o = [p,
     R, v, p - p_ref, v - v_ref]; preview: the reference relative to the vehicle, now and up to 0.4 s ahead; flat:

@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..control.pace import PaceLimits
 from ..errors import ConfigError
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..tasks.reference import Reference, join_references
 from ..tasks.shapes import AT_SPEED, FASTEST
 from ..tasks.shapes import REFERENCES as BUILT_IN
 from ..tasks.trajectory_csv import from_csv
+from .pacing import SUFFIX, is_paced, plain_name, training_tables
 from .presets import Track
 from .registry import Registry
 
@@ -42,7 +44,8 @@ def make_reference(names: str) -> Reference:
         names: A registered name, ``module:name`` of a function that returns a reference, or a CSV file. A closed
             trajectory in a file repeats in laps; any other trajectory ends after one pass. ``my.csv:laps`` requires
             laps, and ``my.csv:once`` requires one pass. A top speed [m/s] may follow a shape, e.g. ``circle=8``.
-            Several names joined by ``+`` form a family.
+            Several names joined by ``+`` form a family. The suffix ``=max`` of a paced reference does not change the
+            result, since a controller chooses the pace in flight.
 
     Raises:
         ConfigError: There is no such reference, or a CSV file cannot be used.
@@ -50,13 +53,23 @@ def make_reference(names: str) -> Reference:
     return _make_reference(names, 0, 0.0)
 
 
-def make_training_reference(table: Track) -> Reference:
+def make_training_reference(table: Track, limits: PaceLimits) -> Reference:
     """Return the training reference: the named reference, and copies of it in the effective gravity of pushes.
+
+    Args:
+        table: Table of the task.
+        limits: Limits of the training vehicle, for the growing pace of a paced reference.
 
     Raises:
         ConfigError: As for :func:`make_reference`.
     """
-    return _make_reference(table.reference, table.gravity_copies, table.gravity_push)
+    if SUFFIX not in table.reference:
+        return _make_reference(table.reference, table.gravity_copies, table.gravity_push)
+    members = list[Reference]()
+    for name in table.reference.split("+"):
+        plain = _one_reference(name)
+        members += training_tables(plain, limits) if is_paced(name) else [plain]
+    return _family(members, table.gravity_copies, table.gravity_push)
 
 
 def _make_reference(names: str, copies: int, push: float) -> Reference:
@@ -88,6 +101,7 @@ def _family(plain: Sequence[Reference], copies: int, push: float) -> Reference:
 
 
 def _one_reference(name: str) -> Reference:
+    name = plain_name(name)
     file, _, how = name.rpartition(":") if ".csv:" in name.lower() else (name, "", "")
     shape, size, speed = name.partition("=")
     try:

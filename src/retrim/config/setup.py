@@ -17,9 +17,9 @@ from ..adapt.learner_state import LearnerState
 from ..adapt.updates import Layer
 from ..adapt.workers import make_worker
 from ..control.controller import AbstractController
-from ..control.gravity_frame import GravityFrame
 from ..control.lora import LoraPolicy
-from ..control.monitor import Monitor
+from ..control.pace import PaceLimits
+from ..control.paced_flight import PacedFlight
 from ..control.policy import AbstractPolicy, Policy
 from ..errors import ConfigError
 from ..learn.encoder import pretrain_encoder
@@ -31,18 +31,19 @@ from ..physics.vehicle import Vehicle
 from ..progress import Progress, show_progress
 from ..runtime.adaptive import AdaptivePilot, ScheduledLearner
 from ..runtime.lockstep import LockstepLearner
-from ..runtime.pilot import Pilot
+from ..runtime.pilot import ControllerPilot, Pilot
 from ..tasks.abstract_reference import AbstractReference
 from ..tasks.motions import MOTIONS, NEAR
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .command_paths import longest_delay, model_path, with_delay
-from .families import identify_vehicle, make_family, policy_controller, track_actuators
+from .families import make_family
 from .initialisers import flight_starts, low_rank
-from .learners import effective_gravity_frame, nominal_model, pretraining_optimiser
+from .learners import adapted_flight, nominal_model, pretraining_optimiser
 from .loading import load
 from .networks import NETWORKS, NetworkRequest, make_policy
 from .online_learners import LearnerRequest, make_learner
+from .pacing import SUFFIX, is_paced, pace_limits
 from .presets import Preset
 from .presets import Track as TrackTable
 from .references import make_reference, make_training_reference
@@ -69,6 +70,8 @@ class Setup:
     """In-flight learner, which re-trains the policy on ``flight_task``."""
     optimiser: optax.GradientTransformation
     """Pretraining optimiser: gradient clipping, then Adam with a cosine schedule."""
+    pace: PaceLimits | None = None
+    """Limits of the pace along the reference of the flight; None if the reference follows the flight time."""
 
     @classmethod
     def from_preset(
@@ -82,7 +85,8 @@ class Setup:
 
         Args:
             preset: Preset of the experiment, or its name.
-            reference: Reference of a tracking flight, by name or as an object; by default the training reference.
+            reference: Reference of a tracking flight, by name or as an object; by default the training reference. The
+                name of a paced reference ends with ``=max``.
             residual_model: Residual model of the learner; by default, the model that the preset names.
 
         Raises:
@@ -100,9 +104,11 @@ class Setup:
         NETWORKS.find(preset.pretrain.network)
         vehicle = make_vehicle(preset.vehicle)
         table = preset.track or TrackTable()
-        training_reference = make_training_reference(table) if entry.has_reference else None
-        if table.gravity_copies and reference is None:
+        limits = pace_limits(preset, vehicle)
+        training_reference = make_training_reference(table, limits) if entry.has_reference else None
+        if reference is None and (table.gravity_copies or SUFFIX in table.reference):
             reference = table.reference
+        paced = isinstance(reference, str) and is_paced(reference)
         try:
             task = make_task(TaskRequest(preset, vehicle, training_reference))
             flight_task = task
@@ -112,21 +118,17 @@ class Setup:
             nominal = nominal_model(preset, vehicle)
             jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
             path = model_path(preset, vehicle)
-            env = Env(
-                nominal,
-                task,
-                path.delay,
-                jump_cost=jumps,
-                family=make_family(preset),
-                longest_delay=longest_delay(preset),
-            )
+            longest = longest_delay(preset)
+            env = Env(nominal, task, path.delay, jump_cost=jumps, family=make_family(preset), longest_delay=longest)
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
-            learner = make_learner(LearnerRequest(preset, model, dataclasses.replace(env, task=flight_task)))
+            learning = env if paced else dataclasses.replace(env, task=flight_task)
+            learner = make_learner(LearnerRequest(preset, model, learning, paced))
         except (TypeError, ValueError) as error:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
             ) from error
-        return cls(preset, vehicle, env, flight_task, learner, pretraining_optimiser(preset.pretrain))
+        optimiser = pretraining_optimiser(preset.pretrain)
+        return cls(preset, vehicle, env, flight_task, learner, optimiser, limits if paced else None)
 
     def on(self, reference: AbstractReference) -> "Setup":
         """Return the same set-up with a different reference for the flight and its learner.
@@ -224,6 +226,8 @@ class Setup:
         from .methods import MethodRequest, find_method  # imported here, because this module is imported there
 
         pilot = find_method(method).make(MethodRequest(self, policy, key, latency, state))
+        if isinstance(pilot, ControllerPilot):
+            pilot.controller = self.paced(pilot.controller)
         if pilot.dt is None:  # a controller does not store its control period
             pilot.dt = self.preset.dt
         return pilot
@@ -233,15 +237,19 @@ class Setup:
 
         In the frame of effective gravity, a monitor reverts learned parameters that make the flight worse.
         """
-        plain = policy_controller(self.preset, self.flight_task, state.policy.policy.merged())
-        if self.preset.adapt.frame == "world":
-            return track_actuators(plain, self.preset)
         residual = FittedResidual(self.learner.residual_model, state.residual)
-        frame = effective_gravity_frame(plain, self.preset, self.vehicle, residual)
-        if not isinstance(frame, GravityFrame):
-            return frame
-        monitor = track_actuators(Monitor(frame, self.flight_task), self.preset)
-        return monitor if self.preset.family is None else identify_vehicle(monitor, self.preset)
+        policy = state.policy.policy.merged()
+        return self.paced(adapted_flight(self.preset, self.flight_task, self.vehicle, policy, residual))
+
+    def paced(self, controller: AbstractController[Any]) -> AbstractController[Any]:
+        """Return a controller that also chooses the pace of a paced reference; unchanged for any other reference.
+
+        Args:
+            controller: Controller with the reference of the flight.
+        """
+        if self.pace is None or self.flight_reference is None or isinstance(controller, PacedFlight):
+            return controller
+        return PacedFlight.of(controller, self.flight_reference, self.pace, self.preset.dt)
 
     def low_rank(self, policy: AbstractPolicy | LoraPolicy, key: Key[Array, ""]) -> LoraPolicy:
         """Return ``policy`` with a fresh low-rank delta (ranks 4, 10 and 1, and scale 4, as in the paper).

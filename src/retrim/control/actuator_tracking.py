@@ -54,6 +54,10 @@ class ActuatorTracking(AbstractController[TrackingState]):
         """Return the condition of the inner controller."""
         return self.inner.condition(memory.inner)
 
+    def disturbance(self, memory: TrackingState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the disturbance that the inner controller expects."""
+        return self.inner.disturbance(memory.inner, x, u)
+
     def init(self, x: State) -> TrackingState:
         """Return the memory at the start of a flight."""
         return TrackingState(BodyRates.start(x, self.dt), self.inner.init(x))

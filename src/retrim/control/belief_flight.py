@@ -72,6 +72,11 @@ class BeliefFlight(AbstractController[BeliefState]):
             jnp.where(cautious, Stage.CAUTIOUS, Stage.ADAPTED), jnp.where(cautious, Cause.SWINGS, Cause.CALM)
         )
 
+    def disturbance(self, memory: BeliefState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the disturbance that the inner controller expects, and the thrust that the thrust gain changes."""
+        missing = (1.0 - 1.0 / memory.gain) * u.c * x.R[:, 2]
+        return missing + self.inner.disturbance(memory.inner, x, u)
+
     def init(self, x: State) -> BeliefState:
         """Return the memory at the start of a flight."""
         return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior).init(x), Caution.none(x))
@@ -142,6 +147,10 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     def vehicle(self, memory: IdentifiedState) -> VehicleReport:
         """Return the present estimate of the vehicle."""
         return VehicleReport(memory.path.estimate, self.declared)
+
+    def disturbance(self, memory: IdentifiedState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the disturbance that the flight expects."""
+        return self.follow(vehicle_estimate(self.family, memory.path.estimate)).disturbance(memory.flight, x, u)
 
     def init(self, x: State) -> IdentifiedState:
         """Return the memory at the start of a flight."""

@@ -6,6 +6,7 @@ from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..errors import FrameError
@@ -14,6 +15,7 @@ from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.observation import AbstractObservation
+from ..tasks.paced_reference import Clock
 from .condition import Condition
 from .policy import AbstractPolicy
 from .vehicle_report import VehicleEstimate, VehicleReport
@@ -100,6 +102,25 @@ class AbstractController(eqx.Module, Generic[M]):
 
     def vehicle(self, memory: M) -> VehicleReport | None:
         """Return the identified vehicle; None for a controller that does not identify the vehicle."""
+        del memory
+        return None
+
+    def disturbance(self, memory: M, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the acceleration that the controller expects beyond its nominal model; zero by default.
+
+        Args:
+            memory: Memory of the controller.
+            x: State, present or planned.
+            u: Command in this state.
+
+        Returns:
+            Acceleration in the world frame [m/s^2].
+        """
+        del memory, u
+        return jnp.zeros_like(x.p)
+
+    def clock(self, memory: M) -> Clock | None:
+        """Return the clock of the reference; None for a controller whose reference follows the flight time."""
         del memory
         return None
 

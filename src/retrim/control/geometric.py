@@ -68,6 +68,11 @@ class GeometricController(AbstractController[GeometricState]):
         """Return the same controller for measurements that are ``age`` seconds old."""
         return dataclasses.replace(self, prediction=self.prediction.with_age(age))
 
+    def disturbance(self, memory: GeometricState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the acceleration that the integral action compensates."""
+        del x, u
+        return -self.gains.integral * memory.integral
+
     def init(self, x: State) -> GeometricState:
         """Return the memory at the start of a flight."""
         return GeometricState(self.prediction.init(x), jnp.zeros_like(x.p))

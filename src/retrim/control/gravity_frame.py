@@ -86,6 +86,13 @@ class GravityFrame(AbstractController[GravityFrameState]):
         """Return the same controller for a tick in which thrust and body rates are known."""
         return dataclasses.replace(self, actuators=actuators)
 
+    def disturbance(self, memory: GravityFrameState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the estimated disturbance and the part of the learned residual that depends on the state."""
+        estimate = self.trust_estimate.astype(x.p.dtype) * memory.observer.d_hat
+        if self.known_residual is None:
+            return estimate
+        return estimate + StateDependentResidual(self.known_residual, self.trust_residual, self.place)(x, u)
+
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
         observer_state = self.observer.init(x)

@@ -60,6 +60,11 @@ class IndiController(AbstractController[IncrementalState]):
         """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 
+    def disturbance(self, memory: IncrementalState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the acceleration that the acting thrust does not explain."""
+        del x, u
+        return -memory.excess
+
     def init(self, x: State) -> IncrementalState:
         """Return the memory at the start of a flight."""
         return IncrementalState(self.prediction.init(x), x, jnp.zeros_like(x.p), jnp.full_like(x.p[0], -jnp.inf))

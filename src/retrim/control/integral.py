@@ -44,6 +44,10 @@ class IntegralAction(AbstractController[IntegralState]):
         u, inner = self.inner(memory.inner, t, State(x.p + self.gain * integral, x.R, x.v))
         return u, IntegralState(integral, inner)
 
+    def disturbance(self, memory: IntegralState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the disturbance that the inner controller expects."""
+        return self.inner.disturbance(memory.inner, x, u)
+
     def accepted(self, memory: IntegralState, u: Command) -> IntegralState:
         """Pass the accepted command to the inner controller."""
         return IntegralState(memory.integral, self.inner.accepted(memory.inner, u))

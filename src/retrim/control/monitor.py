@@ -143,6 +143,10 @@ class Monitor(AbstractController[MonitorState]):
         """Return the stage of the next command, and the cause of this stage."""
         return Condition(memory.stage, memory.cause)
 
+    def disturbance(self, memory: MonitorState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the disturbance that the adapted flight expects."""
+        return self.frame.disturbance(memory.flight, x, u)
+
     def _trust(self, memory: MonitorState, t: Float[Array, ""]) -> Float[Array, ""]:
         """Return the weight of the estimate: small at launch, and smaller the more the estimate swings."""
         calm = jnp.clip((SWINGS - memory.swings.size) / (SWINGS - CALM), 0.0, 1.0)

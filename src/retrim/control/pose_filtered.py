@@ -53,6 +53,10 @@ class PoseFilteredController(AbstractController[PoseFilteredState]):
         """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
 
+    def disturbance(self, memory: PoseFilteredState, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the disturbance that the inner controller expects."""
+        return self.inner.disturbance(memory.inner, x, u)
+
     def init(self, x: State) -> PoseFilteredState:
         """Return the memory at the start of a flight; the filter starts near the state, not exactly at it."""
         poses = self.observation.init(x)

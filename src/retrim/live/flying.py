@@ -17,7 +17,7 @@ from ..io.logs.recording import Recording, write_npz
 from ..io.logs.viewers import can_record, record
 from ..onboard.guard import Mode
 from ..onboard.log_file import log_path
-from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, TRUE
+from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, PHASE, TRUE
 from ..runkit.flights import Flight
 from ..runkit.outlet import Outlet
 from ..runkit.outputs import clear_outputs, write_events, write_learner_state, write_state
@@ -133,7 +133,7 @@ def _write(
 
 def _record(request: LiveRequest, rows: np.ndarray, events: LiveEvents, outlet: Outlet) -> list[Path]:
     """Write the flight with its landing as NPZ and for viewers; return the path of the requested recording, if any."""
-    target = np.asarray(jax.jit(jax.vmap(request.setup.flight_task.target))(rows[:, 1]), dtype=float)
+    target = np.asarray(jax.jit(jax.vmap(request.setup.flight_task.target))(rows[:, PHASE]), dtype=float)
     recording = Recording(
         rows[:, 1], rows[:, MEASURED], rows[:, TRUE], rows[:, 2], rows[:, COMMAND],
         np.linalg.norm(rows[:, TRUE][:, :3] - target, axis=1), target,

@@ -19,11 +19,14 @@ def choices(setup: Setup, present: str) -> tuple[str, ...]:
     """Return the names of the references that a user may select in flight, with the current one first.
 
     The result is empty if the policy does not observe its reference: such a policy cannot follow a different reference.
+    It is also empty in a paced flight, whose reference does not follow the flight time.
 
     Args:
         setup: Set-up of the flight.
         present: Name of the current reference.
     """
+    if setup.pace is not None:
+        return ()
     leaves = jax.tree.leaves(setup.flight_task.observation_in_flight, is_leaf=lambda part: isinstance(part, Reference))
     if not any(isinstance(part, Reference) for part in leaves):
         return ()

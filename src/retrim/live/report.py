@@ -10,7 +10,7 @@ from ..adapt.learner_state import LearnerState
 from ..errors import PlantError
 from ..io.policies import load_learner_state
 from ..onboard.guard import HOVER, Mode
-from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, STOPPED, TRUE
+from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, PHASE, STOPPED, TRUE
 from ..onboard.recorder import read_log
 from ..onboard.stalls import count_lost_ticks
 from ..onboard.timing_stats import EDGES_MS, has_measurement, is_from_control, summary
@@ -62,6 +62,7 @@ def flight_of(
         False,
         tuple(events),
         flight_rows[:, 2],
+        None if request.setup.pace is None else flight_rows[:, PHASE],
     )
     return score_flight(
         request.setup, request.flight, cut_at_termination(request.setup.flight_task, log), learner_state

@@ -102,7 +102,8 @@ class ControlLoop:
         if not setpoint.is_final:
             self.bus.publish("setpoint", setpoint.pack())
         if new:
-            accounts = [lateness, time.monotonic() - began, 0.0, age, t - self.intake.data_time, self.mode]
+            phase = self.pilot.task_time(t)
+            accounts = [lateness, time.monotonic() - began, 0.0, age, t - self.intake.data_time, phase, self.mode]
             head = [sample.tick, t, sample.age]
             self._row = np.concatenate([head, sample.state, sample.truth, self._command, accounts])
         elif self.mode in (Mode.BLIND, Mode.DROP):

@@ -134,12 +134,13 @@ COLUMNS = (
     *(f"x{i}" for i in range(STATE)),
     *(f"true{i}" for i in range(STATE)),
     *("c", "omega0", "omega1", "omega2"),
-    *("lateness", "step", "idle", "state_age", "policy_age", "mode"),
+    *("lateness", "step", "idle", "state_age", "policy_age", "phase", "mode"),
 )
 """Columns of a row in reports and in the log; each row describes one tick. ``idle`` is the duration of the work that is
-not urgent. Times are in seconds."""
+not urgent. ``phase`` is the time along the reference. Times are in seconds."""
 MEASURED, TRUE = slice(3, 3 + STATE), slice(3 + STATE, 3 + 2 * STATE)
 COMMAND = slice(3 + 2 * STATE, 7 + 2 * STATE)
+PHASE = COLUMNS.index("phase")
 ACCOUNTS = {name: COLUMNS.index(name) for name in ("lateness", "step", "idle", "state_age", "policy_age")}
 MOST_TICKS = 10_000  # largest number of ticks in a report
 

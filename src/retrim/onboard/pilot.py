@@ -10,6 +10,7 @@ from ..compile.ops.program import Arrays, NumpyProgram, ProgramSource
 from .messages import STATE, Parameters
 from .topics import UNLEARNED, VEHICLE
 
+GROWING = 0.4  # [s], time during which the pace of a clock changes, as in retrim.tasks.paced_reference
 BLEND = 5  # ticks over which the pilot fades out a jump in the command at a swap
 
 
@@ -20,11 +21,12 @@ class ControllerSource:
     init: ProgramSource
     """(parameters, state) -> memory."""
     decide: ProgramSource
-    """(parameters, [memory, time, age, state]) -> command, stage of the controller and its cause, memory."""
+    """(parameters, [memory, time, age, state]) -> command, stage of the controller and its cause, phase along the
+    reference [s], pace and its relative growth [1/s], memory."""
     accepted: ProgramSource
     """(parameters, [memory, command]) -> memory, if the plant accepted a command that differs from the issued one."""
     target: ProgramSource
-    """(parameters, time) -> target position of the vehicle."""
+    """(parameters, time along the reference) -> target position of the vehicle."""
     predicted: ProgramSource
     """(parameters, [state, command]) -> acceleration that the corrected model predicts."""
     parameters: Mapping[str, Mapping[str, Any]]
@@ -51,6 +53,7 @@ class LivePilot:
         self._memory: Arrays = []
         self.condition = 0, 0
         """Stage of the controller's degradation, and its cause; see :mod:`retrim.control.condition`."""
+        self._clock = 0.0, 0.0, 1.0, 0.0
         self._prepared = self._prepare()
         self._old = self._prepared[1]
         self._jump, self._left, self._just_swapped = np.zeros(4), 0, False
@@ -59,11 +62,22 @@ class LivePilot:
         """Start a flight in the state ``x``, a vector of p, R by rows and v."""
         self._memory = self._init.step(self._prepared[0], self._state(x))
         self._left, self._just_swapped, self._jump = 0, False, np.zeros(4)
-        self.condition = 0, 0
+        self.condition, self._clock = (0, 0), (0.0, 0.0, 1.0, 0.0)
+
+    def task_time(self, t: float) -> float:
+        """Return the time along the reference at flight time ``t`` [s], which equals ``t`` at a constant pace of 1.
+
+        Args:
+            t: Time since the start of the flight, at most a few ticks after the last command [s].
+        """
+        begin, phase, pace, growth = self._clock
+        tau = t - begin
+        growing = min(tau, GROWING)
+        return phase + pace * (tau + growth * growing * (tau - 0.5 * growing))
 
     def target(self, t: float) -> np.ndarray:
         """Return the vehicle's target position in the world frame [m] at flight time ``t`` [s]."""
-        return np.asarray(self._target.step(self._prepared[4], [self._scalar(t)])[0], dtype=float)
+        return np.asarray(self._target.step(self._prepared[4], [self._scalar(self.task_time(t))])[0], dtype=float)
 
     def act(self, t: float, age: float, x: np.ndarray) -> np.ndarray:
         """Return the command [c, omega] for a new measurement.
@@ -75,8 +89,9 @@ class LivePilot:
         """
         inputs = [self._scalar(t), self._scalar(age), *self._state(x)]
         decide, memory = self._prepared[1], self._memory
-        c, omega, stage, cause, *self._memory = self._decide.step(decide, [*memory, *inputs])
+        c, omega, stage, cause, phase, pace, growth, *self._memory = self._decide.step(decide, [*memory, *inputs])
         self.condition = int(stage), int(cause)
+        self._clock = t, float(phase), float(pace), float(growth)
         u = np.concatenate([[c], omega]).astype(float)
         if self._just_swapped:
             before, rates, *_ = self._decide.step(self._old, [*memory, *inputs])

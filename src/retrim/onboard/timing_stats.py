@@ -50,8 +50,9 @@ def blind_row(
     """
     after = max(stamp.tick - sample.tick, int((now - sample.send_time) / dt), 1)
     age = sample.age + now - sample.send_time
-    head = [sample.tick + after, sample.t + after * dt - start, age]
-    return np.concatenate([head, sample.state, sample.truth, u, [0.0, 0.0, 0.0, age, 0.0, mode]])
+    t = sample.t + after * dt - start
+    head = [sample.tick + after, t, age]
+    return np.concatenate([head, sample.state, sample.truth, u, [0.0, 0.0, 0.0, age, 0.0, t, mode]])
 
 
 def has_measurement(rows: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ def flight_codec(specs: Sequence[FlightSpec]) -> Codec[Sequence[Flight]]:
         arrays, rows = dict[str, Any](), list[dict[str, Any]]()
         for i, flight in enumerate(flights):
             log = flight.log
-            parts: dict[str, Any] = {"t": log.t, "u": log.u, "age": log.age}
+            parts: dict[str, Any] = {"t": log.t, "u": log.u, "age": log.age, "phase": log.phase}
             parts |= {"error": flight.error, "cross": flight.cross, "target": flight.target}
             for name, states in (("true", log.true), ("measured", log.measured)):
                 parts |= {f"{name}.{part}": value for part, value in states._asdict().items()}
@@ -60,5 +60,6 @@ def _flight(parts: dict[str, np.ndarray], spec: FlightSpec, about: dict[str, Any
     events = tuple(Event(*event) for event in about["events"])
     cross, target, age = parts.get("cross"), parts.get("target"), parts["age"]
     log_age = age if age.ndim else float(age)
-    log = Log(parts["t"], true, measurement, parts["u"], about["dt"], about["terminated"], events, log_age)
+    ends = about["dt"], about["terminated"], events, log_age
+    log = Log(parts["t"], true, measurement, parts["u"], *ends, parts.get("phase"))
     return Flight(spec, log=log, error=parts["error"], cross=cross, target=target, **about["flight"])

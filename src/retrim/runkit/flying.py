@@ -147,7 +147,7 @@ def fly_batch(
 
 def cut_at_termination(task: AbstractTask, log: Log) -> Log:
     """Cut a log where the vehicle left the task's bounds; a batch does not stop there."""
-    left = np.flatnonzero(np.asarray(_all_terminated(task, log.t, log.true.as_state()))[1:])
+    left = np.flatnonzero(np.asarray(_all_terminated(task, log.task_time, log.true.as_state()))[1:])
     if not len(left):
         return log
     rows = int(left[0]) + 2
@@ -162,6 +162,7 @@ def cut_at_termination(task: AbstractTask, log: Log) -> Log:
         True,
         events,
         np.broadcast_to(log.age, log.t.shape)[:rows],
+        None if log.phase is None else log.phase[:rows],
     )
 
 
@@ -173,7 +174,7 @@ def learner_state_of(pilot: Pilot) -> LearnerState | None:
 def score_flight(setup: Setup, spec: FlightSpec, log: Log, learner_state: LearnerState | None = None) -> Flight:
     """Return a flight with its errors and, if it was terminated, the reason."""
     task = setup.flight_task
-    error, cross, target = _errors(task, log.t, log.true.as_state())
+    error, cross, target = _errors(task, log.task_time, log.true.as_state())
     if log.terminated:
         why = Event(float(log.t[-1]), "terminated", _why(log, float(error[-1])))
         log = log._replace(events=(*log.events, why))

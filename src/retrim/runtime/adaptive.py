@@ -104,6 +104,10 @@ class AdaptivePilot(Pilot):
         self._publish(ResidualUpdate(t, 0.0, state.residual))
         self._publish(PolicyUpdate(t, 0.0, 0.0, state.policy))
 
+    def task_time(self, t: float) -> float:
+        """Return the time along the reference at flight time ``t`` [s]."""
+        return self._pilot.task_time(t)
+
     def take_events(self) -> list[Event]:
         """Return the events since the last call."""
         result, self._new_events = self._new_events, []

@@ -13,6 +13,7 @@ from ..control.controller import AbstractController
 from ..control.vehicle_report import VehicleReport
 from ..physics.state import Command, State, where
 from ..plants.sim import SimState, Simulation
+from ..tasks.paced_reference import Clock
 
 
 class InFlight(eqx.Module):
@@ -40,6 +41,8 @@ class Ticks(eqx.Module):
     """Condition of the controller after its command; None for a controller that never steps back."""
     vehicle: VehicleReport | None = None
     """Vehicle that the controller has identified; None for a controller that does not identify the vehicle."""
+    clock: Clock | None = None
+    """Clock of the reference; None for a controller whose reference follows the flight time."""
 
 
 def take_off(simulation: Simulation, controller: AbstractController[Any], x0: State) -> InFlight:
@@ -94,9 +97,9 @@ def fly_ticks(
         is_limited = jnp.any(accepted_command.vector() != command.vector())
         memory = where(is_limited, controller.accepted(memory, accepted_command), memory)
         s, condition = simulation.advance(s, accepted_command, k), controller.condition(memory)
-        vehicle = controller.vehicle(memory)
+        vehicle, clock = controller.vehicle(memory), controller.clock(memory)
         return InFlight(s, memory, k + 1), Ticks(
-            simulation.true(s), simulation.measured(s), command, accepted_command, condition, vehicle
+            simulation.true(s), simulation.measured(s), command, accepted_command, condition, vehicle, clock
         )
 
     def step(i: Array, carry: tuple[InFlight, Ticks]) -> tuple[InFlight, Ticks]:
@@ -105,7 +108,8 @@ def fly_ticks(
 
     x = simulation.true(flight.sim)
     u = Command.hover(x.p.dtype)
-    row = Ticks(x, x, u, u, controller.condition(flight.memory), controller.vehicle(flight.memory))
+    memory = flight.memory
+    row = Ticks(x, x, u, u, controller.condition(memory), controller.vehicle(memory), controller.clock(memory))
     blank = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), row)
     result: tuple[InFlight, Ticks] = lax.fori_loop(0, ticks, step, (flight, blank))
     return result

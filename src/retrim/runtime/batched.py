@@ -15,6 +15,7 @@ from ..learn.stacking import stack
 from ..learn.window import Window
 from ..physics.state import Command, State
 from ..plants.sim import SimState, Simulation
+from ..tasks.paced_reference import Clock
 from .batch import InFlight, Ticks, fly_ticks, in_flight
 from .events import Event, stage_events, vehicle_events
 from .flight import FlightStopped, Log, States
@@ -115,6 +116,7 @@ class Batch:
             False,
             tuple(events),
             self._simulations.age,
+            None if rows.clock is None else _phases(rows.clock, t),
         )
 
 
@@ -128,6 +130,12 @@ def _record(record: Any, new: Any, at: int, size: int, *, rows: int) -> Any:
         return whole
 
     return jax.tree.map(write, record, new)
+
+
+def _phases(clocks: Clock, t: np.ndarray) -> np.ndarray:
+    """Return the phase at each row of a log from the clock of each tick."""
+    last: Clock = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), clocks)
+    return np.append(clocks.phase, float(last.phase_at(jnp.asarray(t[-1], last.t.dtype)))).astype(float)
 
 
 @eqx.filter_jit

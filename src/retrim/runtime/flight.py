@@ -64,6 +64,13 @@ class Log(NamedTuple):
     events: tuple[Event, ...] = ()
     age: np.ndarray | float = 0.0
     """Age of the measurement in each row [s]."""
+    phase: np.ndarray | None = None
+    """Time along the reference in each row [s]; None if it is equal to ``t``."""
+
+    @property
+    def task_time(self) -> np.ndarray:
+        """Time of the task in each row [s]: the phase of a paced reference, otherwise the flight time."""
+        return self.t if self.phase is None else self.phase
 
     @property
     def p(self) -> np.ndarray:
@@ -151,12 +158,22 @@ class Recorder:
         """Keep an event."""
         self._events.append(event)
 
-    def log(self, dt: float, *, terminated: bool) -> Log:
-        """Return the recorded flight."""
+    def log(self, dt: float, phase: Sequence[float], *, terminated: bool) -> Log:
+        """Return the recorded flight.
+
+        Args:
+            dt: Control tick [s].
+            phase: Time along the reference in each row [s].
+            terminated: Whether the vehicle left the bounds of the task.
+        """
         times, true, measurement, commands, ages = zip(*self._rows, strict=True)
         t = np.array(times)
         u = np.stack([as_numpy(command) for command in commands])
-        return Log(t - t[0], _stack(true), _stack(measurement), u, dt, terminated, tuple(self._events), np.array(ages))
+        t, phases = t - t[0], np.array(phase)
+        return Log(
+            t, _stack(true), _stack(measurement), u, dt, terminated, tuple(self._events), np.array(ages),
+            None if np.array_equal(phases, t) else phases,
+        )  # fmt: skip
 
 
 def fly(
@@ -177,8 +194,8 @@ def fly(
         pilot: Source of the commands.
         x0: State at the start of the flight; None for the vehicle's present state.
         ticks: Length of the flight in ticks of the plant's clock; a missed tick counts.
-        terminated: Function of the time since the start [s] and the true state that returns whether to end the flight
-            early.
+        terminated: Function of the time along the reference [s], which is usually the time since the start, and the
+            true state. It returns whether to end the flight early.
         observers: Observers, which receive every measurement and event.
         stop: Event that aborts the flight; set it from another thread.
         progress: Display of the progress; by default a bar in a notebook or a terminal, and nothing elsewhere.
@@ -195,7 +212,7 @@ def fly(
         raise ConfigError(
             f"the pilot was made for ticks of {pilot.dt:g} s, the plant has {plant.dt:g} s; pass dt to it"
         )
-    recorder, is_over = Recorder(), False
+    recorder, phase, is_over = Recorder(), [0.0], False
     everyone: tuple[Observer, ...] = (recorder, *observers)
     with plant, progress("flying") as advance:
         advance(0.0, "compiling")
@@ -212,9 +229,10 @@ def fly(
                 pilot.accepted(accepted_command)
             _tell(everyone, measurement, accepted_command, pilot.take_events())
             t = measurement.t - start
-            is_over = terminated(t, measurement.true_state)
+            phase.append(pilot.task_time(t))
+            is_over = terminated(phase[-1], measurement.true_state)
             advance(min(1.0, t / (ticks * plant.dt)), f"{t:.1f} of {ticks * plant.dt:g} s")
-    return recorder.log(plant.dt, terminated=is_over)
+    return recorder.log(plant.dt, phase, terminated=is_over)
 
 
 def _tell(observers: Sequence[Observer], measurement: Measurement, u: Command, events: Sequence[Event]) -> None:

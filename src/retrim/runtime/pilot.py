@@ -13,6 +13,7 @@ from ..control.controller import AbstractController
 from ..control.vehicle_report import REPORTS, VehicleReport
 from ..physics.state import Command, State
 from ..plants.plant import Measurement
+from ..tasks.paced_reference import Clock
 from .events import ROUNDING, Event
 
 
@@ -51,6 +52,14 @@ class Pilot(abc.ABC):
         """Return the events since the last call, and clear them."""
         return []
 
+    def task_time(self, t: float) -> float:
+        """Return the time along the reference at flight time ``t`` [s]; by default, both times are equal.
+
+        Args:
+            t: Time since the start of the flight, at most one tick after the last command [s].
+        """
+        return t
+
 
 class FunctionPilot(Pilot):
     """Pilot that calls a function of the measurement."""
@@ -78,12 +87,13 @@ class ControllerPilot(Pilot):
         self._start = 0.0
         self._stage = 0
         self._t = -1.0
+        self._clock: Clock | None = None
         self._events: list[Event] = []
 
     def reset(self, measurement: Measurement) -> None:
         """Initialise the controller's memory."""
         self._memory, self._start = _begin(self.controller, measurement.x), measurement.t
-        self._stage, self._t, self._events = 0, -1.0, []
+        self._stage, self._t, self._clock, self._events = 0, -1.0, None, []
 
     def act(self, measurement: Measurement) -> Command:
         """Call the controller once, with the time since the start of the flight."""
@@ -93,7 +103,7 @@ class ControllerPilot(Pilot):
         if measurement.omega is not None and measurement.a is not None:
             controller = controller.with_inertial(measurement.omega, measurement.a)
         before = self._t
-        u, self._memory, condition, vehicle = _decide(controller, self._memory, t, x)
+        u, self._memory, condition, vehicle, self._clock = _decide(controller, self._memory, t, x)
         self._t = float(t)
         self._note(self._t, condition)
         if vehicle is not None and any(before < at - ROUNDING <= self._t for at in REPORTS):
@@ -103,6 +113,10 @@ class ControllerPilot(Pilot):
     def accepted(self, u: Command) -> None:
         """Correct the controller's memory of its last command."""
         self._memory = self.controller.accepted(self._memory, u)
+
+    def task_time(self, t: float) -> float:
+        """Return the phase of the controller's clock; for a controller without a clock, return ``t``."""
+        return t if self._clock is None else float(self._clock.phase_at(jnp.asarray(t, self._clock.t.dtype)))
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call: changes of the controller's stage, and identified vehicles."""
@@ -123,6 +137,6 @@ def _begin(controller: AbstractController[Any], x: State) -> Any:
 @eqx.filter_jit
 def _decide(
     controller: AbstractController[Any], memory: Any, t: Float[Array, ""], x: State
-) -> tuple[Command, Any, Condition | None, VehicleReport | None]:
+) -> tuple[Command, Any, Condition | None, VehicleReport | None, Clock | None]:
     u, memory = controller(memory, t, x)
-    return u, memory, controller.condition(memory), controller.vehicle(memory)
+    return u, memory, controller.condition(memory), controller.vehicle(memory), controller.clock(memory)

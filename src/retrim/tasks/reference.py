@@ -66,6 +66,17 @@ class Reference(AbstractReference):
         joins = [(0.0, seconds)] if lap is None else [(0.0, lap), (lap, seconds), (lap, seconds)]
         return cls(jnp.asarray(rows), jnp.array(times[1]), jnp.array(ends), jnp.array(joins))
 
+    @classmethod
+    def from_rows(cls, rows: Float[Array, "n 18"], every: Float[Array, ""]) -> "Reference":
+        """Return a reference without a lap from evenly spaced rows.
+
+        Args:
+            rows: Rows with the fields of :class:`Point`.
+            every: Time between rows [s].
+        """
+        end = every * (rows.shape[0] - 1)
+        return cls(rows, every, jnp.stack([end, end]), jnp.stack([jnp.zeros_like(end), end])[None])
+
     def __call__(self, t: Float[Array, ""]) -> Point:
         """Return the reference at time ``t`` [s], linearly interpolated between rows, or hover once the end is held."""
         start, end = self.lap[0], self.lap[1]

@@ -24,6 +24,7 @@ from ...onboard.pilot import ControllerSource
 from ...onboard.topics import REFERENCE, VEHICLE
 from ...physics.dynamics import f_a
 from ...physics.state import Command, State
+from ...tasks.paced_reference import Clock
 from ...transport import wire
 
 
@@ -119,7 +120,8 @@ def _source(setup: Setup, controller: Any, prediction: Any, parameters: dict[str
         now = controller(parameters).with_age(age)
         u, after = now(memory, t, x)
         condition = now.condition(after) or Condition(jnp.array(0), jnp.array(0))
-        return (u.c, u.omega, condition.stage, condition.cause), after
+        clock = now.clock(after) or Clock(t, t, jnp.ones_like(t), jnp.zeros_like(t))
+        return (u.c, u.omega, condition.stage, condition.cause, clock.phase, clock.pace, clock.growth), after
 
     def accept(parameters: Any, inputs: Any) -> Any:
         return controller(parameters).accepted(*inputs)
