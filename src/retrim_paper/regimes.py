@@ -14,14 +14,16 @@ from retrim.config.disturbances import disturbance
 from retrim.config.hidden_vehicles import draw_vehicles
 from retrim.config.loading import changed, load
 from retrim.config.presets import Preset
+from retrim.config.references import make_reference
 from retrim.config.scenario import Scenario
 from retrim.physics import State, TableEdge
 from retrim.runkit.flights import Flight
 
-from .vehicles import DELAY, slow_quadrotor
+from .vehicles import DELAY, THRUST_TO_WEIGHT, heavy_quadrotor, slow_quadrotor
 
 PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
 LAST, TAIL = 2.0, 10.0  # [s], scored intervals at the end of hover flights and of tracking flights
+LAP_ERROR = 0.1  # [m], largest mean error of a lap that counts
 VEHICLES = 8  # number of hidden vehicles
 VEHICLE_SEED = 48  # seed of their draw
 
@@ -31,7 +33,7 @@ class Score:
     """A figure of a flight."""
 
     of: Callable[[Flight], float]
-    """Function that returns the figure of a flight that was not lost [m]."""
+    """Function that returns the figure of a flight that was not lost, in m or s; cells show mm or ms."""
     about: str
 
 
@@ -60,6 +62,25 @@ def mean_error(flight: Flight) -> float:
 def tracking_error(flight: Flight) -> float:
     """Return the mean distance from the reference over the last ten seconds [m]."""
     return float(np.mean(flight.error[_tail(flight, TAIL)]))
+
+
+def lap_time(flight: Flight) -> float:
+    """Return the duration of the last lap [s], or infinity if its mean error exceeds 10 cm or there is no lap.
+
+    Raises:
+        ValueError: The flight does not follow a paced reference.
+    """
+    name, phase = flight.spec.scenario.reference, flight.log.phase
+    if name is None or phase is None:
+        raise ValueError("lap_time needs a flight at a variable pace")
+    start, end = (float(t) for t in make_reference(name).lap)
+    laps = int((phase[-1] - start) // (end - start))
+    if laps < 1:
+        return float("inf")
+    ends = start + (end - start) * np.array([laps - 1, laps])
+    first, last = np.interp(ends, phase, flight.log.t)
+    error = float(np.mean(flight.error[(flight.log.t >= first) & (flight.log.t <= last)]))
+    return float(last - first) if error <= LAP_ERROR else float("inf")
 
 
 def height_error(flight: Flight) -> float:
@@ -93,12 +114,13 @@ def regimes() -> tuple[Regime, ...]:
     hover, any_hover = load("hover/retrim"), load("hover/any")
     tracking = load("track/retrim")
     over_places = changed(tracking, vehicle="large", adapt=replace(tracking.adapt, residual="place"))
-    slow = slow_quadrotor()
+    slow, paced = slow_quadrotor(), load("track/paced")
     circle = "circle=1"
     hidden = tuple(vehicle.scenario(PUSH) for vehicle in draw_vehicles(VEHICLES, VEHICLE_SEED))
     at_rest = Score(mean_error, f"mean error, last {LAST:g} s")
     on_path = Score(tracking_error, f"mean error, last {TAIL:g} s")
     in_height = Score(height_error, f"RMS height error, last {TAIL:g} s")
+    per_lap = Score(lap_time, f"time of the last lap; an error above {LAP_ERROR:g} m counts as lost")
     above_table = Score(height_error_above_table, f"RMS height error, last {TAIL:g} s; a contact counts as lost")
     return (
         Regime(
@@ -118,6 +140,17 @@ def regimes() -> tuple[Regime, ...]:
             "commands act 60 ms late (declared: 20 ms); a push",
             any_hover, (Scenario(PUSH, delay=0.06),), 10.0, at_rest, adapted="base-id",
             published="RAPTOR oscillates from 10 to 30 ms on",
+        ),
+        Regime(
+            "S4 growing speed",
+            "a figure-8 of 3 m x 1 m as fast as possible, after 60 s; the first lap takes 8.2 s",
+            changed(paced, vehicle="large"), (Scenario(reference="figure8=max"),), 60.0, per_lap,
+            published="8.34 to 2.34 s in 100 s (LAFR)",
+        ),
+        Regime(
+            "S4 sagging battery",
+            f"the same with a thrust of {THRUST_TO_WEIGHT:g} times the weight, which falls by 0.2 % per second",
+            changed(paced, vehicle=heavy_quadrotor()), (Scenario("battery", reference="figure8=max"),), 60.0, on_path,
         ),
         Regime(
             "corners",

@@ -64,7 +64,7 @@ PLANT = (
 REFERENCE = (
     f"Reference of a tracking policy: {join_names(REFERENCES)}, module:name, or a CSV file of t, x, y, z[, yaw]; by "
     "default the reference of its training. A closed file repeats as laps, any other is flown once; my.csv:laps and "
-    "my.csv:once override this, and circle=max sets the pace in flight. A new reference needs a policy that observes it."
+    "my.csv:once override this; circle=max sets the pace in flight. A new reference needs a policy that observes it."
 )
 VEHICLE = (
     f"Vehicle that the plant simulates: {join_names(VEHICLES)}, a vehicle file or module:name; by default the vehicle "

@@ -117,9 +117,8 @@ class Setup:
                 flight_task = make_task(TaskRequest(preset, vehicle, flight_reference))
             nominal = nominal_model(preset, vehicle)
             jumps = jnp.array(preset.jump_cost) if preset.jump_cost else None
-            path = model_path(preset, vehicle)
-            longest = longest_delay(preset)
-            env = Env(nominal, task, path.delay, jump_cost=jumps, family=make_family(preset), longest_delay=longest)
+            delay, longest = model_path(preset, vehicle).delay, longest_delay(preset)
+            env = Env(nominal, task, delay, jump_cost=jumps, family=make_family(preset), longest_delay=longest)
             model = residual_model or make_residual(ResidualRequest(preset, vehicle))
             learning = env if paced else dataclasses.replace(env, task=flight_task)
             learner = make_learner(LearnerRequest(preset, model, learning, paced))
@@ -127,8 +126,8 @@ class Setup:
             raise (
                 error if isinstance(error, ConfigError) else ConfigError(f"preset {preset.name!r}: {error}")
             ) from error
-        optimiser = pretraining_optimiser(preset.pretrain)
-        return cls(preset, vehicle, env, flight_task, learner, optimiser, limits if paced else None)
+        pace = limits if paced else None
+        return cls(preset, vehicle, env, flight_task, learner, pretraining_optimiser(preset.pretrain), pace)
 
     def on(self, reference: AbstractReference) -> "Setup":
         """Return the same set-up with a different reference for the flight and its learner.
@@ -228,8 +227,7 @@ class Setup:
         pilot = find_method(method).make(MethodRequest(self, policy, key, latency, state))
         if isinstance(pilot, ControllerPilot):
             pilot.controller = self.paced(pilot.controller)
-        if pilot.dt is None:  # a controller does not store its control period
-            pilot.dt = self.preset.dt
+        pilot.dt = pilot.dt or self.preset.dt  # a controller does not store its control period
         return pilot
 
     def controller(self, state: LearnerState) -> AbstractController[Any]:
