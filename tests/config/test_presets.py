@@ -216,6 +216,7 @@ OURS["track/fast"] = OURS["track/retrim"] | {
     "track": OURS["track/retrim"]["track"] | {"reference": "circle=8+figure8=8+circle=4+figure8=4+star=1.5"},
 }
 OURS["track/paced"] = OURS["track/retrim"] | {
+    "jump_cost": 0.01,
     "track": OURS["track/retrim"]["track"] | {"reference": "circle=max+figure8=max+star=max", "gravity_copies": 3},
 }
 OURS["hover/any"] = OURS["hover/retrim"] | {
