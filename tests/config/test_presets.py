@@ -103,7 +103,7 @@ DEFAULTS = {
             0.1,
             "world",
         ),
-        *("free", 0.2, 1.0),
+        *("free", False, 0.2, 1.0),
     ),
     "rest": ("small", 0.02, (0.0, 0.0, 1.0), 5.0, 0, 0, 1, None),
 }
@@ -217,6 +217,7 @@ OURS["track/fast"] = OURS["track/retrim"] | {
 }
 OURS["track/paced"] = OURS["track/retrim"] | {
     "jump_cost": 0.01,
+    "adapt": OURS["track/retrim"]["adapt"] | {"lap_learning": True},
     "track": OURS["track/retrim"]["track"] | {"reference": "circle=max+figure8=max+star=max", "gravity_copies": 3},
 }
 OURS["hover/any"] = OURS["hover/retrim"] | {

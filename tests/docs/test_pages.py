@@ -91,6 +91,7 @@ def test_toml_files_of_pages_are_accepted(tmp_path):
         "my_log": read_map,
         "study": read_sweep,
         "track100": lambda path: overlaid(PRESETS["track/preview"], path),
+        "laps": lambda path: overlaid(PRESETS["track/retrim"], path),
         "excite": lambda path: overlaid(PRESETS["hover/any"], path),
         "east": lambda path: tomllib.loads(path.read_text()),
     }

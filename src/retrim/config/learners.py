@@ -17,6 +17,7 @@ from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
 from ..control.gravity_frame import GravityFrame, PoseFrame, lead_of
+from ..control.lap_learning import LapLearning
 from ..control.monitor import Monitor
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError, FrameError
@@ -28,6 +29,7 @@ from ..physics.actuators import LaggedModel
 from ..physics.dynamics import AbstractDynamics, PointMass
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.vehicle import Vehicle
+from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
 from .command_paths import declared_path, longest_delay, response_of
 from .families import identify_vehicle, policy_controller, track_actuators
@@ -156,7 +158,8 @@ def adapted_flight(
 ) -> AbstractController[Any]:
     """Return the controller of an adapting policy, with the policy's observation and in the preset's frame.
 
-    In the frame of effective gravity, a monitor reverts learned parameters that make the flight worse.
+    In the frame of effective gravity, a monitor reverts learned parameters that make the flight worse. If the preset
+    says so, the reference of a flight in laps is shifted against the error that repeats.
 
     Args:
         preset: Preset of the policy.
@@ -165,7 +168,16 @@ def adapted_flight(
         policy: Policy of the flight.
         residual: Learned residual.
     """
-    plain = policy_controller(preset, task, policy)
+    flight = _in_frame(preset, task, vehicle, policy_controller(preset, task, policy), residual)
+    reference = getattr(task, "reference", None)
+    if not preset.adapt.lap_learning or not isinstance(reference, Reference):
+        return flight
+    return LapLearning.of(flight, reference, preset.dt)
+
+
+def _in_frame(
+    preset: Preset, task: AbstractTask, vehicle: Vehicle, plain: AbstractController[Any], residual: FittedResidual
+) -> AbstractController[Any]:
     if preset.adapt.frame == "world":
         return track_actuators(plain, preset)
     frame = effective_gravity_frame(plain, preset, vehicle, residual)

@@ -105,6 +105,7 @@ TRACK_PACED = dataclasses.replace(
     name="track/paced",
     jump_cost=0.01,
     track=dataclasses.replace(GRAVITY_TRACK, reference="circle=max+figure8=max+star=max", gravity_copies=3),
+    adapt=dataclasses.replace(TRACK_RETRIM.adapt, lap_learning=True),
 )
 
 OCCLUDED = dataclasses.replace(

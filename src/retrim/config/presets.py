@@ -100,6 +100,8 @@ class Adapt:
     trim: Literal["free", "rest"] = "free"
     """Correction after an update. rest: the policy is shifted so that it commands hover when the vehicle is at rest at
     home; free: no correction."""
+    lap_learning: bool = Field(default=False, strict=True)
+    """Whether the reference of a flight in laps is shifted against the error that repeats on every lap."""
     fit_latency: Seconds = 0.2
     """Flight time until a fitted residual is used [s]."""
     update_latency: Seconds = 1.0

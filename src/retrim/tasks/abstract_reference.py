@@ -59,6 +59,19 @@ class AbstractReference(eqx.Module):
         Without a lap, it is the distance to the nearest point of the whole trajectory.
         """
 
+    def phase(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the time along the path at flight time ``t`` [s]; by default, both times are equal."""
+        return t
+
+    def pace(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the rate of the phase at flight time ``t``; 1 by default."""
+        return jnp.ones_like(t)
+
+    @property
+    def phase_lap(self) -> Float[Array, "2"]:
+        """Start and end of the repeating lap as phases [s]."""
+        return self.lap
+
     @abc.abstractmethod
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractReference":
         """Return the same trajectory in the coordinates of ``frame``."""

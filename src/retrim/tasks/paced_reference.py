@@ -13,7 +13,9 @@ from ..physics.state import STANDARD_GRAVITY
 from .abstract_reference import AbstractReference, Point, TurnedReference
 from .flatness import flat_command
 from .reference import Reference
+from .shifted_reference import ShiftedReference
 
+TABULATED = (Reference, ShiftedReference)
 GROWING = 0.4  # [s], time during which the pace of a clock changes
 
 
@@ -75,6 +77,19 @@ class PacedReference(AbstractReference):
         here = self.reference(self.clock.phase_at(t))
         return at_pace(here, self.clock.pace_at(t), self.clock.pace * self.clock.growth)
 
+    def phase(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the phase of the clock [s]."""
+        return self.clock.phase_at(t)
+
+    def pace(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the pace of the clock."""
+        return self.clock.pace_at(t)
+
+    @property
+    def phase_lap(self) -> Float[Array, "2"]:
+        """Lap of the reference as phases [s]."""
+        return self.reference.lap
+
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
         """Return the cross-track error [m], which does not depend on the pace."""
         return self.reference.distance(p)
@@ -114,6 +129,6 @@ def pace_references(tree: Any, clock: Clock) -> Any:
     """Return a pytree, such as a task or a controller, in which every tabulated reference follows a clock."""
 
     def wrap(part: Any) -> Any:
-        return PacedReference(part, clock) if isinstance(part, Reference) else part
+        return PacedReference(part, clock) if isinstance(part, TABULATED) else part
 
-    return jax.tree.map(wrap, tree, is_leaf=lambda part: isinstance(part, Reference))
+    return jax.tree.map(wrap, tree, is_leaf=lambda part: isinstance(part, TABULATED))

@@ -1,0 +1,61 @@
+"""A shifted reference: the sum of a path and a Fourier series, with the derivatives of the sum."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from retrim.tasks import Reference
+from retrim.tasks.paced_reference import Clock, PacedReference, pace_references
+from retrim.tasks.shapes import figure8
+from retrim.tasks.shifted_reference import HARMONICS, ShiftedReference, basis, set_shift, shift_references
+
+SHIFT = 0.02 * jnp.asarray(np.random.default_rng(0).normal(size=(3, 1 + 2 * HARMONICS)))
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return figure8()
+
+
+def test_without_a_shift_it_is_the_reference(reference):
+    times = jnp.linspace(0.0, 12.0, 60)
+    shifted, plain = jax.vmap(ShiftedReference.of(reference))(times), jax.vmap(reference)(times)
+    for leaf, other in zip(shifted, plain, strict=True):
+        np.testing.assert_allclose(leaf, other, atol=1e-2)  # the command of a row is interpolated
+    np.testing.assert_allclose(shifted.p, plain.p, atol=1e-12)
+
+
+def test_the_functions_are_periodic_and_have_their_derivatives(reference):
+    t, h, period = jnp.array(4.3), 1e-4, reference.lap[1] - reference.lap[0]
+    for order in range(3):
+        rate = (basis(reference.lap, t + h, order) - basis(reference.lap, t - h, order)) / (2 * h)
+        np.testing.assert_allclose(rate, basis(reference.lap, t, order + 1), rtol=1e-4, atol=1e-2)
+        np.testing.assert_allclose(
+            basis(reference.lap, t + period, order), basis(reference.lap, t, order), rtol=1e-6, atol=1e-6
+        )
+
+
+def test_velocity_and_command_belong_to_the_shifted_path(reference):
+    shifted, h = set_shift({"a": ShiftedReference.of(reference)}, SHIFT)["a"], 1e-4
+    for t in (4.0, 5.7):
+        here, before, after = (shifted(jnp.array(t + k * h)) for k in (0, -1, 1))
+        np.testing.assert_allclose((after.p - before.p) / (2 * h), here.v, atol=5e-2)
+        thrust = np.linalg.norm(np.asarray(here.a) + np.array([0.0, 0.0, 9.81]))
+        np.testing.assert_allclose(here.u[0], thrust, rtol=1e-9)
+
+
+def test_a_path_without_laps_is_not_shifted():
+    once = Reference.of(lambda t: [np.sin(t), 0.0, 1.0], seconds=3.0)
+    shifted = set_shift(ShiftedReference.of(once), SHIFT)
+    np.testing.assert_array_equal(shifted(jnp.array(1.0)).p, once(jnp.array(1.0)).p)
+
+
+def test_the_pace_moves_the_shifted_path(reference):
+    """The shift is a function of the phase, so it stays at its place when the pace changes."""
+    clock = Clock(jnp.array(0.0), jnp.array(4.0), jnp.array(2.0), jnp.array(0.0))
+    tree = set_shift(pace_references(shift_references([reference]), clock), SHIFT)
+    assert isinstance(tree[0], PacedReference)
+    np.testing.assert_allclose(
+        tree[0](jnp.array(0.3)).p, set_shift(ShiftedReference.of(reference), SHIFT)(jnp.array(4.6)).p, atol=1e-12
+    )
