@@ -411,9 +411,9 @@ def test_what_is_no_log_is_named(tmp_path):
     with pytest.raises(LogError, match="no such file"):
         read_flight_log(tmp_path / "nowhere.csv")
     (tmp_path / "log.txt").write_text("t\n1\n")
-    with pytest.raises(LogError, match=r"say what is where.* maps by name: crazyflie, "):
+    with pytest.raises(LogError, match=r"say what is where.* maps by name: ardupilot, "):
         read_flight_log(tmp_path / "log.txt")
-    for name, text in (("a.bbl", "blackbox_decode"), ("a.BIN", "mavlogdump.py"), ("a.px4log", "sdlog2_dump.py")):
+    for name, text in (("a.LOG", "mavlogdump.py"), ("a.tlog", "mavlogdump.py"), ("a.px4log", "sdlog2_dump.py")):
         (tmp_path / name).write_bytes(b"1")
         with pytest.raises(LogError, match=rf"is not read; {text} .* makes a CSV.*--map map.toml"):
             read_flight_log(tmp_path / name)

@@ -233,18 +233,44 @@ def test_crazyswarm_has_poses_without_velocities(tmp_path):
     assert any("velocity is the derivative of the position" in note for note in log.notes)
 
 
-def test_four_motors_are_no_thrust(tmp_path):
-    table = crazyflie(False, False) | {f"motor.m{i}": 0.0 * FLIGHT.t for i in range(1, 5)}
-    choice = tmp_path / "map.toml"
-    choice.write_text("""
-    time = { field = "timestamp", unit = "ms" }
+MOTORS = """
+    time = {{ field = "timestamp", unit = "ms" }}
     position.fields = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z"]
     attitude.fields = ["stateEstimate.roll", "-stateEstimate.pitch", "stateEstimate.yaw"]
     attitude.form = "roll pitch yaw"
     attitude.unit = "deg"
-    thrust = { fields = ["motor.m1", "motor.m2", "motor.m3", "motor.m4"], unit = "share" }
-    """)
-    with pytest.raises(LogError, match="thrust needs 1 number, its fields hold 4; add the motors' thrusts up"):
+    thrust = {{ fields = [{}], unit = "share", zero = 1000.0, full = 2000.0, curve = 0.6 }}
+    """
+FOUR = ", ".join(f'"motor.m{i}"' for i in range(1, 5))
+
+
+def motors_of(shares):
+    """Pulse widths with the thrust 0.4 s + 0.6 s^2, of motors that differ although their sum does not."""
+    square = np.sqrt(0.16 + 2.4 * shares) / 1.2 - 1.0 / 3.0
+    return {f"motor.m{i}": 1000.0 * (1.0 + square) for i in range(1, 5)}
+
+
+def test_motors_are_a_thrust(tmp_path):
+    table = crazyflie(False, False) | motors_of(0.5 * FLIGHT.c / G[2])
+    choice = tmp_path / "map.toml"
+    choice.write_text(MOTORS.format(FOUR))
+    log = read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(choice))
+    assert log.full_thrust == pytest.approx(2.0 * G[2], rel=1e-2)
+    np.testing.assert_allclose(
+        log.c[log.valid] / G[2], np.interp(log.t, FLIGHT.t, FLIGHT.c)[log.valid] / G[2], atol=0.1
+    )
+    at = np.sqrt(0.16 + 1.2) / 1.2 - 1.0 / 3.0
+    assert any(f"hover at {1000 * (1 + at):.0f}" in note for note in log.notes)
+    choice.write_text(MOTORS.format(FOUR).replace("curve", f"hover = {1000.0 * (1.0 + at)}, curve"))
+    told = read_flight_log(tmp_path / "log.csv", read_map(choice))
+    assert told.full_thrust == pytest.approx(2.0 * G[2], rel=1e-6)
+
+
+def test_three_numbers_are_no_thrust(tmp_path):
+    choice = tmp_path / "map.toml"
+    choice.write_text(MOTORS.format('"motor.m1", "motor.m2", "motor.m3"'))
+    table = crazyflie(False, False) | motors_of(0.5 * FLIGHT.c / G[2])
+    with pytest.raises(LogError, match=r"thrust needs 1 number or, .*one for each of 4 motors or more; .* hold 3"):
         read_flight_log(write_csv(tmp_path / "log.csv", table), read_map(choice))
 
 

@@ -22,7 +22,7 @@ def replay(
     """Read a flight log, report the nominal model's error and its predictability, and identify or adapt.
 
     Args:
-        log: Log file: CSV, NPZ, PX4 ULog, ROS 1 or 2 bag, or MCAP; the last three need the extra `logs`.
+        log: CSV, NPZ, Blackbox, dataflash, PX4 ULog, ROS bag or MCAP file; the last three need the extra `logs`.
         request: Options of the replay.
         out: Folder for the report, its picture, vehicle.toml and the policy; by default, a new one under runs/.
     """

@@ -13,7 +13,7 @@ from ..config.methods import find_method, learning_methods
 from ..config.setup import Setup
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError, LogError
-from ..io.logs import FlightLog, read_flight_log, read_map
+from ..io.logs import BodyLog, FlightLog, read_log, read_map
 from ..io.policies import load_policy
 from ..learn.residuals.targets import Targets
 from ..runkit.document import Document, TableSection
@@ -21,6 +21,7 @@ from ..runkit.outputs import write_state
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from .adaptation import adapt_to
+from .body_replay import replay_body
 from .identification import identify
 from .prediction import PredictionScore, Protocol, predict_log
 from .predictors import model_factory, yardsticks
@@ -43,8 +44,11 @@ class Replay:
 
     map: str | None = None
     """TOML file with the name, unit and frame of each field; or a name: px4, px4-1.9, px4-dds,
-    px4-dds-1.13, mavros, mavros-pose, crazyflie, crazyflie-quaternion, crazyswarm, crazyswarm-quaternion,
-    crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap. Default: the format's first map whose fields exist."""
+    px4-dds-1.13, mavros, mavros-pose, ardupilot, ardupilot-rates, betaflight, betaflight-csv, crazyflie,
+    crazyflie-quaternion, crazyswarm, crazyswarm-quaternion, crazyswarm-ros, retrim-csv, retrim-npz, retrim-mcap.
+    Default: the format's first map whose fields exist."""
+    flight: int | None = None
+    """Number of the flight, from 1, in a Blackbox or dataflash file that contains several."""
     buffer: float = 5.0
     """Duration of the data to which residual models are fitted [s]."""
     horizon: float = 5.0
@@ -82,6 +86,8 @@ class Replay:
             raise ConfigError(f"--adapt {self.adapt}: must be {', '.join(learning_methods())} or none")
         if (self.adapt == "none") != (self.policy is None):
             raise ConfigError("--adapt and --policy go together; `retrim pretrain hover --out h` makes a policy")
+        if self.flight is not None and self.flight < 1:
+            raise ConfigError(f"--flight {self.flight}: flights are numbered from 1")
         if not 1 <= self.updates <= 10_000:
             raise ConfigError(f"--updates {self.updates}: must be 1 to 10000")
 
@@ -105,7 +111,11 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
     setup = Setup.from_preset(
         preset if request.residual is None else changed(preset, adapt={"residual": request.residual})
     )
-    log = read_flight_log(path, None if request.map is None else read_map(request.map), dt=preset.dt)
+    chosen_map = None if request.map is None else read_map(request.map)
+    log = read_log(path, chosen_map, dt=preset.dt, flight=request.flight)
+    if isinstance(log, BodyLog):
+        return replay_body(log, path, setup, run, reporter, identify=request.identify, seed=request.seed,
+                           adapt=request.adapt)  # fmt: skip
     least, most = setup.preset.plant_delay_ticks + SAMPLES[0], SAMPLES[1]
     if not least <= round(request.buffer / log.dt) <= most:
         raise ConfigError(

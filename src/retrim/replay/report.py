@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..io.logs import FlightLog
+from ..io.logs import BodyLog, FlightLog
 from ..io.logs.plausibility import DOUBTFUL
 from ..learn.residuals.targets import Targets
 from ..runkit.document import TableSection
@@ -23,7 +23,7 @@ WORDS = {
 }
 
 
-def warning_of(log: FlightLog) -> str:
+def warning_of(log: FlightLog | BodyLog) -> str:
     """Return the introductory warning for a doubtful log, or an empty string for a consistent one."""
     if not log.warnings:
         return ""
@@ -31,7 +31,7 @@ def warning_of(log: FlightLog) -> str:
     return f"**Warning: this log agrees badly with itself, and no figure below can be relied on: {warnings}.**"
 
 
-def agreement_section(log: FlightLog) -> TableSection:
+def agreement_section(log: FlightLog | BodyLog) -> TableSection:
     """Return a table of the agreement between a log's quantities."""
     lines = tuple(
         (WORDS[name], f"{round(100 * score)} %", f"{round(100 * DOUBTFUL[name])} %")

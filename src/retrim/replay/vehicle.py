@@ -15,13 +15,14 @@ MOST = 0.2  # longest delay in a vehicle file [s]
 DAMPINGS = (0.1, 10.0)  # limits for a damping ratio in a vehicle file
 
 
-def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str) -> str:
+def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str, *, remark: str = "") -> str:
     """Return a vehicle file with the identified values; all other values come from the preset's vehicle.
 
     Args:
         identification: The identified parameters.
         setup: The preset's set-up.
         log: Name of the log.
+        remark: A further sentence for the comment at the beginning.
     """
     base, spec = setup.vehicle, setup.preset.vehicle
     keep = spec if isinstance(spec, VehicleSpec) else None
@@ -29,6 +30,7 @@ def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str) -> s
     lines = [
         f"# Identified from {plain_from(log)}; what no line says so of is that of {plain_from(name_of(spec))!r}.",
         "# Intervals hold 90 %.",
+        *([f"# {remark}"] if remark else []),
         *(
             []
             if identification.thrust_gain is None

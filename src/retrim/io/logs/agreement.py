@@ -46,7 +46,7 @@ def agreement(log_map: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, flo
     velocity, velocity_log = ((ticks.p[k:] - ticks.p[:-k]) / (k * ticks.dt))[both], mean(ticks.v)
     independent = log_map.position is not None and log_map.velocity is not None
     if independent and max(_rms(velocity), _rms(velocity_log)) > MOVES:
-        scores["motion"] = _with_signs(
+        scores["motion"] = with_signs(
             _explained_share(velocity, velocity_log), velocity, velocity_log, MOVES, _explained_share
         )
     specific_force, axis = mean(ticks.a + UP), mean(ticks.R[:, :, 2])
@@ -62,12 +62,12 @@ def agreement(log_map: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, flo
         late = max(1, round(LATE / ticks.dt))
         shifts = [np.concatenate([np.full(lag, ticks.thrust[0]), ticks.thrust])[: len(ticks.t)] for lag in range(late)]
         thrusts = [mean(each[:, None])[:, 0] for each in shifts]
-        result = max(_correlation(changes, each - smooth(each, rows)) for each in thrusts)
+        result = max(correlation(changes, each - smooth(each, rows)) for each in thrusts)
         scores["climb"] = result * abs(result)
     turn_rates = mean(turning(ticks.R, ticks.dt))
     for name, rates in (("turning", ticks.command), ("gyroscope", ticks.rates if ticks.gyroscope else None)):
         if rates is not None and max(_rms(mean(rates)), _rms(turn_rates)) > TURNS:
-            scores[name] = _with_signs(_alike(turn_rates, mean(rates)), turn_rates, mean(rates), TURNS, _alike)
+            scores[name] = with_signs(alike(turn_rates, mean(rates)), turn_rates, mean(rates), TURNS, alike)
     return scores
 
 
@@ -87,10 +87,10 @@ def _lift(specific_force: np.ndarray, axis: np.ndarray) -> float:
     if _rms(tilt) <= TILTS:
         return alignment
     leans = float(np.sum(sideways * tilt) / max(np.linalg.norm(sideways) * np.linalg.norm(tilt), 1e-12))
-    return min(alignment, _with_signs(leans, sideways, tilt, TILTS, _correlation))
+    return min(alignment, with_signs(leans, sideways, tilt, TILTS, correlation))
 
 
-def _with_signs(
+def with_signs(
     score: float, x: np.ndarray, by: np.ndarray, least: float, agree: Callable[[np.ndarray, np.ndarray], float]
 ) -> float:
     """Return the agreement of all axes, or the agreement of a wrong-signed axis whose motion exceeds ``least``."""
@@ -119,13 +119,13 @@ def _explained_share(x: np.ndarray, by: np.ndarray) -> float:
     return 1.0 - float(np.sum((x - by) ** 2) / max(np.sum(x**2), np.sum(by**2), 1e-12))
 
 
-def _alike(x: np.ndarray, by: np.ndarray) -> float:
+def alike(x: np.ndarray, by: np.ndarray) -> float:
     """Return the correlation times the square root of the size ratio, so that a lag is not a disagreement."""
     small, large = sorted((float(np.linalg.norm(x)), float(np.linalg.norm(by))))
     return float(np.sum(x * by)) / max(small * large, 1e-12) * float(np.sqrt(small / max(large, 1e-12)))
 
 
-def _correlation(x: np.ndarray, y: np.ndarray) -> float:
+def correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Return the correlation; zero if the second signal is constant."""
     x, y = x - x.mean(), y - y.mean()
     size = float(np.linalg.norm(x) * np.linalg.norm(y))

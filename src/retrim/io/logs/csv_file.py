@@ -21,9 +21,20 @@ def read_csv(
     ``p[0]`` and ``p[0:3]`` select numbers from a column of lists. If there is no exact match for a name, case is
     ignored.
     """
+    return series_of_rows(path, rows_of_file(path), request, time, optional)
+
+
+def series_of_rows(
+    path: Path,
+    rows: list[tuple[int, list[str]]],
+    request: Mapping[str, Sequence[str]],
+    time: Clock | None,
+    optional: Collection[str],
+) -> tuple[dict[str, Series], list[str]]:
+    """Return the columns of rows, the first of which is the header; see :func:`read_csv`."""
     if time is None:
         raise LogError(f'{path}: a CSV file needs a table [time] in the map, as field = "t" and unit = "s"')
-    header, lines = _lines(path)
+    header, lines = _split_header(path, rows)
     places = {"": [_place(path, time.field, header)]}
     for what, fields in request.items():
         try:
@@ -57,8 +68,8 @@ def read_csv(
     return result, notes
 
 
-def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header, and all other non-empty lines with their line numbers."""
+def rows_of_file(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the non-empty lines of a file with their line numbers."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             first = file.readline()
@@ -69,6 +80,11 @@ def _lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
         raise LogError(f"{path}: not a text file of columns ({error})") from error
     if not rows:
         raise LogError(f"{path}: it is empty")
+    return rows
+
+
+def _split_header(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the names of the columns, and the other rows."""
     header = [cell.strip() for cell in rows[0][1]]
     if len(rows) < 2:
         raise LogError(f"{path}: it has a header and no sample")

@@ -6,13 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
+from ...errors import LogError
+from .body_log import BodyLog
+from .body_map import BodyMap
+from .body_reader import body_log_of
 from .flight_part import ENDS, flight_part
 from .log_map import LogMap
 from .marks import marks_of
+from .named_maps import AnyMap
 from .on_one_clock import Ticks, grid_of, on_one_clock
 from .other_maps import Other
 from .plausibility import check_plausible
 from .quantities import read_quantities
+from .series import Series
 from .thrust_map import normalise_thrust
 
 
@@ -55,22 +61,51 @@ class FlightLog:
         return float(np.sum(self.valid) * self.dt)
 
 
-@np.errstate(all="ignore")  # ticks with numbers that overflow are excluded later
-def read_flight_log(path: Path, log_map: LogMap | None = None, *, dt: float = 0.02) -> FlightLog:
-    """Read a flight.
+def read_flight_log(
+    path: Path, log_map: AnyMap | None = None, *, dt: float = 0.02, flight: int | None = None
+) -> FlightLog:
+    """Read a flight with attitudes and velocities.
 
     If the states arrive about every ``dt``, the log is read sample by sample. A faster log is interpolated. A slower
     log determines the tick.
 
     Args:
-        path: A CSV, NPZ, ULog or MCAP file, or a ROS 1 or ROS 2 bag.
+        path: A CSV, NPZ, ULog, MCAP or dataflash file, or a ROS 1 or ROS 2 bag.
         log_map: Map of the log's fields; by default a map for the output of retrim or of a common autopilot.
         dt: Control tick [s].
+        flight: Number of the flight in a file with several, from 1.
 
     Raises:
         LogError: The file cannot be read, a field is missing, or the columns contradict the map.
     """
-    series, used_map, notes = read_quantities(path, log_map)
+    log = read_log(path, log_map, dt=dt, flight=flight)
+    if isinstance(log, BodyLog):
+        raise LogError(f"{path}: the log has no attitudes and velocities; retrim.io.logs.read_log reads it")
+    return log
+
+
+def read_log(
+    path: Path, log_map: AnyMap | None = None, *, dt: float = 0.02, flight: int | None = None
+) -> FlightLog | BodyLog:
+    """Read a flight of any kind: a ``BodyLog`` if the log has no attitudes and velocities.
+
+    Args:
+        path: A file as for :func:`read_flight_log`, or a Blackbox log.
+        log_map: Map of the log's fields.
+        dt: Control tick of a flight with attitudes [s].
+        flight: Number of the flight in a file with several, from 1.
+
+    Raises:
+        LogError: The file cannot be read, a field is missing, or the columns contradict the map.
+    """
+    series, used_map, notes = read_quantities(path, log_map, flight)
+    if isinstance(used_map, BodyMap):
+        return body_log_of(path, used_map, series, notes)
+    return _flight_log_of(path, used_map, series, notes, dt)
+
+
+@np.errstate(all="ignore")  # ticks with numbers that overflow are excluded later
+def _flight_log_of(path: Path, used_map: LogMap, series: dict[str, Series], notes: list[str], dt: float) -> FlightLog:
     grid = grid_of(path, series, used_map.part, dt)
     ticks = on_one_clock(path, used_map, series, grid)
     marks = marks_of(used_map, series, grid.t)

@@ -33,6 +33,8 @@ World = Annotated[str, AfterValidator(check_world)]
 Body = Annotated[str, AfterValidator(check_body)]
 Seconds = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Share = Annotated[float, Field(ge=0, le=1, strict=True)]
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 SPEEDS = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6}
@@ -98,6 +100,7 @@ class Thrust:
     """The commanded collective thrust."""
 
     fields: Fields
+    """One field, or one for each motor: their mean is used, or their sum for the unit N."""
     unit: Literal["m/s^2", "g", "N", "share"]
     """m/s^2 or g for a mass-normalised thrust, N for newtons, or a share on the autopilot's own scale."""
     positive: Literal["up", "down"] = "up"
@@ -107,6 +110,10 @@ class Thrust:
     """For a share: the value at hover, or the field that contains it; by default it is estimated from the flight."""
     full: Positive = 1.0
     """For a share: the number that means full thrust, for example 65535."""
+    zero: NotNegative = 0.0
+    """For a share: the number that means no thrust, for example 1000 for a pulse width in us."""
+    curve: Share = 0.0
+    """For a share s: the thrust is (1 - curve) s + curve s^2; 0 for a thrust, about 0.6 to 1 for a motor command."""
 
     @property
     def scale(self) -> float | None:
@@ -124,8 +131,11 @@ class Thrust:
             raise ValueError('mass [kg] goes with unit = "N", and only with it')
         if self.hover is not None and self.unit != "share":
             raise ValueError('hover goes with unit = "share"')
-        if self.full != 1.0 and self.unit != "share":
-            raise ValueError('full goes with unit = "share"')
+        for name, default in (("full", 1.0), ("zero", 0.0), ("curve", 0.0)):
+            if getattr(self, name) != default and self.unit != "share":
+                raise ValueError(f'{name} goes with unit = "share"')
+        if self.zero >= self.full:
+            raise ValueError(f"zero = {self.zero:g} must be less than full = {self.full:g}")
         return self
 
 
@@ -148,6 +158,7 @@ class Acceleration:
     axes: Literal["world", "body"] = "body"
     gravity: Literal["felt", "removed"] = "felt"
     """An accelerometer's specific force, one g upwards at rest (felt); or the derivative of the velocity (removed)."""
+    optional: bool = False
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .log_map import LogMap
+from .log_map import LandDetector, LogMap
 from .series import Series
 
 QUANTITIES = ("position", "velocity", "attitude")
@@ -38,12 +38,16 @@ def marks_of(log_map: LogMap, series: Mapping[str, Series], t: np.ndarray) -> Ma
                 count = _around(counter, t)[0]
                 changes = np.concatenate([[False], np.diff(count) != 0.0])
                 resets[name] = resets.get(name, np.zeros(len(t), dtype=bool)) | changes
+    return Marks(holds, resets, landed_at(log_map.landed, series, t))
+
+
+def landed_at(detector: LandDetector | None, series: Mapping[str, Series], t: np.ndarray) -> np.ndarray:
+    """Return the times of a grid at which a land detector reports the ground; none without a detector."""
     on_ground = np.zeros(len(t), dtype=bool)
-    if log_map.landed is not None:
-        for k, field in enumerate(log_map.landed.fields):
-            if (flag := series.get(f"landed {k}")) is not None:
-                on_ground |= _true(_around(flag, t)[0], field)
-    return Marks(holds, resets, on_ground)
+    for k, field in enumerate(() if detector is None else detector.fields):
+        if (flag := series.get(f"landed {k}")) is not None:
+            on_ground |= _true(_around(flag, t)[0], field)
+    return on_ground
 
 
 def _around(series: Series, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

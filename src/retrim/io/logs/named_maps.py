@@ -6,17 +6,24 @@ from importlib.resources import files
 from pathlib import Path
 
 from ...config.validation import read_toml, validated
+from .body_map import BodyMap, is_body_map
 from .log_map import LogMap
+
+AnyMap = LogMap | BodyMap
 
 USUAL: dict[str, tuple[str, ...]] = {
     ".npz": ("retrim-npz",),
-    ".csv": ("retrim-csv", "crazyflie", "crazyflie-quaternion", "crazyswarm", "crazyswarm-quaternion"),
+    ".csv": (
+        "retrim-csv", "crazyflie", "crazyflie-quaternion", "crazyswarm", "crazyswarm-quaternion", "betaflight-csv",
+    ),
+    ".bbl": ("betaflight",),
+    ".bin": ("ardupilot", "ardupilot-rates"),
     ".ulg": ("px4", "px4-1.9"),
     ".bag": ("mavros", "mavros-pose", "crazyswarm-ros"),
     ".mcap": ("retrim-mcap", "px4-dds", "px4-dds-1.13", "mavros", "mavros-pose", "crazyswarm-ros"),
-}
+}  # fmt: skip
 """Default maps by file suffix; the first one whose fields exist in the log is used."""
-USUAL |= {".ulog": USUAL[".ulg"], ".db3": USUAL[".mcap"], "": USUAL[".mcap"]}
+USUAL |= {".ulog": USUAL[".ulg"], ".bfl": USUAL[".bbl"], ".db3": USUAL[".mcap"], "": USUAL[".mcap"]}
 
 
 @cache
@@ -26,13 +33,15 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(each.name.removesuffix(".toml") for each in folder.iterdir() if each.name.endswith(".toml")))
 
 
-def read_map(source: str | Path) -> LogMap:
-    """Return a map by name or from a TOML file.
+def read_map(source: str | Path) -> AnyMap:
+    """Return a map by name or from a TOML file; a map with measured rates and without states is a ``BodyMap``.
 
     Raises:
         ConfigError: The file cannot be read, or a value is missing, unknown or impossible.
     """
     if str(source) in names():
-        text = (files(__package__) / "maps" / f"{source}.toml").read_text(encoding="utf-8")
-        return validated(LogMap, tomllib.loads(text), source=f"map {source}")
-    return validated(LogMap, read_toml(Path(source)), source=str(source))
+        tables = tomllib.loads((files(__package__) / "maps" / f"{source}.toml").read_text(encoding="utf-8"))
+        name = f"map {source}"
+    else:
+        tables, name = read_toml(Path(source)), str(source)
+    return validated(BodyMap, tables, source=name) if is_body_map(tables) else validated(LogMap, tables, source=name)

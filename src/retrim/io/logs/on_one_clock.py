@@ -10,6 +10,7 @@ from ...physics.state import STANDARD_GRAVITY
 from . import log_map as maps
 from .attitudes import attitudes
 from .axes import to_body, to_world
+from .collective import collective_of, share_of
 from .log_map import LogMap
 from .resampling import around, derivative, held_mean, hold_last, interpolate, interpolate_attitudes, mark_known, period
 from .series import Series
@@ -20,6 +21,7 @@ SLOWEST = 0.1  # [s]: slower states do not determine accelerations, and no prese
 SHORTEST = 2e-5  # [s]: states never arrive that often
 ROUNDING = 0.045  # relative deviation of a logger that is set to ten samples per second
 LONGEST = 5_000_000  # maximum number of ticks; times that span more do not belong to one flight
+MOTORS = 4  # smallest number of motors
 ALIKE = 0.02  # relative difference up to which the log's period and the control period count as equal
 COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
 
@@ -98,7 +100,7 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     """
     W, B = to_world(log_map.frames.world), to_body(log_map.frames.body)
     t, dt = grid.t, grid.dt
-    of = {name: _columns(path, name, series) for name in series if " " not in name}
+    of = {name: _columns(path, log_map, name, series) for name in series if " " not in name}
     there = np.all([mark_known(each, t, dt) for name, each in of.items() if name in STATES], axis=0)
     attitude, rotations = attitudes(of["attitude"].values, log_map.attitude, path)
     stamps = of["attitude"].t
@@ -122,7 +124,8 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     else:
         p = maps.METRES[log_map.position.unit] * interpolate(of["position"], t) @ W.T
     spin = B * np.linalg.det(B)  # a rate is a pseudovector
-    thrust = _sample_command(of["thrust"], grid)[:, 0] * log_map.thrust.sign / log_map.thrust.full
+    total = Series(of["thrust"].t, collective_of(log_map.thrust, of["thrust"].values)[:, None])
+    thrust = _sample_command(total, grid)[:, 0]
     there &= mark_known(of["thrust"], t, dt, hold_s=COMMAND_HELD)
     command = measurement = hover = None
     if log_map.rates is not None and "rates" in of:
@@ -132,7 +135,7 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
         measurement = maps.RATES[log_map.measured_rates.unit] * interpolate(of["measured_rates"], t) @ spin.T
         there &= mark_known(of["measured_rates"], t, dt)
     if "hover" in of:
-        hover = hold_last(of["hover"], t)[:, 0] / log_map.thrust.full
+        hover = share_of(log_map.thrust, hold_last(of["hover"], t)[:, 0])
     if log_map.acceleration is None:
         a = derivative(v, dt)
         there &= around(there, 2)
@@ -169,10 +172,14 @@ def turning(R: np.ndarray, dt: float) -> np.ndarray:
     return np.asarray(angle / span[:, None])
 
 
-def _columns(path: Path, name: str, series: dict[str, Series]) -> Series:
+def _columns(path: Path, log_map: LogMap, name: str, series: dict[str, Series]) -> Series:
     """Return a series after checking its number of columns."""
     width, result = {"thrust": 1, "hover": 1}.get(name, 3), series[name].values.shape[1]
-    if name != "attitude" and result != width:
-        hint = "; add the motors' thrusts up into one column" if name == "thrust" and result == 4 else ""
-        raise LogError(f"{path}: {name} needs {width} number{'s' * (width > 1)}, its fields hold {result}{hint}")
+    if name == "thrust" and result != 1 and (result < MOTORS or log_map.thrust.unit not in ("share", "N")):
+        raise LogError(
+            f'{path}: thrust needs 1 number or, with unit = "share" or "N", one for each of {MOTORS} motors or more; '
+            f"its fields hold {result}"
+        )
+    if name not in ("attitude", "thrust") and result != width:
+        raise LogError(f"{path}: {name} needs {width} number{'s' * (width > 1)}, its fields hold {result}")
     return series[name]

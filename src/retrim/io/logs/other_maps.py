@@ -148,6 +148,6 @@ def _values(spec: Any, key: str) -> tuple[Any, ...]:
 
 def _with(log_map: LogMap, table: str, key: str, value: Any) -> LogMap:
     changes = {key: value} | (
-        {"mass": None, "hover": None, "full": 1.0} if table == "thrust" else {}
+        {"mass": None, "hover": None, "full": 1.0, "zero": 0.0, "curve": 0.0} if table == "thrust" else {}
     )  # these belong to a single unit
     return dataclasses.replace(log_map, **{table: dataclasses.replace(getattr(log_map, table), **changes)})

@@ -1,15 +1,21 @@
 """Reads a map's quantities from a file, as series in order of time."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...errors import LogError
+from .blackbox_csv import read_decoded
+from .blackbox_file import read_blackbox
+from .body_map import BodyMap
 from .csv_file import read_csv
-from .log_map import METRES, SECONDS, LogMap
-from .named_maps import USUAL, names, read_map
+from .dataflash_file import read_dataflash
+from .flights import FlightReader
+from .log_map import METRES, SECONDS
+from .named_maps import USUAL, AnyMap, names, read_map
 from .npz_file import read_npz
 from .ros_bag import read_bag
 from .series import Clock, LogReader, Series
@@ -22,12 +28,13 @@ READERS: dict[str, LogReader] = {
     ".bag": read_bag, ".mcap": read_bag, ".db3": read_bag,
 }  # fmt: skip
 """Readers by file suffix; a folder is a ROS 2 bag."""
-MOST_BYTES = 2 * 2**30, 256 * 2**20
-"""Maximum sizes of a log and of a CSV log [bytes]."""
+WITH_FLIGHTS: dict[str, FlightReader] = {".bbl": read_blackbox, ".bfl": read_blackbox, ".bin": read_dataflash}
+"""Readers of files that can contain several flights."""
+MOST_BYTES = {".csv": 256 * 2**20, ".bbl": 128 * 2**20, ".bfl": 128 * 2**20, ".bin": 512 * 2**20}
+"""Maximum sizes of logs that take much time or memory [bytes]."""
+LARGEST = 2 * 2**30  # maximum size of other logs [bytes]
 CONVERTERS = {
-    ".bbl": "blackbox_decode of blackbox-tools makes a CSV of it",
-    ".bfl": "blackbox_decode of blackbox-tools makes a CSV of it",
-    ".bin": "mavlogdump.py --format csv of pymavlink makes a CSV of a dataflash log of ArduPilot",
+    ".log": "mavlogdump.py --format csv of pymavlink makes a CSV of a text log of ArduPilot",
     ".tlog": "mavlogdump.py --format csv of pymavlink makes a CSV of it",
     ".px4log": "sdlog2_dump.py of PX4 makes a CSV of a log of before 1.4",
     ".mat": "scipy.io.loadmat and numpy.savez make an NPZ of it",
@@ -38,8 +45,15 @@ QUANTITIES = ("position", "velocity", "attitude", "thrust", "rates", "measured_r
 FLAGS = ("valid", "resets")
 
 
-def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Series], LogMap, list[str]]:
+def read_quantities(
+    path: Path, log_map: AnyMap | None, flight: int | None = None
+) -> tuple[dict[str, Series], AnyMap, list[str]]:
     """Return a log's series, the map that was used to read it, and notes.
+
+    Args:
+        path: The log.
+        log_map: The map; None for the first one that fits.
+        flight: Number of the flight in a file with several, from 1.
 
     In addition to the quantities, the series include ``<quantity> valid <k>``, ``<quantity> resets <k>`` and
     ``landed <k>``, and a derived velocity if the log contains none.
@@ -47,8 +61,7 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
     Raises:
         LogError: The file cannot be read, or a field is missing.
     """
-    reader = _reader(path)
-    raw, used_map, notes = _read(path, reader, log_map)
+    raw, used_map, notes = _read(path, _reader(path, flight), log_map)
     age, clock = raw.pop("age", None), _clock(used_map)
     if age is not None and clock is not None:  # the states were measured earlier, by the logged age
         for name in ("position", "velocity", "attitude"):
@@ -67,6 +80,10 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
             continue
         series[name], more = in_order(each, name, path)
         notes += more
+    if isinstance(used_map, BodyMap):
+        if "measured_rates" not in series:
+            raise LogError(f"{path}: the gyroscope measures nothing: measured_rates are 0 or not finite throughout")
+        return series, used_map, notes
     if "position" in series and "velocity" in series and not len(_valid(series, "position").t):
         del series["position"]
         used_map = replace(used_map, position=None)
@@ -85,12 +102,13 @@ def read_quantities(path: Path, log_map: LogMap | None) -> tuple[dict[str, Serie
     return series, used_map, notes
 
 
-def _read(path: Path, reader: LogReader, log_map: LogMap | None) -> tuple[dict[str, Series], LogMap, list[str]]:
+def _read(path: Path, reader: LogReader, log_map: AnyMap | None) -> tuple[dict[str, Series], AnyMap, list[str]]:
     first: LogError | None = None
     for used_map in [log_map] if log_map is not None else map(read_map, _usual(path)):
         request, optional = _list_fields(used_map)
         try:
-            raw, notes = reader(path, request, _clock(used_map), optional)
+            own = read_decoded if isinstance(used_map, BodyMap) and used_map.decoder == "blackbox" else reader
+            raw, notes = own(path, request, _clock(used_map), optional)
         except LogError as error:
             if log_map is not None or "no field" not in str(error):
                 raise
@@ -101,12 +119,12 @@ def _read(path: Path, reader: LogReader, log_map: LogMap | None) -> tuple[dict[s
     raise LogError(f"{first}; without a map it is read as {usual}: give --map map.toml") from first
 
 
-def _list_fields(used_map: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]]:
+def _list_fields(used_map: AnyMap) -> tuple[dict[str, tuple[str, ...]], set[str]]:
     """Return the fields of each quantity and mark, and the set of those that are optional."""
     request, optional = dict[str, tuple[str, ...]](), set[str]()
     marks = dict[str, tuple[str, ...]]()
     for name in QUANTITIES:
-        spec: Any = getattr(used_map, name)
+        spec: Any = getattr(used_map, name, None)
         if spec is None:
             continue
         request[name] = tuple(spec.fields)
@@ -125,7 +143,7 @@ def _list_fields(used_map: LogMap) -> tuple[dict[str, tuple[str, ...]], set[str]
     return request, optional
 
 
-def _clock(used_map: LogMap) -> Clock | None:
+def _clock(used_map: AnyMap) -> Clock | None:
     return None if used_map.time is None else Clock(used_map.time.field, SECONDS[used_map.time.unit])
 
 
@@ -139,23 +157,34 @@ def _valid(series: dict[str, Series], name: str) -> Series:
     return Series(result.t[keep], result.values[keep])
 
 
-def _reader(path: Path) -> LogReader:
+def _reader(path: Path, flight: int | None) -> LogReader:
+    suffix = path.suffix.lower()
+    _check_file(path, suffix)
+    if not path.is_dir() and suffix in WITH_FLIGHTS:
+        return partial(WITH_FLIGHTS[suffix], flight=flight)
+    if flight is not None:
+        raise LogError(f"{path}: --flight {flight}: only {', '.join(WITH_FLIGHTS)} files can contain several flights")
+    return read_bag if path.is_dir() else READERS[suffix]
+
+
+def _check_file(path: Path, suffix: str) -> None:
+    """Refuse a file of an unknown kind, an empty one and one that is too large."""
     if not path.exists():
         raise LogError(f"{path}: no such file")
     if path.is_dir():
-        return read_bag
-    suffix = path.suffix.lower()
+        return
     if suffix in CONVERTERS:
         raise LogError(f"{path}: {suffix} is not read; {CONVERTERS[suffix]}, to be read with --map map.toml")
-    if suffix not in READERS:
-        raise LogError(f"{path}: no log that is known; there are {', '.join(READERS)}, and folders of ROS 2")
+    if suffix not in READERS and suffix not in WITH_FLIGHTS:
+        raise LogError(
+            f"{path}: no log that is known; there are {', '.join([*READERS, *WITH_FLIGHTS])}, and folders of ROS 2"
+        )
     if not path.is_file():
         raise LogError(f"{path}: not a regular file")
     if (size := path.stat().st_size) == 0:
         raise LogError(f"{path}: it is empty")
-    if size > (most := MOST_BYTES[suffix == ".csv"]):
+    if size > (most := MOST_BYTES.get(suffix, LARGEST)):
         raise LogError(f"{path}: {size} bytes, more than the {most} that are accepted; cut out a part of the flight")
-    return READERS[suffix]
 
 
 def _usual(path: Path) -> tuple[str, ...]:

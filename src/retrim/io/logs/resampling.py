@@ -51,6 +51,22 @@ def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
     return np.asarray((both[1] - both[0]) / dt)
 
 
+def mean_between(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
+    """Return the mean of a measured quantity over the tick after each grid time, linear between samples."""
+    areas = 0.5 * np.diff(series.t)[:, None] * (series.values[1:] + series.values[:-1])
+    total = np.concatenate([np.zeros((1, series.values.shape[1])), np.cumsum(areas, axis=0)])
+
+    def area_until(at: np.ndarray) -> np.ndarray:
+        k = np.clip(np.searchsorted(series.t, at, side="right") - 1, 0, len(series.t) - 2)
+        step = np.clip(at, series.t[0], series.t[-1]) - series.t[k]
+        slope = (series.values[k + 1] - series.values[k]) / (series.t[k + 1] - series.t[k])[:, None]
+        beyond = at - np.clip(at, series.t[0], series.t[-1])
+        return np.asarray(total[k] + step[:, None] * (series.values[k] + 0.5 * step[:, None] * slope)
+                          + beyond[:, None] * series.values[np.where(at < series.t[0], 0, -1)])  # fmt: skip
+
+    return np.asarray((area_until(grid + dt) - area_until(grid)) / dt)
+
+
 def interpolate_attitudes(t: np.ndarray, R: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return the attitudes at grid times, interpolated along the shortest rotation between samples."""
     from scipy.spatial.transform import Rotation, Slerp  # local, because it takes as long to import as all of retrim

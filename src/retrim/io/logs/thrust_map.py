@@ -6,6 +6,7 @@ import numpy as np
 
 from ...errors import LogError
 from ...physics.state import STANDARD_GRAVITY
+from .collective import number_of, share_of
 from .log_map import Thrust
 from .on_one_clock import UP, Ticks
 
@@ -33,10 +34,10 @@ def normalise_thrust(
         full = float(np.sum(share * along) / np.sum(share**2))
         if full <= 0.0:
             raise LogError(f"{path}: the more thrust, the less acceleration along its axis; is it the right field?")
-        hover = spec.full * STANDARD_GRAVITY / full
+        hover = number_of(spec, STANDARD_GRAVITY / full)
         number = f"{hover:.3f}" if spec.full == 1.0 else f"{hover:.5g}"
         return full * ticks.thrust, full, [f"thrust map found from the flight: hover at {number}"]
-    hovers = ticks.hover if ticks.hover is not None else np.full(len(ticks.t), float(spec.hover) / spec.full)
+    hovers = ticks.hover if ticks.hover is not None else share_of(spec, np.full(len(ticks.t), float(spec.hover)))
     if not np.all(hovers[valid] > 0.01):
         raise LogError(f"{path}: thrust at hover, {spec.hover!r}, is not positive all the time")
     return STANDARD_GRAVITY * ticks.thrust / hovers, float(STANDARD_GRAVITY / np.median(hovers[valid])), []

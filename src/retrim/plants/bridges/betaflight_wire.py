@@ -5,27 +5,30 @@ import struct
 import numpy as np
 
 from ...errors import MessageError
+from ...physics.state import STANDARD_GRAVITY
 
 MOTORS, STATE, STICKS, CLI = 9002, 9003, 9004, 5761  # ports: the board sends motors, and listens on the others
 CENTRE, SPAN, LOW, HIGH = 1500, 500, 1000, 2000  # [us], stick positions
 THROTTLE_FROM, THROTTLE_SPAN = 1050.0, 950.0  # [us]: start and length of the throttle range
 IDLE = 0.055  # smallest share of a motor's range while the board is armed
 CHANNELS, ARM = 16, 4  # number of receiver channels, and index of the one that arms
+REST = np.array([0.0, 0.0, STANDARD_GRAVITY])
 GYRO = np.array([1.0, -1.0, -1.0])  # from forward-left-up body rates
 RATE_STICKS = np.array([1.0, 1.0, -1.0])  # roll, pitch and yaw up, from forward-left-up body rates
 OUR_ROTORS = [0, 1, 3, 2]  # the board's are front-right, back-left, front-left, back-right; our last two are swapped
 _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct.Struct("<4f")
 
 
-def state_packet(omega: np.ndarray) -> bytes:
-    """Return a packet with body rates; a board in rate mode ignores all other values.
+def state_packet(omega: np.ndarray, specific_force: np.ndarray = REST) -> bytes:
+    """Return a packet with body rates and a specific force; a board in rate mode flies by the rates alone.
 
     The time stamp is constant, so the board uses its own clock, which the jitter of varying stamps would disturb.
 
     Args:
         omega: Body rates, forward-left-up [rad/s].
+        specific_force: Specific force, forward-left-up [m/s^2], which the board writes to its Blackbox.
     """
-    still = (0.0, 0.0, -9.81, 1.0, 0.0, 0.0, 0.0, *(0.0,) * 6, 101325.0)
+    still = (*-specific_force, 1.0, 0.0, 0.0, 0.0, *(0.0,) * 6, 101325.0)
     return _STATE.pack(1.0, *(GYRO * omega), *still)
 
 

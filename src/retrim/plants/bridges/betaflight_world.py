@@ -18,7 +18,7 @@ from ...physics.motors import CommandedSpeeds
 from ...physics.state import Command, State
 from ...physics.substep import SUBSTEP
 from .betaflight_firmware import in_real_time
-from .betaflight_wire import MOTORS, STATE, STICKS, motors_of, state_packet, sticks_packet
+from .betaflight_wire import MOTORS, REST, STATE, STICKS, motors_of, state_packet, sticks_packet
 from .vehicle_state import VehicleState
 
 GROUND = 0.0  # [m]
@@ -103,7 +103,7 @@ class World:
         with self._lock:
             self._free, self._s, self._t = False, s, 0.0
             self._output = np.concatenate(
-                [np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)] + [np.zeros(3)]
+                [np.asarray(leaf, dtype=float).ravel() for leaf in (x.p, x.R, x.v)] + [np.zeros(3), REST]
             )
             self._stamp = time.monotonic()
 
@@ -153,10 +153,11 @@ class World:
                     if not np.isfinite(self._output).all() or self._output[2] < GROUND:
                         self._over.set()  # contact with the ground is not simulated
                 rates = self._output[15:18] if self._free else np.zeros(3)
+                specific_force = self._output[18:21] if self._free else REST
                 sticks = (
                     sticks_packet(*self._sticks, self._fastest, armed=self._is_armed) if k % STICKS_EVERY == 0 else None
                 )
-            self._out.sendto(state_packet(rates), (HOST, STATE))
+            self._out.sendto(state_packet(rates, specific_force), (HOST, STATE))
             if sticks is not None:
                 self._out.sendto(sticks, (HOST, STICKS))
 
@@ -170,16 +171,18 @@ def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
 def _compile(
     model: BemQuadrotor, disturbance: Disturbance
 ) -> Callable[[BemState, np.ndarray, float], tuple[BemState, Array]]:
-    """Return a function for one millisecond of flight: (state, motors, time) -> (state, state as p, R, v, omega)."""
+    """Return a millisecond of flight: (state, motors, time) -> (state, [p, R, v, omega, specific force])."""
     vehicle, hover = model.vehicle, Command.hover()
 
     @jax.jit
     def advance(s: BemState, motors: Float[Array, "4"], t: Float[Array, ""]) -> tuple[BemState, Array]:
         speeds = jnp.clip(vehicle.esc.speed(motors), vehicle.motor_min, vehicle.motor_max)
         model_at_speeds = BemQuadrotor(vehicle, CommandedSpeeds(speeds, model.loop.thrust_map), model.dt)
-        after = model_at_speeds.substep(s, hover, disturbance(t, model.state(s)))
+        before = model.state(s)
+        after = model_at_speeds.substep(s, hover, disturbance(t, before))
         x, rotors = model.state(after), model.rotor_state(after)
-        return after, jnp.concatenate([x.p, x.R.reshape(9), x.v, rotors.omega])
+        specific_force = x.R.T @ ((x.v - before.v) / SUBSTEP + jnp.asarray(REST, x.v.dtype))
+        return after, jnp.concatenate([x.p, x.R.reshape(9), x.v, rotors.omega, specific_force])
 
     dtype: Any = jnp.result_type(float)
 
