@@ -1,4 +1,4 @@
-"""Writes Blackbox logs from the description of the format: I and P frames with every code, and the events."""
+"""Writes Blackbox logs from the description of the format: I, P and S frames with every code, and two events."""
 
 import struct
 
@@ -60,18 +60,6 @@ def three(values):
     return whole_bytes(values)
 
 
-def three_uneven(values):
-    """Three numbers of 2, 2, 2, of 5, 5, 4 or of 8, 7, 7 bits, or of whole bytes."""
-    a, b, c = values
-    if fits(values, (2, 2, 2)):
-        return bytes([(a & 3) << 4 | (b & 3) << 2 | c & 3])
-    if fits(values, (5, 5, 4)):
-        return (0x4000 | (a & 31) << 9 | (b & 31) << 4 | c & 15).to_bytes(2, "big")
-    if fits(values, (8, 7, 7)):
-        return (0x800000 | (a & 255) << 14 | (b & 127) << 7 | c & 127).to_bytes(3, "big")
-    return whole_bytes(values)
-
-
 def four(values):
     """Four numbers of 0, 4, 8 or 16 bits, packed by half bytes."""
     sizes = [0 if v == 0 else 1 if fits([v], [4]) else 2 if fits([v], [8]) else 4 for v in values]
@@ -81,7 +69,7 @@ def four(values):
 
 
 CODES = {0: (svb, 1), 1: (vb, 1), 3: (lambda v: vb(-v & 0x3FFF), 1), 6: (eight, 8), 7: (three, 3), 8: (four, 4),
-         9: (lambda v: b"", 1), 10: (three_uneven, 3)}  # fmt: skip
+         9: (lambda v: b"", 1)}  # fmt: skip
 
 
 def encode(codes, values):
@@ -104,7 +92,8 @@ LAYOUT = [
     *((f"rcCommand[{k}]", int(k < 3), 0, int(k == 3), 1, 8) for k in range(4)),
     *((f"setpoint[{k}]", 1, 0, 0, 1, 8) for k in range(4)),
     *((f"gyroADC[{k}]", 1, 0, 0, 3, 0) for k in range(3)), *((f"accSmooth[{k}]", 1, 0, 0, 3, 0) for k in range(3)),
-    *((f"debug[{k}]", 1, 0, 0, 1, 6) for k in range(8)), *((f"x[{k}]", 1, 0, 0, 1, 10) for k in range(3)),
+    *((f"debug[{k}]", 1, 0, 0, 1, 6) for k in range(8)), *((f"x[{k}]", 1, 0, 0, 1, 7) for k in range(3)),
+    ("down", 1, 0, 3, 1, 3),
     ("motor[0]", 0, 11, 1, 3, 0), *((f"motor[{k}]", 0, 5, 0, 3, 0) for k in (1, 2, 3)),
 ]  # fmt: skip
 UNFILTERED = [(f"gyroUnfilt[{k}]", 1, 0, 0, 3, 0) for k in range(3)]
@@ -129,6 +118,7 @@ def numbers(flight, version, fine=False):
                     f"gyroUnfilt[{i}]": k * flight.rates[:, i] * DEG, f"axisI[{i}]": 40.0 * flight.rates[:, i],
                     f"accSmooth[{i}]": 2048.0 * flight.force[:, i] / STANDARD_GRAVITY,
                     f"x[{i}]": 10.0 ** (i + 1) * flight.rates[:, 0]}  # fmt: skip
+    columns["down"] = 4000.0 + 90.0 * flight.rates[:, 0]
     columns |= {f"motor[{i}]": LOW + (HIGH - LOW) * (flight.motors[:, i] - IDLE) / (1.0 - IDLE) for i in range(4)}
     columns |= {f"debug[{i}]": 100.0 * (i == 2) * flight.rates[:, 0] for i in range(8)}
     return {name: np.round(column).astype(int) for name, column in columns.items()}

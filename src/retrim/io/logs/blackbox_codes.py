@@ -86,21 +86,6 @@ def _three(data: bytes, at: int, count: int) -> tuple[tuple[int, ...], int]:
     return _whole_bytes(data, at)
 
 
-def _three_uneven(data: bytes, at: int, count: int) -> tuple[tuple[int, ...], int]:
-    """Return three numbers of 2, 2, 2, of 5, 5, 4 or of 8, 7, 7 bits, or of whole bytes."""
-    tag = data[at]
-    size = tag >> 6
-    if size == 0:
-        return tuple(_extend(tag >> shift & 3, 2) for shift in (4, 2, 0)), at + 1
-    if size == 1:
-        word = (tag & 63) << 8 | data[at + 1]
-        return (_extend(word >> 9 & 31, 5), _extend(word >> 4 & 31, 5), _extend(word & 15, 4)), at + 2
-    if size == 2:
-        word = (tag & 63) << 16 | data[at + 1] << 8 | data[at + 2]
-        return (_extend(word >> 14 & 255, 8), _extend(word >> 7 & 127, 7), _extend(word & 127, 7)), at + 3
-    return _whole_bytes(data, at)
-
-
 def _whole_bytes(data: bytes, at: int) -> tuple[tuple[int, ...], int]:
     tag, values = data[at], []
     at += 1
@@ -139,7 +124,7 @@ def _extend(value: int, bits: int) -> int:
 
 DECODERS: dict[int, tuple[Decode, int]] = {
     0: (_one_signed, 1), 1: (_one_unsigned, 1), 3: (_negative_14, 1), 6: (_eight, 8), 7: (_three, 3), 8: (_four, 4),
-    9: (_nothing, 1), 10: (_three_uneven, 3),
+    9: (_nothing, 1),
 }  # fmt: skip
 """Function of each encoding, and the largest number of fields that it decodes at once."""
 

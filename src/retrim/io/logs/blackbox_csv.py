@@ -32,7 +32,8 @@ def read_decoded(
     values = {row[0].strip(): ",".join(row[1:]).strip() for _, row in rows[:begin] if len(row) > 1}
     header = [cell.strip() for cell in rows[begin][1]]
     fields = {what: [each for name in names for each in _expand(name, header)] for what, names in request.items()}
-    raw, notes = series_of_rows(path, rows[begin:], fields, time, optional)
+    clock = None if time is None else Clock(_expand(time.field, header)[0], time.scale)
+    raw, notes = series_of_rows(path, rows[begin:], fields, clock, optional)
     board = BlackboxHeader((), (), {}, values, 0)
     if not board.revision:
         notes.append("the CSV has no settings; the units of motors and accelerometer follow from its numbers")

@@ -10,7 +10,7 @@ BEGIN = b"H Product:Blackbox"
 LONGEST = 64 * 1024  # largest size of a header [bytes]
 FIELDS = 256  # largest number of fields in a frame
 HEADER_MARK = b"H "
-ENCODINGS = (0, 1, 3, 6, 7, 8, 9, 10)
+ENCODINGS = (0, 1, 3, 6, 7, 8, 9)
 PREDICTORS = range(12)
 
 

@@ -92,7 +92,7 @@ def _grid(path: Path, body_map: BodyMap, series: Mapping[str, Series]) -> tuple[
     last = min(each.t[-1] for each in needed.values())
     if body_map.part.end is not None:
         last = min(last, zero + body_map.part.end)
-    cut, dt = last - first > LONGEST_S, max(own, FINEST)
+    cut, dt = bool(last - first > LONGEST_S), max(own, FINEST)
     n = int(min(last - first, LONGEST_S) / dt + 1e-9)
     if n < 4:
         spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in needed.items())

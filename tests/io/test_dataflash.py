@@ -1,0 +1,184 @@
+"""Dataflash logs of ArduPilot, whole and damaged: the flight in retrim's frames, or one line."""
+
+import contextlib
+import struct
+
+import numpy as np
+import pytest
+
+from fake_body_flight import BodyFlight, Truth, fly_body
+from fake_dataflash import HEAD, body_messages, dataflash, flight_messages, formats, message, sorted_messages
+from fake_log import G, fly_once
+from retrim.errors import LogError, RetrimError
+from retrim.io.logs import BodyLog, FlightLog, read_flight_log, read_log, read_map
+from retrim.io.logs.dataflash_file import parameters_of
+from retrim.replay import rows_of
+
+FLIGHT = fly_once(6.0, dt=0.01)
+MESSAGES = flight_messages(FLIGHT)
+LOG = dataflash(MESSAGES)
+
+
+def write(tmp_path, data, name="flight.bin"):
+    (tmp_path / name).write_bytes(data)
+    return tmp_path / name
+
+
+def is_the_flight(log, flight=FLIGHT):
+    """Position, velocity, attitude, rates and thrust, in east-north-up and forward-left-up."""
+    assert isinstance(log, FlightLog)
+    at = [np.argmin(np.abs(flight.t - t)) for t in log.t]
+    np.testing.assert_allclose(log.p, flight.p[at], atol=2e-3)
+    np.testing.assert_allclose(log.v, flight.v[at], atol=2e-3)
+    np.testing.assert_allclose(log.R, flight.R[at], atol=2e-3)
+    np.testing.assert_allclose(log.rates, flight.omega[at], atol=1e-3)
+    np.testing.assert_allclose(log.command, flight.omega[at], atol=1e-3)
+    assert log.full_thrust == pytest.approx(G[2] / 0.35, rel=1e-2)
+    assert np.abs(np.asarray(rows_of(log).a_res)[log.valid]).max() < 0.2
+
+
+def test_a_flight_with_positions(tmp_path):
+    """The estimator's states, of its first instance; the thrust map is that of the parameter."""
+    path = write(tmp_path, LOG)
+    log = read_flight_log(path)
+    is_the_flight(log)
+    assert min(log.agreement.values()) > 0.95
+    hover = float(next(note for note in log.notes if "hover at" in note).split()[-1])
+    assert hover == pytest.approx(parameters_of(path)["MOT_THST_HOVER"], rel=0.1)
+
+
+def test_numbers_are_those_of_pymavlink(tmp_path):
+    reader = pytest.importorskip("pymavlink.DFReader")
+    path = write(tmp_path, LOG, "flight.BIN")
+    log, rows = reader.DFReader_binary(str(path)), []
+    while (each := log.recv_match(type=["XKF1", "RATE", "IMU"])) is not None:
+        if each.get_type() != "RATE" and getattr(each, "C" if each.get_type() == "XKF1" else "I") == 1:
+            continue
+        rows.append((each.get_type(), each))
+    log.close()
+    from retrim.io.logs.dataflash_file import read_dataflash
+
+    fields = {"XKF1": ["Roll", "Yaw", "VN", "PD"], "RATE": ["RDes", "AOut"], "IMU": ["GyrX", "AccZ"]}
+    series, _ = read_dataflash(path, {k: [f"{k}.{x}" for x in names] for k, names in fields.items()}, None)
+    for kind, names in fields.items():
+        theirs = np.array([[getattr(each, x) for x in names] for what, each in rows if what == kind])
+        np.testing.assert_allclose(series[kind].values, theirs, rtol=1e-6, atol=1e-9)
+
+
+def test_motors_and_another_instance(tmp_path):
+    """Four pulse widths instead of a thrust; and the second accelerometer, which is 50 m/s^2 off."""
+    text = (read_text("ardupilot")).replace(
+        'fields = ["RATE.AOut|CTUN.ThO"]\nunit = "share"',
+        'fields = ["RCOU.C1", "RCOU.C2", "RCOU.C3", "RCOU.C4"]\nunit = "share"\nzero = 1000.0\nfull = 2000.0',
+    )
+    (tmp_path / "map.toml").write_text(text)
+    log = read_flight_log(write(tmp_path, LOG), read_map(tmp_path / "map.toml"))
+    assert log.full_thrust == pytest.approx(G[2] / (0.8 * 0.35), rel=1e-2)
+    (tmp_path / "map.toml").write_text(read_text("ardupilot-rates").replace("IMU.Acc", "IMU#1.Acc"))
+    with pytest.raises(LogError, match=r"accelerometer measures .* g upwards in flight instead of 1"):
+        read_log(tmp_path / "flight.bin", read_map(tmp_path / "map.toml"))
+
+
+def read_text(name):
+    from importlib.resources import files
+
+    return (files("retrim.io.logs") / "maps" / f"{name}.toml").read_text()
+
+
+def test_a_rate_loop_alone(tmp_path):
+    """Without an estimator's states the log is one of rates; axes are turned from forward-right-down."""
+    whole = fly_body(3.0, Truth(curve=0.0))
+    flight = BodyFlight(*(getattr(whole, name)[::5] for name in ("t", "command", "rates", "motors", "force")))
+    log = read_log(write(tmp_path, dataflash(body_messages(flight), without=("XKF1",))))
+    assert isinstance(log, BodyLog)
+    n = len(log.t)
+    np.testing.assert_allclose(log.command, flight.command[:n], atol=1e-4)
+    np.testing.assert_allclose(log.rates, 0.5 * (flight.rates[:n] + flight.rates[1 : n + 1]), atol=1e-4)
+    np.testing.assert_allclose(log.specific_force, 0.5 * (flight.force[:n] + flight.force[1 : n + 1]), atol=1e-4)
+    assert log.agreement["turning"] > 0.9
+
+
+def test_two_flights_between_arming_and_disarming(tmp_path):
+    other = fly_once(4.0, dt=0.01, seed=3)
+    path = write(tmp_path, dataflash(MESSAGES, flight_messages(other, start=60.0)))
+    with pytest.raises(
+        LogError, match=r"2 flights are in this file: 1 of 6.0 s, 2 of 4.0 s; choose one, as --flight 1"
+    ):
+        read_log(path)
+    is_the_flight(read_flight_log(path, flight=1))
+    is_the_flight(read_flight_log(path, flight=2), other)
+
+
+def test_a_clock_that_begins_again_begins_another_flight(tmp_path):
+    """Two starts of the board in one file, without arming; a damaged time alone is no start."""
+    other = fly_once(4.0, dt=0.01, seed=3)
+    parts = flight_messages(FLIGHT, events=False), flight_messages(other, start=1.0, events=False)
+    path = write(tmp_path, dataflash(*parts))
+    with pytest.raises(LogError, match=r"2 flights are in this file: 1 of 9.0 s, 2 of 4.0 s"):
+        read_log(path)
+    is_the_flight(read_flight_log(path, flight=2), other)
+    data = bytearray(dataflash(parts[0]))
+    at = data.index(HEAD + b"\x43", len(data) // 2) + 3
+    data[at : at + 8] = struct.pack("<Q", 10**12)
+    log = read_flight_log(write(tmp_path, bytes(data)))
+    assert log.seconds > 5.0
+
+
+def torn(data):
+    return data[: len(data) * 2 // 3 + 7]
+
+
+def test_a_log_that_is_cut_or_has_gaps_is_read(tmp_path):
+    log = read_flight_log(write(tmp_path, torn(LOG)))
+    is_the_flight(log)
+    assert 3.0 < log.seconds < 5.0
+    data = bytearray(LOG)
+    data[len(data) // 2 : len(data) // 2 + 300] = bytes(300)
+    log = read_flight_log(write(tmp_path, bytes(data)))
+    assert any("bytes of the file belong to no message" in note for note in log.notes)
+    assert log.seconds > 5.0
+
+
+def slow():
+    return dataflash(flight_messages(fly_once(6.0, dt=0.1), every=1), without=("XKF1",))
+
+
+REFUSED = {
+    "empty": (lambda: b"", "it is empty"),
+    "garbage": (lambda: bytes(range(256)) * 40, "no message describes the others"),
+    "descriptions alone": (formats, "no field"),
+    "short": (lambda: dataflash(flight_messages(fly_once(0.5, dt=0.01))), "at least 1 s are needed"),
+    "no rates": (
+        lambda: dataflash(flight_messages(FLIGHT, without=("RATE", "XKF1")), without=("RATE", "XKF1")),
+        "no field 'XKF1'; there are .*IMU.* without a map it is read as 'ardupilot' or 'ardupilot-rates'",
+    ),
+    "too rare": (slow, "rates come every 0.1 s; .*LOG_BITMASK with fast attitude"),
+    "descriptions of other lengths": (
+        lambda: formats().replace(b"Q", b"Z") + sorted_messages(MESSAGES), "no message describes the others"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_cannot_be_read_is_refused_with_one_line(kind, tmp_path):
+    make, text = REFUSED[kind]
+    with pytest.raises(LogError, match=f"flight.bin: .*{text}") as error:
+        read_log(write(tmp_path, make()))
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 1500
+
+
+def test_bytes_of_any_kind_are_a_flight_or_one_line(tmp_path):
+    rng, short = np.random.default_rng(0), dataflash(flight_messages(fly_once(1.5, dt=0.01)))
+    head = len(formats())
+    for k in range(40):
+        data = bytearray(short[: int(rng.integers(1, len(short)))] if k % 3 == 0 else short)
+        for place in rng.integers(0, min(head, len(data)) if k % 2 else len(data), 1 + k % 6):
+            data[place] = int(rng.integers(256))
+        with contextlib.suppress(RetrimError):
+            log = read_log(write(tmp_path, bytes(data)))
+            assert np.isfinite(log.rates[log.valid]).all()
+    with contextlib.suppress(RetrimError):
+        read_log(write(tmp_path, short[:head] + rng.bytes(300_000)))
+    with pytest.raises(LogError):
+        read_log(write(tmp_path, formats() + message("EV", 5, 10) * 20_000))
