@@ -106,7 +106,7 @@ def layout_of(version, without=()):
 
 
 def numbers(flight, version, fine=False):
-    """What a board writes: deg/s (tenths if ``fine``), 2048 for one g, motor commands of DSHOT."""
+    """The numbers of a board: deg/s (tenths if ``fine``), 2048 for one g, motor commands of DSHOT."""
     k = 10.0 if fine else 1.0
     n = len(flight.t[::1])
     stick = (flight.motors.mean(axis=1) - IDLE) / (1.0 - IDLE)
@@ -169,7 +169,7 @@ def blackbox(flight, version=(4, 5), *, without=(), fine=False, end=DISARM + END
 
 
 def decoded_csv(flight, version=(4, 5), settings=()):
-    """What blackbox_decode makes of a log; Blackbox Explorer writes settings above the table."""
+    """The table of blackbox_decode; Blackbox Explorer writes settings above the table."""
     layout, columns = layout_of(version), numbers(flight, version)
     names = [each[0] for each in layout]
     title = ", ".join("time" if settings and n == "time" else "time (us)" if n == "time" else n for n in names)

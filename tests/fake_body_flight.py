@@ -27,7 +27,7 @@ class BodyFlight:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is to be found."""
+    """The parameters of the flight."""
 
     delay: float = 0.008
     lag: float = 0.030
@@ -40,7 +40,7 @@ class Truth:
 
 
 def second_order(u, lag, damping, delay):
-    """What follows ``u`` with omega = 2 zeta / lag, after a delay of whole milliseconds; exact for a held command."""
+    """The response to ``u`` with omega = 2 zeta / lag, after a delay in milliseconds; exact for a held command."""
     w = 2.0 * damping / lag
     num, den, _ = cont2discrete(([w * w], [1.0, lag * w * w, w * w]), DT, method="zoh")
     late = np.concatenate([np.full(round(delay / DT), u[0]), u])[: len(u)]
@@ -48,7 +48,7 @@ def second_order(u, lag, damping, delay):
 
 
 def first_order(u, lag):
-    """What follows ``u`` with one pole."""
+    """The response to ``u`` with one pole."""
     keep = np.exp(-DT / lag)
     return lfilter([0.0, 1.0 - keep], [1.0, -keep], u - u[0]) + u[0]
 
@@ -61,7 +61,7 @@ def wander(rng, n, size, tau, every=10):
 
 
 def fly_body(seconds=16.0, truth=Truth(), seed=0, noise=0.01):
-    """Fly random rates and thrusts; mild noise on what is measured."""
+    """Fly random rates and thrusts; mild noise on the measurements."""
     rng, n = np.random.default_rng(seed), round(seconds / DT)
     command = np.stack([wander(rng, n, size, 0.15) for size in (2.0, 2.0, 1.2)], axis=1)
     shapes = ((truth.lag, truth.damping), (truth.lag, truth.damping), (truth.yaw_lag, truth.damping))

@@ -45,7 +45,7 @@ def sorted_messages(rows):
 
 
 def flight_messages(flight, start=3.0, *, without=(), events=True, every=2):
-    """What ArduCopter logs of a flight with attitudes: NED, forward-right-down; two of its estimators and IMUs."""
+    """Messages of ArduCopter for a flight with attitudes: NED, forward-right-down; two of its estimators and IMUs."""
     ned, stamp = turned_frames(flight), [round(1e6 * (t + start)) for t in flight.t]
     angles = Rotation.from_matrix(ned.R).as_euler("ZYX", degrees=True)
     force = np.einsum("nji,nj->ni", flight.R, flight.a + G) @ FRD_OF_FLU.T
@@ -73,7 +73,7 @@ def dataflash(*parts, without=()):
 
 
 def body_messages(flight, start=3.0):
-    """What ArduCopter logs of a flight of rates alone."""
+    """Messages of ArduCopter for a flight of rates alone."""
     rows = []
     c, w, f = flight.command @ FRD_OF_FLU.T * DEG, flight.rates @ FRD_OF_FLU.T * DEG, flight.force @ FRD_OF_FLU.T
     share = flight.motors.mean(axis=1)

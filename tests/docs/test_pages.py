@@ -89,6 +89,7 @@ def test_toml_files_of_pages_are_accepted(tmp_path):
         "my_quad": read_vehicle,
         "slow": read_vehicle,
         "my_log": read_map,
+        "rates": read_map,
         "study": read_sweep,
         "track100": lambda path: overlaid(PRESETS["track/preview"], path),
         "laps": lambda path: overlaid(PRESETS["track/retrim"], path),

@@ -52,7 +52,7 @@ def is_the_flight(log, flight=FLIGHT):
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_every_number_of_every_code_is_read(version):
-    """Frames with differences are what was written, to the last bit."""
+    """Frames with differences have the numbers of the writer, to the last bit."""
     data = blackbox(FLIGHT, version)
     header = read_header(Path("log"), data, 0)
     frames = FrameDecoder(data, header, len(data)).decode(header.names)

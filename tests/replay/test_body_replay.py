@@ -1,4 +1,4 @@
-"""What a board's own log says of a vehicle: each value within a tenth, or the reason why it is not known."""
+"""Values from a board's own log: within a tenth of the truth, or the report gives the reason for their absence."""
 
 import json
 import tomllib
@@ -50,7 +50,7 @@ def log_of(flight, every=4, **changes):
 
 
 def agrees(result, truth, *, forces=True):
-    """Every value is within a tenth of what was put in, or within 2 ms or 0.1 where a tenth is less."""
+    """Every value is within a tenth of the truth, or within 2 ms or 0.1 where a tenth is less."""
     found = result.vehicle
     assert found.delay.value == pytest.approx(truth.delay, rel=TENTH, abs=2e-3)
     assert found.rate_lag.value == pytest.approx(truth.lag, rel=TENTH)
@@ -103,7 +103,7 @@ def test_a_map_that_states_the_thrust_curve_is_believed():
 
 
 def test_what_does_not_move_is_not_known():
-    """At rest there is noise alone: nothing of the rate loop, and no thrust map."""
+    """At rest there is noise alone: the rate loop and the thrust map stay unknown."""
     rng, flight = np.random.default_rng(0), fly_body(11.0)
     noise = 0.01 * rng.normal(size=flight.rates.shape)
     still = BodyFlight(

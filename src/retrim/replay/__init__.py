@@ -1,5 +1,7 @@
 """Replays flight logs: measures the nominal model's error, predicts this error, and identifies the vehicle."""
 
+from .body_identification import BodyIdentification as BodyIdentification
+from .body_identification import identify_body as identify_body
 from .identification import IdentifiedVehicle as IdentifiedVehicle
 from .identification import identify as identify
 from .prediction import PredictionScore as PredictionScore

@@ -29,7 +29,7 @@ WIDE = 0.5  # a value whose interval is wider than this share of it is not deter
 
 @dataclass(frozen=True)
 class BodyIdentification:
-    """What a log of commands, gyroscope and accelerometer says about a vehicle."""
+    """Values of a vehicle that follow from commands, gyroscope and accelerometer."""
 
     vehicle: IdentifiedVehicle
     hover: Estimate | None
@@ -48,7 +48,7 @@ class BodyIdentification:
 
 
 class _Channel(NamedTuple):
-    """Sums of a channel, and what its commands explain."""
+    """Sums of a channel, and the share of its changes that commands explain."""
 
     products: Products
     best: Fit

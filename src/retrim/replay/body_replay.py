@@ -1,4 +1,4 @@
-"""Reports on a log of commands, gyroscope and accelerometer, and states what such a log cannot say."""
+"""Reports on a log of commands, gyroscope and accelerometer, with a reason for each value that is not determined."""
 
 from pathlib import Path
 

@@ -133,7 +133,7 @@ class FrameDecoder:
         return frame, at
 
     def _absolute(self, kind: str, raw: list[int]) -> tuple[int, ...]:
-        """Return the values of a main frame: what is predicted, plus the difference in the frame."""
+        """Return the values of a main frame: predictions plus the differences in the frame."""
         one, two, signs = self._one, self._two, self._header.signed
         frame = list[int]()
         for k, (value, predictor) in enumerate(zip(raw, self._predictors[kind], strict=True)):

@@ -82,7 +82,7 @@ def _correct_signs(body_map: BodyMap, axes: dict[int, float]) -> str:
 
 
 def _other_unit(body_map: BodyMap, log: BodyLog, delay: int) -> str:
-    """Return the unit with which commanded and measured rates agree, or an empty string if there is none."""
+    """Return the unit with which commanded and measured rates agree, or an empty string."""
     if body_map.rates is None or log.command is None:
         return ""
     own = maps.RATES[body_map.rates.unit]

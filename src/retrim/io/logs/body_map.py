@@ -12,7 +12,7 @@ STATES = ("position", "velocity", "attitude")
 
 @dataclass(frozen=True, config=STRICT)
 class BodyMap:
-    """A map from a log's fields to commands, and to what a gyroscope and an accelerometer measure."""
+    """A map from a log's fields to commands and to the measurements of a gyroscope and an accelerometer."""
 
     thrust: Thrust
     measured_rates: BodyRates
