@@ -153,7 +153,7 @@ REFUSED = {
     "too rare": (slow, "rates come every 0.06 s; .*blackbox_sample_rate"),
     "upside down": (
         lambda: blackbox(BodyFlight(FLIGHT.t, FLIGHT.command, FLIGHT.rates, FLIGHT.motors, -FLIGHT.force)),
-        r"measures -1(\.\d+)? g upwards .*; the sign",
+        r"measures -[01](\.\d+)? g upwards .*; the sign",
     ),
     "two flights": (
         lambda: blackbox(SHORTER) + LOG,

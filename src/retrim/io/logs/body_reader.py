@@ -19,7 +19,7 @@ from .resampling import held_mean, mark_known, mean_between, period, smooth
 from .series import Series
 
 FINEST, SLOWEST = 0.002, 0.052  # [s]: shortest tick, and slowest rates from which a lag can be identified
-LONGEST_S = 600.0  # [s]: longer flights are not needed to identify a vehicle
+LONGEST_S = 180.0  # [s]: longer flights are not needed to identify a vehicle
 SHORT_GAP = 0.02  # [s]: a shorter gap between samples is bridged
 LEAST_S = 1.0  # [s]: shortest flight
 FILTER = "acceleration filter"  # series of one sample: the lag of the accelerometer's filter [s]
