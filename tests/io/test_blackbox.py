@@ -204,7 +204,7 @@ def test_a_log_that_is_cut_is_read_up_to_the_cut(tmp_path):
 
 def test_a_damaged_frame_costs_the_frames_up_to_the_next_main_frame(tmp_path):
     data = bytearray(LOG)
-    data[len(data) // 2 : len(data) // 2 + 40] = bytes(40)
+    data[len(data) // 2 : len(data) // 2 + 800] = bytes(800)
     log = read(tmp_path, bytes(data))
     assert any("frames are damaged, and are left out" in note for note in log.notes)
     lost = np.sum(~log.valid) * log.dt
