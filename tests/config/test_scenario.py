@@ -146,6 +146,9 @@ BOUNDS = {
     "table-edge": (0.0, 0.5),
     "ceiling": (0.0, 1.0),
     "downwash": (0.3, 3.0),
+    "slung-load": (0.02, 1.0),
+    "slung-cable": (0.2, 3.0),
+    "slung-pickup": (0.02, 1.0),
 }
 
 
@@ -186,6 +189,16 @@ def test_the_control_period_reaches_every_plant(plant):
         assert Scenario(plant=plant).make(dt=0.01).dt == 0.01
     except PlantError as error:
         pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("plant", ["rotorpy", "mujoco", "crazyflow", "betaflight"])
+def test_plants_without_a_state_of_the_disturbance_refuse_a_load_on_a_cable(plant):
+    for plain in ("payload", "none"):
+        Scenario(plain, plant=plant)
+    with pytest.raises(ConfigError, match=f"plant '{plant}' cannot carry a load on a cable; disturbance 'wind.slung"):
+        Scenario("wind+slung-load", plant=plant)
+    for able in ("bem", "simple", "second-order"):
+        Scenario("wind+slung-load", plant=able)
 
 
 @pytest.mark.parametrize("plant", ["bem", "simple"])

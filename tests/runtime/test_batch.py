@@ -12,9 +12,20 @@ from retrim.control.controller import AbstractController
 from retrim.control.gravity_frame import GravityFrame
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn.stacking import stack, unstack
-from retrim.physics import Command, CommandPath, Constant, LinearDragQuadrotor, PointMass, State, small
+from retrim.physics import (
+    Command,
+    CommandPath,
+    Constant,
+    LinearDragQuadrotor,
+    PointMass,
+    SlungLoad,
+    State,
+    SumOfDisturbances,
+    small,
+)
 from retrim.plants import SensorModel, SimPlant
 from retrim.runtime import ControllerPilot, batch_flight, fly
+from retrim.runtime.together import fly_together
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +53,21 @@ def test_same_as_flying_the_plant(parts, delay_s, sensors):
     plant = SimPlant(model, push, delay_s=delay_s, sensors=sensors, seed=4)
     log = fly(plant, ControllerPilot(controller), x0, ticks=15)
     assert_same(jax.jit(lambda x0: batch_flight(plant.simulation, controller, x0, ticks=15))(x0), log)
+
+
+def test_a_load_on_a_cable_swings_the_same(parts):
+    """As one program, and in a batch of different loads, whose launch shares a program."""
+    model, _, controller, x0 = parts
+    loads = [SlungLoad.of(share, length=0.3, picked=0.1, dropped=0.24) for share in (0.1, 0.4)]
+    plants = [SimPlant(model, SumOfDisturbances((load, Constant(jnp.ones(3))))) for load in loads]
+    logs = [fly(plant, ControllerPilot(controller), x0, ticks=15) for plant in plants]
+    for plant, log in zip(plants, logs, strict=True):
+        assert_same(jax.jit(lambda x0, s=plant.simulation: batch_flight(s, controller, x0, ticks=15))(x0), log)
+    pilots = [ControllerPilot(controller) for _ in loads]
+    for log, other in zip(fly_together(plants, pilots, [x0, x0], ticks=15), logs, strict=True):
+        np.testing.assert_allclose(log.true.p, other.true.p, atol=1e-6)
+        np.testing.assert_allclose(log.u, other.u, atol=1e-5)
+    assert np.abs(logs[0].true.p[-1] - logs[1].true.p[-1]).max() > 0.01
 
 
 def test_a_late_measurement_is_taken_for_what_it_says_of_now(parts):

@@ -11,6 +11,7 @@ from ..physics.disturbance import Constant, Disturbance, Kick, RandomWalk, Rever
 from ..physics.downwash import Downwash
 from ..physics.faults import BatterySag, Payload, WeakRotor
 from ..physics.proximity import BELOW, Ceiling, TableEdge
+from ..physics.slung_load import SlungLoad
 from ..physics.wind import Dryden, Fan, SteadyWind
 from .registry import Registry
 from .sizes import name_and_size
@@ -122,6 +123,12 @@ _BUILT_IN: dict[str, DisturbanceFactory] = {
     "payload": lambda key, size: Payload.of(_check_size(size, 0.07, 0.0, 20.0, "kg")),  # the paper: 190 g become 260 g
     "off-centre": lambda key, size: Payload.of(0.07, ahead=_check_size(size, 0.03, -0.2, 0.2, "m")),  # the same load
     "pickup": lambda key, size: Payload.of(_check_size(size, 0.07, 0.0, 20.0, "kg"), picked=8.0, dropped=20.0),
+    # Sizes: mass of the load as a share of the vehicle's, or the length of the cable of a load of 30 %.
+    "slung-load": lambda key, size: SlungLoad.of(_check_size(size, 0.3, 0.02, 1.0, "of the mass")),
+    "slung-cable": lambda key, size: SlungLoad.of(0.3, length=_check_size(size, 0.5, 0.2, 3.0, "m")),
+    "slung-pickup": lambda key, size: SlungLoad.of(
+        _check_size(size, 0.3, 0.02, 1.0, "of the mass"), picked=8.0, dropped=20.0
+    ),
     "battery": lambda key, size: BatterySag(  # size: relative loss of thrust per second
         jnp.array(_check_size(size, 0.002, 0.0, 0.1, "1/s")), jnp.array(0.8)
     ),

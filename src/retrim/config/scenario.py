@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 from ..errors import ConfigError, RetrimError
 from ..physics.command_path import LONGEST_DELAY
-from ..physics.disturbance import Disturbance, for_vehicle
+from ..physics.disturbance import Disturbance, for_vehicle, stateful_parts
 from ..physics.vehicle import Vehicle
 from ..plants.entry import DELAY, PlantEntry, PlantRequest
 from ..plants.plant import Plant
@@ -42,7 +42,7 @@ class Scenario:
         """Raise :class:`ConfigError` for an unknown name or an option that the plant does not support."""
         entry = self.entry
         SENSORS.find(self.sensors)
-        disturbance(self.disturbance)
+        has_state = bool(stateful_parts(disturbance(self.disturbance)))
         if self.vehicle is not None:
             if entry.own_vehicle is not None:
                 raise ConfigError(
@@ -55,6 +55,11 @@ class Scenario:
             raise ConfigError(
                 f"plant {self.plant!r} is a vehicle, whose world nobody can disturb by name: disturbance "
                 f"{self.disturbance!r} must be none"
+            )
+        if has_state and not entry.has_disturbance_state:
+            raise ConfigError(
+                f"plant {self.plant!r} cannot carry a load on a cable; disturbance {self.disturbance!r} needs bem, "
+                "simple or second-order"
             )
         if self.sensors != "ideal" and not entry.has_sensors:
             raise ConfigError(

@@ -36,6 +36,8 @@ from .proximity import Ceiling as Ceiling
 from .proximity import TableEdge as TableEdge
 from .rotors import LinearDragQuadrotor as LinearDragQuadrotor
 from .second_order import SecondOrderQuadrotor as SecondOrderQuadrotor
+from .slung_load import LoadState as LoadState
+from .slung_load import SlungLoad as SlungLoad
 from .state import STANDARD_GRAVITY as STANDARD_GRAVITY
 from .state import Command as Command
 from .state import State as State

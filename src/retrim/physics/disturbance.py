@@ -2,10 +2,13 @@
 
 This module contains pushes; see also the modules ``wind`` and ``faults``. Disturbances belong to the plant; the nominal
 model does not contain them. Their random numbers are drawn at construction, so a disturbance is repeatable.
+
+A disturbance may have a state of its own, such as that of a load on a cable (:class:`StatefulDisturbance`). The plant
+advances this state together with the vehicle, in the same substeps.
 """
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -24,6 +27,26 @@ class Disturbance(Protocol):
 
     def __call__(self, t: Float[Array, ""], x: State, /) -> ExternalEffects:
         """Return the external effects at time ``t`` in the state ``x``."""
+        ...
+
+
+@runtime_checkable
+class StatefulDisturbance(Disturbance, Protocol):
+    """Protocol of a disturbance with a state of its own. A call without it gives the effects of its state of rest."""
+
+    def init(self, x: State, /) -> Any:
+        """Return the state of the disturbance at the start of a flight in the state ``x``: a pytree of arrays."""
+        ...
+
+    def advance(self, s: Any, t: Float[Array, ""], x: State, h: float, /) -> tuple[ExternalEffects, Any]:
+        """Return the effects on the vehicle during a substep, and the state of the disturbance at its end.
+
+        Args:
+            s: State of the disturbance at the start of the substep.
+            t: Time at the start of the substep [s].
+            x: State of the vehicle at the start of the substep.
+            h: Length of the substep [s].
+        """
         ...
 
 
@@ -56,6 +79,48 @@ class SumOfDisturbances(eqx.Module):
     def for_vehicle(self, vehicle: Vehicle) -> "SumOfDisturbances":
         """Return the sum of the parts for a vehicle."""
         return SumOfDisturbances(tuple(for_vehicle(part, vehicle) for part in self.parts))
+
+
+def parts_of(disturbance: Disturbance) -> tuple[Disturbance, ...]:
+    """Return the parts of a sum of disturbances, also of nested sums; a disturbance that is no sum is its only part."""
+    if not isinstance(disturbance, SumOfDisturbances):
+        return (disturbance,)
+    return tuple(part for summand in disturbance.parts for part in parts_of(summand))
+
+
+def stateful_parts(disturbance: Disturbance) -> tuple[StatefulDisturbance, ...]:
+    """Return the parts of a disturbance that have a state of their own."""
+    return tuple(part for part in parts_of(disturbance) if isinstance(part, StatefulDisturbance))
+
+
+def start(disturbance: Disturbance, x: State) -> tuple[Any, ...]:
+    """Return the states of the stateful parts of a disturbance at the start of a flight in the state ``x``."""
+    return tuple(part.init(x) for part in stateful_parts(disturbance))
+
+
+def advance(
+    disturbance: Disturbance, states: tuple[Any, ...], t: Float[Array, ""], x: State, h: float
+) -> tuple[ExternalEffects, tuple[Any, ...]]:
+    """Return the effects of a disturbance during a substep, and the states of its stateful parts at the end.
+
+    Args:
+        disturbance: The disturbance.
+        states: States of its stateful parts at the start of the substep, from :func:`start`; empty without such parts.
+        t: Time at the start of the substep [s].
+        x: State of the vehicle at the start of the substep.
+        h: Length of the substep [s].
+    """
+    if not states:
+        return disturbance(t, x), states
+    effects, after, remaining = ExternalEffects.calm(x.p.dtype), list[Any](), iter(states)
+    for part in parts_of(disturbance):
+        if isinstance(part, StatefulDisturbance):
+            more, state = part.advance(next(remaining), t, x, h)
+            after.append(state)
+        else:
+            more = part(t, x)
+        effects = effects + more
+    return effects, tuple(after)
 
 
 def for_vehicle(disturbance: Disturbance, vehicle: Vehicle) -> Disturbance:

@@ -57,6 +57,8 @@ class PlantEntry:
     """Whether the plant supports an error of the thrust map."""
     has_delay: bool = False
     """Whether the plant supports a configurable command delay."""
+    has_disturbance_state: bool = False
+    """Whether the plant advances the states of disturbances that have one, such as a load on a cable."""
     is_vehicle: bool = False
     """Whether the plant is a link to a vehicle, which runs in real time and whose world cannot be disturbed. An address
     may follow the plant's name, e.g. ``mavlink:udp:127.0.0.1:14540``. Such a plant is a

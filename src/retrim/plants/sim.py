@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from ..errors import PlantError
 from ..physics.command_path import LONGEST_DELAY, CommandQueue, check_delay
-from ..physics.disturbance import Disturbance
+from ..physics.disturbance import Disturbance, SumOfDisturbances, advance, start, stateful_parts
 from ..physics.effects import ExternalEffects
 from ..physics.state import Command, State
 from ..physics.substep import SUBSTEP, AbstractSubstepDynamics
@@ -46,6 +46,8 @@ class SimState(eqx.Module):
     """Mean acceleration over the last tick in the world frame [m/s^2]."""
     reports: Reports | None = None
     """Memory of the measurement fault; None without a fault."""
+    disturbance: tuple[Any, ...] = ()
+    """States of those parts of the disturbance that have one, such as a load on a cable."""
 
 
 class Simulation(eqx.Module):
@@ -80,8 +82,9 @@ class Simulation(eqx.Module):
         return 0.0 if self.sensors is None else self.sensors.age
 
     def undisturbed(self) -> "Simulation":
-        """Return a copy without the disturbance."""
-        return dataclasses.replace(self, disturbance=_calm)
+        """Return a copy without those parts of the disturbance that have no state; a launch does not need them."""
+        parts = stateful_parts(self.disturbance)
+        return dataclasses.replace(self, disturbance=SumOfDisturbances(parts) if parts else _calm)
 
     def launch(self, x0: State) -> SimState:
         """Return the state of a plant that hovers at ``x0``, with queued hover commands and one sample of ``x0``."""
@@ -93,7 +96,7 @@ class Simulation(eqx.Module):
         if self.fault is not None:
             rows = self.fault.memory + 1
             reports = Reports(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, *leaf.shape)), sample), sample)
-        return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p), reports)
+        return SimState(self.model.init(x0), queue, samples, jnp.zeros_like(x0.p), reports, start(self.disturbance, x0))
 
     def advance(self, s: SimState, u: Command, tick: Int[ArrayLike, ""]) -> SimState:
         """Return the state one control tick later, computed in steps of 1 ms.
@@ -108,21 +111,23 @@ class Simulation(eqx.Module):
         """
         per_tick, queue = round(self.model.dt / SUBSTEP), s.queue.push(u)
 
-        def millisecond(inner: Any, xs: tuple[Float[Array, ""], Command]) -> tuple[Any, State]:
-            t, acting = xs
-            after = self.model.substep(inner, acting, self.disturbance(t, self.model.state(inner)))
-            return after, self.model.state(after)
+        def millisecond(carry: tuple[Any, Any], xs: tuple[Float[Array, ""], Command]) -> tuple[tuple[Any, Any], State]:
+            (inner, outer), (t, acting) = carry, xs
+            effects, outer = advance(self.disturbance, outer, t, self.model.state(inner), SUBSTEP)
+            after = self.model.substep(inner, acting, effects)
+            return (after, outer), self.model.state(after)
 
         times = self.time(tick, s.a.dtype) + SUBSTEP * jnp.arange(per_tick, dtype=s.a.dtype)
         acting = queue.substeps(self.delay, self.model.dt, per_tick)
-        inner, path = lax.scan(millisecond, s.model, (times, acting))
+        (inner, outer), path = lax.scan(millisecond, (s.model, s.disturbance), (times, acting))
         if (sensors := self.sensors) is None:
             samples = jax.tree.map(lambda leaf: leaf[-1:], path)
         else:
             on_samples = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
             samples = sensors.received(s.samples, on_samples, random.fold_in(self.key, tick))
         a = (self.model.state(inner).v - self.model.state(s.model).v) / self.model.dt
-        return SimState(inner, queue, samples, a, self._reports(s.reports, samples, jnp.asarray(tick) + 1))
+        reports = self._reports(s.reports, samples, jnp.asarray(tick) + 1)
+        return SimState(inner, queue, samples, a, reports, outer)
 
     def _reports(self, before: Reports | None, samples: State, tick: Int[Array, ""]) -> Reports | None:
         if before is None or self.fault is None:
@@ -238,8 +243,16 @@ class SimPlant(Plant):
         return self._measurement(), accepted_command
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Change the disturbance in flight; new parameters of the same kind do not cause recompilation."""
+        """Change the disturbance in flight; new parameters of the same kind do not cause recompilation.
+
+        The states of its parts continue if they have the same structure; otherwise, they begin anew.
+        """
         self.simulation = dataclasses.replace(self.simulation, disturbance=disturbance)
+        if (s := self._state) is not None:
+            states = start(disturbance, self.simulation.true(s))
+            structures: list[Any] = [jax.tree.structure(each) for each in (states, s.disturbance)]
+            if structures[0] != structures[1]:
+                self._state = dataclasses.replace(s, disturbance=states)
 
     def _measurement(self) -> Measurement:
         assert self._state is not None

@@ -29,6 +29,7 @@ def _entry(model: Callable[[PlantRequest], AbstractSubstepDynamics[Any]], about:
         has_faults=True,
         has_thrust_error=True,
         has_delay=True,
+        has_disturbance_state=True,
     )
 
 

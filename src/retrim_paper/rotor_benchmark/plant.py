@@ -120,4 +120,5 @@ entry = PlantEntry(
     own_vehicle="simplified",
     has_sensors=True,
     has_faults=True,
+    has_disturbance_state=True,
 )
