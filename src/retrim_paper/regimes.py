@@ -19,11 +19,13 @@ from retrim.config.scenario import Scenario
 from retrim.physics import State, TableEdge
 from retrim.runkit.flights import Flight
 
+from .slung_load import END, seconds_to_calm
 from .vehicles import DELAY, THRUST_TO_WEIGHT, heavy_quadrotor, slow_quadrotor
 
 PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
 LAST, TAIL = 2.0, 10.0  # [s], scored intervals at the end of hover flights and of tracking flights
 LAP_ERROR = 0.1  # [m], largest mean error of a lap that counts
+CHANGES = 16.0  # [s], scored interval at the end of flights with a pick-up and a release
 VEHICLES = 8  # number of hidden vehicles
 VEHICLE_SEED = 48  # seed of their draw
 
@@ -83,6 +85,16 @@ def lap_time(flight: Flight) -> float:
     return float(last - first) if error <= LAP_ERROR else float("inf")
 
 
+def rms_error(flight: Flight) -> float:
+    """Return the root mean square of the distance from the reference over the last ten seconds [m]."""
+    return float(np.sqrt(np.mean(flight.error[_tail(flight, TAIL)] ** 2)))
+
+
+def rms_error_with_changes(flight: Flight) -> float:
+    """Return :func:`rms_error` for the last 16 seconds, which contain a pick-up and a release [m]."""
+    return float(np.sqrt(np.mean(flight.error[_tail(flight, CHANGES)] ** 2)))
+
+
 def height_error(flight: Flight) -> float:
     """Return the root mean square of the height error over the last ten seconds [m].
 
@@ -115,10 +127,13 @@ def regimes() -> tuple[Regime, ...]:
     tracking = load("track/retrim")
     over_places = changed(tracking, vehicle="large", adapt=replace(tracking.adapt, residual="place"))
     slow, paced = slow_quadrotor(), load("track/paced")
+    with_load = changed(tracking, adapt=replace(tracking.adapt, residual="swing"))
     circle = "circle=1"
     hidden = tuple(vehicle.scenario(PUSH) for vehicle in draw_vehicles(VEHICLES, VEHICLE_SEED))
     at_rest = Score(mean_error, f"mean error, last {LAST:g} s")
     on_path = Score(tracking_error, f"mean error, last {TAIL:g} s")
+    on_path_rms = Score(rms_error, f"RMS error, last {TAIL:g} s")
+    calm = Score(seconds_to_calm, "time after the stop until the swing remains below 5° [ms]")
     in_height = Score(height_error, f"RMS height error, last {TAIL:g} s")
     per_lap = Score(lap_time, f"time of the last lap; an error above {LAP_ERROR:g} m counts as lost")
     above_table = Score(height_error_above_table, f"RMS height error, last {TAIL:g} s; a contact counts as lost")
@@ -168,6 +183,27 @@ def regimes() -> tuple[Regime, ...]:
             "a circle at 1 m/s over the edge of a table, 2 cm above it; after eight passes",
             over_places, (Scenario("table-edge", reference=circle),), 38.0, above_table,
             published="-72 % height error (arXiv 2203.07747)",
+        ),
+        Regime(
+            "S7 no load", "a figure-8 of 3 m by 1 m in 5 s without a load, for comparison",
+            with_load, (Scenario(reference="figure8"),), 24.0, on_path_rms,
+        ),
+        Regime(
+            "S7 slung load",
+            "the same figure-8 with a load of 30 % of the mass on a cable of 0.5 m, unknown to every method",
+            with_load, (Scenario("slung-load=0.3", reference="figure8"),), 24.0, on_path_rms,
+            published="\"significantly outperforms\" (arXiv 2605.16015)",
+        ),
+        Regime(
+            "S7 stop",
+            "the same load; a circle of 1 m in 3 s, and a stop within 0.6 s",
+            with_load, (Scenario("slung-load=0.3", reference="retrim_paper.slung_load:circle_and_stop"),), END, calm,
+        ),
+        Regime(
+            "S7 pick-up and release",
+            "the same load on a circle at 1 m/s, picked up at rest at 8 s and dropped at 20 s",
+            with_load, (Scenario("slung-pickup=0.3", reference=circle),), 24.0,
+            Score(rms_error_with_changes, f"RMS error, last {CHANGES:g} s"),
         ),
         Regime(
             "S8 off-centre load",

@@ -271,7 +271,7 @@ def test_a_low_rank_delta_has_a_learning_rate_of_its_own(low_rank):
     assert max(jax.tree.leaves(change)) == pytest.approx(0.04, rel=1e-3)
 
 
-@pytest.mark.parametrize("name", ["ensemble", "regression", "layered", "linear", "place"])
+@pytest.mark.parametrize("name", ["ensemble", "regression", "layered", "linear", "place", "swing"])
 def test_what_was_learnt_has_the_types_of_nothing_learnt(window, name, key):
     """Weak types, too: a program that took the first state must not be compiled again for the second, in flight."""
     learner = Setup.from_preset(tiny_preset(adapt={"residual": name, "fit_steps": 2})).learner

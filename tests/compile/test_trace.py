@@ -12,6 +12,7 @@ from jax import lax, random
 from retrim import Measurement
 from retrim.compile.ops.program import NumpyProgram
 from retrim.compile.trace import numpy_program, plain
+from retrim.config.loading import changed
 from retrim.config.named_presets import PRESETS
 from retrim.config.setup import Setup
 from retrim.control.mppi import MppiController
@@ -160,6 +161,7 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
         ("hover/retrim", None),
         ("hover/paper", None),
         ("track/retrim", "figure8"),
+        ("track/retrim with a load", "figure8"),
         ("track/fast", "star"),
         ("track/paced", "figure8=max"),
         ("vision/retrim", None),
@@ -167,7 +169,9 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
     ],
 )
 def test_a_preset_flies_the_same_commands(preset, reference):
-    setup = Setup.from_preset(PRESETS[preset], reference)
+    name, _, load = preset.partition(" with a ")
+    values = changed(PRESETS[name], adapt={"residual": "swing"}) if load else PRESETS[name]
+    setup = Setup.from_preset(values, reference)
     with jax.numpy_dtype_promotion("standard"):
         state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     parameters, fixed = eqx.partition(state, eqx.is_array)

@@ -85,7 +85,7 @@ def test_a_low_rank_delta_is_drawn_from_the_key_and_kept_where_there_is_one(key)
     assert setup.pilot(policy).dt == setup.preset.dt
 
 
-@pytest.mark.parametrize("method", ["base", "base-do", "base-id", "full", "lora"])
+@pytest.mark.parametrize("method", ["base", "base-do", "base-swing", "base-id", "full", "lora"])
 @pytest.mark.parametrize("name", ["hover/any", "track/any"])
 def test_every_method_of_a_policy_for_many_vehicles_gives_a_command(name, method):
     """Traced, not compiled: each method wraps the policy in other controllers."""

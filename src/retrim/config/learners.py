@@ -20,6 +20,7 @@ from ..control.gravity_frame import GravityFrame, PoseFrame, lead_of
 from ..control.lap_learning import LapLearning
 from ..control.monitor import Monitor
 from ..control.policy import AbstractPolicy
+from ..control.slung_load import LoadCompensation
 from ..errors import ConfigError, FrameError
 from ..estimation.command_path import PathEstimator
 from ..estimation.disturbance_observer import DisturbanceObserver
@@ -120,7 +121,11 @@ def check_frame(preset: Preset, task: AbstractTask) -> None:
 
 
 def effective_gravity_frame(
-    controller: AbstractController[Any], preset: Preset, vehicle: Vehicle, known_residual: FittedResidual | None = None
+    controller: AbstractController[Any],
+    preset: Preset,
+    vehicle: Vehicle,
+    known_residual: FittedResidual | None = None,
+    load_task: AbstractTask | None = None,
 ) -> GravityFrame | PoseFrame:
     """Return a controller in the frame of effective gravity, which an observer or the observation estimates.
 
@@ -131,6 +136,7 @@ def effective_gravity_frame(
         known_residual: Learned residual, including the learned body-rate bias. The observer estimates the remaining
             disturbance. The estimator of an observation ignores the residual and
             estimates the whole disturbance.
+        load_task: Task of a flight with a load on a cable, which is estimated and compensated; None without a load.
     """
     limit = jnp.array(TILT_LIMIT)
     if isinstance(controller, PolicyController) and controller.observation.state_estimator is not None:
@@ -148,8 +154,9 @@ def effective_gravity_frame(
     result = None if known_residual is None else known_residual.turning
     bias = jnp.zeros(3) if result is None else result.bias
     place = None if known_residual is None else known_residual.place
+    load = None if load_task is None else LoadCompensation(load_task)
     return GravityFrame(
-        controller, observer, known_residual, rate_bias=bias, place=place, lead=lead_of(path, preset.dt)
+        controller, observer, known_residual, rate_bias=bias, place=place, lead=lead_of(path, preset.dt), load=load
     )
 
 
@@ -180,7 +187,8 @@ def _in_frame(
 ) -> AbstractController[Any]:
     if preset.adapt.frame == "world":
         return track_actuators(plain, preset)
-    frame = effective_gravity_frame(plain, preset, vehicle, residual)
+    load_task = task if hasattr(residual.model, "load") else None
+    frame = effective_gravity_frame(plain, preset, vehicle, residual, load_task)
     if not isinstance(frame, GravityFrame):
         return frame
     monitor = track_actuators(Monitor(frame, task), preset)

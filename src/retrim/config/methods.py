@@ -45,16 +45,20 @@ class MethodRequest:
         """Return the policy with the observation used in flight."""
         return policy_controller(self.setup.preset, self.setup.flight_task, self.policy.merged())
 
-    def in_effective_gravity_frame(self) -> AbstractController[Any]:
+    def in_effective_gravity_frame(self, *, with_load: bool = False) -> AbstractController[Any]:
         """Return the policy in the frame of effective gravity.
+
+        Args:
+            with_load: Whether to estimate a load on a cable and to compensate its pull.
 
         Raises:
             ConfigError: The task cannot be rotated into this frame.
         """
         check_frame(self.setup.preset, self.setup.env.task)
-        return track_actuators(
-            effective_gravity_frame(self.controller(), self.setup.preset, self.setup.vehicle), self.setup.preset
-        )
+        setup = self.setup
+        load_task = setup.flight_task if with_load else None
+        frame = effective_gravity_frame(self.controller(), setup.preset, setup.vehicle, load_task=load_task)
+        return track_actuators(frame, setup.preset)
 
     def by_state(self, controller: AbstractController[Any], name: str | None = None) -> AbstractController[Any]:
         """Adapt a state-feedback controller to the observation, whose state estimator it uses if there is one.
@@ -163,6 +167,10 @@ def _gravity_frame(request: MethodRequest) -> Pilot:
     return ControllerPilot(request.in_effective_gravity_frame())
 
 
+def _load(request: MethodRequest) -> Pilot:
+    return ControllerPilot(request.in_effective_gravity_frame(with_load=True))
+
+
 def _make_identifying_pilot(request: MethodRequest) -> Pilot:
     return ControllerPilot(identify_vehicle(request.in_effective_gravity_frame(), request.setup.preset))
 
@@ -187,6 +195,7 @@ def _low_rank(setup: "Setup", policy: AbstractPolicy, key: Key[Array, ""]) -> Lo
 register_method("base", MethodEntry(_base, "base policy"))
 register_method("base-i", MethodEntry(_integral, "base policy + integral action"))
 register_method("base-do", MethodEntry(_gravity_frame, "base policy + disturbance observer"))
+register_method("base-swing", MethodEntry(_load, "base policy + observer + load estimator"))
 register_method("base-id", MethodEntry(_make_identifying_pilot, "base policy + observer + identification"))
 for _name, _baseline in BASELINES.items():
     register_method(_name, MethodEntry(partial(_without_policy, _name, _baseline), _baseline.label))

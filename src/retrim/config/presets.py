@@ -57,7 +57,8 @@ class Adapt:
     residual: Printable = "ensemble"
     """Residual model: ensemble (the paper's), regression (ten physical numbers), layered (a regression, and
     an ensemble for the remaining error), linear (19 features, learned over the whole flight), place (a regression, and
-    a map over position with a memory of minutes), or module:name."""
+    a map over position with a memory of minutes), swing (a regression, and an estimator of a load on a cable), or
+    module:name."""
     memory: Seconds = 0.5
     """Regression: age at which a tick's weight is 1/e of the newest tick's weight [s]."""
     thrust_prior: float = Field(default=0.05, gt=0, le=1.0, strict=True)

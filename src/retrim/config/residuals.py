@@ -12,6 +12,7 @@ from ..learn.residuals.linear import LinearModel
 from ..learn.residuals.model import ResidualModel
 from ..learn.residuals.place import PlaceModel
 from ..learn.residuals.regression import BLOCK, RegressionModel
+from ..learn.residuals.swing import SwingModel
 from ..physics.vehicle import Vehicle
 from .command_paths import lag_of
 from .presets import Preset
@@ -86,6 +87,10 @@ def _place(request: ResidualRequest) -> PlaceModel:
     return PlaceModel.of(_regression(request), p.dt, every=p.adapt.fit_every)
 
 
+def _swing(request: ResidualRequest) -> SwingModel:
+    return SwingModel(_regression(request), request.preset.dt, request.preset.adapt.fit_every)
+
+
 def _linear(request: ResidualRequest) -> LinearModel:
     return LinearModel.of(request.preset.dt, every=request.preset.adapt.fit_every)
 
@@ -95,3 +100,4 @@ register_residual("regression", _regression)
 register_residual("layered", _make_layered)
 register_residual("linear", _linear)
 register_residual("place", _place)
+register_residual("swing", _swing)

@@ -23,6 +23,7 @@ from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from .controller import AbstractController, PolicyController
+from .slung_load import LoadCompensation, LoadMemory
 
 SHARE_OF_LATENESS = 0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
 FASTEST, SLOWEST = 0.015, 0.05  # [s], limits of this time constant
@@ -35,6 +36,8 @@ class GravityFrameState(eqx.Module):
     inner: Any
     frame: EffectiveGravityFrame
     """Frame of the last command."""
+    load: LoadMemory | None = None
+    """Memory of the compensation of a load; None without it."""
 
 
 class GravityFrame(AbstractController[GravityFrameState]):
@@ -64,6 +67,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
     """Time from a measurement that is not late until the thrust has followed a command [s]."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Disturbance that turns the frame in addition to the estimated one, in the world frame [m/s^2]."""
+    load: LoadCompensation | None = None
+    """Compensation of a load on a cable; None if no load is expected."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "GravityFrame":
         """Return the same controller for measurements that are ``age`` seconds old."""
@@ -102,11 +107,14 @@ class GravityFrame(AbstractController[GravityFrameState]):
             lambda leaf, new: jnp.broadcast_to(new, leaf.shape), observer_state.commands, CommandQueue(command)
         )
         observer_state = dataclasses.replace(observer_state, commands=commands)
-        return GravityFrameState(observer_state, self.inner.init(x), EffectiveGravityFrame.of(observer_state.d_hat))
+        load = None if self.load is None else self.load.init(x)
+        return GravityFrameState(
+            observer_state, self.inner.init(x), EffectiveGravityFrame.of(observer_state.d_hat), load
+        )
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
         """Return the command of the inner controller, in the frame of the present effective gravity."""
-        observer, disturbance = self.observer, jnp.zeros_like(x.p)
+        observer, disturbance, unsteady = self.observer, jnp.zeros_like(x.p), None
         if self.known_residual is not None:
             unsteady = StateDependentResidual(self.known_residual, self.trust_residual, self.place)
             disturbance = unsteady(x, memory.observer.commands.newest)
@@ -115,7 +123,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
                 there = x.p + (self.lead + self.age).astype(x.p.dtype) * x.v
                 change = self.place(there) - self.place(x.p)
                 disturbance = disturbance + self.trust_residual.astype(x.p.dtype) * change
-        observer_state = observer(memory.observer, t, x)
+        observer_state, load, pull = self._observe(observer, memory, t, x, unsteady)
+        now = x
+        if load is not None:
+            share, sway = self.trust_residual.astype(x.p.dtype), load.sway
+            disturbance = disturbance + share * (pull - sway.a)
+            now = State(x.p - share * sway.p, x.R, x.v - share * sway.v)
         disturbance = self.trust_estimate.astype(x.p.dtype) * (observer_state.d_hat + disturbance)
         disturbance = disturbance + self.steady.astype(x.p.dtype)
         frame = EffectiveGravityFrame.of(limit_norm(disturbance, observer.limit))
@@ -123,17 +136,44 @@ class GravityFrame(AbstractController[GravityFrameState]):
         acting, flying = Command(last.c, last.omega + bias), self.inner
         if self.actuators is not None:
             acting, flying = self.actuators.command, flying.with_actuators(frame.actuators(self.actuators))
-        x = ahead(x, acting, frame.d, self.age.astype(x.p.dtype))
+        x = ahead(now, acting, frame.d, self.age.astype(x.p.dtype))
         u, inner = flying.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
         u = Command(u.c, u.omega - bias)
-        return u, GravityFrameState(observer.issued(observer_state, u), inner, frame)
+        return u, GravityFrameState(observer.issued(observer_state, u), inner, frame, load)
+
+    def _observe(
+        self,
+        observer: DisturbanceObserver,
+        memory: GravityFrameState,
+        t: Float[Array, ""],
+        x: State,
+        known: Residual | None,
+    ) -> tuple[ObserverState, LoadMemory | None, Float[Array, "3"]]:
+        """Return the memory of the observer, that of the load, and the pull of the load on the vehicle [m/s^2].
+
+        The observer estimates what remains of the disturbance without the pull.
+        """
+        before, load, dt = memory.observer, memory.load, observer.nominal.dt
+        if self.load is None or load is None:
+            return observer(before, t, x), None, jnp.zeros_like(x.p)
+        load, pull = self.load.predict(load, before.last, x, dt)
+        without = self.trust_residual.astype(x.p.dtype) * pull
+        after = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, Held(without)))(before, t, x)
+        u, _ = observer.acted(before, x)
+        missed = after.innovation + without
+        if known is not None:
+            missed = missed + known(before.last, u)
+        valid = jnp.any(after.innovation != before.innovation)  # the observer holds it if the tick is not usable
+        load = self.load.correct(load, missed, before.last, x, u, after.noise, valid, dt)
+        pull, load = self.load.plan(load, t, (self.lead + self.age).astype(x.p.dtype), dt)
+        return after, load, pull
 
     def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
         """Remember the accepted command in the observer and, transformed to the frame, in the inner controller."""
         observer = self.observer.accepted(memory.observer, u)
         command = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
-        return GravityFrameState(observer, self.inner.accepted(memory.inner, command), memory.frame)
+        return GravityFrameState(observer, self.inner.accepted(memory.inner, command), memory.frame, memory.load)
 
     def _bias(self, dtype: Any) -> Float[Array, "3"]:
         return (self.trust_residual * self.rate_bias).astype(dtype)
@@ -193,6 +233,17 @@ class StateDependentResidual(eqx.Module):
         if self.place is not None:
             beyond = beyond + self.place(x.p)
         return self.share.astype(x.p.dtype) * beyond
+
+
+class Held(eqx.Module):
+    """A constant residual."""
+
+    a: Float[Array, "3"]
+    """Acceleration, world [m/s^2]."""
+
+    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
+        """Return the acceleration."""
+        return self.a
 
 
 class NormLimited(eqx.Module):

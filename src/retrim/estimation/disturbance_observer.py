@@ -88,6 +88,18 @@ class DisturbanceObserver(eqx.Module):
         """Return the mean command that arrived during the tick that has just ended."""
         return s.commands.arrival(self.path.delay, self.nominal.dt)
 
+    def acted(self, s: ObserverState, x: State) -> tuple[Command, Float[Array, ""]]:
+        """Return the mean thrust and the mean body rates of the tick that has just ended, and the thrust at its end.
+
+        The body rates are those of the measured rotation, not the commanded ones.
+
+        Args:
+            s: Memory before the measurement.
+            x: Measured state.
+        """
+        mean, thrust = self.path.thrust(s.commands, s.thrust, self.nominal.dt)
+        return Command(mean, so3.log(so3.mul(s.last.R.T, x.R)) / self.nominal.dt), thrust
+
     def init(self, x: State) -> ObserverState:
         """Return the memory of an undisturbed vehicle that hovers at ``x``."""
         zero = jnp.zeros_like(x.p)
@@ -107,9 +119,7 @@ class DisturbanceObserver(eqx.Module):
             x: Measured state.
         """
         nominal, dt = self.nominal, self.nominal.dt
-        mean, thrust = self.path.thrust(s.commands, s.thrust, dt)
-        # Use the measured rotation of the vehicle instead of the commanded rates.
-        u = Command(mean, so3.log(so3.mul(s.last.R.T, x.R)) / dt)
+        u, thrust = self.acted(s, x)
         speed_change = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
         mismatch = (x.v - s.last.v - speed_change) / dt
         noise = self._noise(s, mismatch)

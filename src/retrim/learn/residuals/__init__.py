@@ -16,5 +16,7 @@ from .rates import RateFit as RateFit
 from .rates import RateModel as RateModel
 from .regression import RegressionModel as RegressionModel
 from .regression import RegressionState as RegressionState
+from .swing import SwingModel as SwingModel
+from .swing import SwingState as SwingState
 from .targets import Targets as Targets
 from .targets import residual_targets as residual_targets

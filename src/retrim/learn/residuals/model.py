@@ -22,6 +22,8 @@ class ResidualModel(Protocol):
     that depends on position has a method ``at_place``, which maps its state and a position [m] to this part [m/s^2]. A
     model that remembers over flights has a method ``recall``, which maps the state at the end of a flight to the state
     at the start of the next one, and a method ``strength``, which returns the largest acceleration in a state [m/s^2].
+    A model for a vehicle with a load on a cable has a method ``load``, which maps its state to the estimated
+    :class:`~retrim.estimation.slung_load.Load`; in flight, the frame of the effective gravity then compensates a load.
     """
 
     def init(self, key: Key[Array, ""]) -> Any:
