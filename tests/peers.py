@@ -20,4 +20,5 @@ def start_process(*command):
 
 def peer(speaks, *words):
     """A peer of ours that speaks the language of an autopilot."""
-    return start_process(sys.executable, "-m", f"retrim.testing.{speaks}_peer", *words)
+    module = "retrim.ros1.peer" if speaks == "ros" else f"retrim.testing.{speaks}_peer"
+    return start_process(sys.executable, "-m", module, *words)

@@ -11,8 +11,8 @@ from peers import peer
 from retrim import PlantError, Scenario, testing
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
-from retrim.plants.bridges import ros
-from retrim.plants.bridges.ros_link import attitude_target
+from retrim.ros1 import plant as ros
+from retrim.ros1.link import attitude_target
 from retrim.testing.vehicle import HEADING
 from retrim_paper.latency import rosmaster
 

@@ -13,7 +13,7 @@ import pytest
 from bus_ends import LOCAL, NETWORK, await_message, network, two_ends
 from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
-from retrim.transport import ros
+from retrim.ros1 import bus as ros
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus

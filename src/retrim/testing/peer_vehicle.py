@@ -108,12 +108,13 @@ def _standing(x: float, y: float, yaw: float) -> np.ndarray:
     return np.concatenate([[x, y, 0.0], R.ravel(), np.zeros(3)])
 
 
-def fly_until_interrupt(step: Callable[[], None], address: str) -> None:
-    """Call a step function every 0.01 s until Ctrl-C.
+def fly_until_interrupt(step: Callable[[], None], address: str, period: float = DT) -> None:
+    """Call a step function periodically until Ctrl-C.
 
     Args:
         step: Function to call.
         address: Description of the peer's address, for the printed message.
+        period: Time between two calls [s].
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     print(f"{address}; Ctrl-C ends it", flush=True)
@@ -122,7 +123,7 @@ def fly_until_interrupt(step: Callable[[], None], address: str) -> None:
     try:
         while True:
             step()
-            tick = max(tick + 1, int((time.monotonic() - began) / DT))
-            sleep_until(began + tick * DT)
+            tick = max(tick + 1, int((time.monotonic() - began) / period))
+            sleep_until(began + tick * period)
     except KeyboardInterrupt:
         return

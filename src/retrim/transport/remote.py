@@ -84,7 +84,7 @@ class Address:
 
             bus = ZenohBus(capacities, f"tcp/{where}", listen=listen, key=self.key, writes=writes, session=session)
         else:
-            from .ros import RosBus
+            from ..ros1.bus import RosBus
 
             bus = RosBus(capacities, f"http://{where}", key=self.key, writes=writes, session=session)
         if session is None:

@@ -1,5 +1,6 @@
 """Map a remote machine's clock to this machine's clock."""
 
+import math
 from collections import deque
 
 import numpy as np
@@ -9,6 +10,8 @@ ENOUGH = 3  # smallest number of exchanges for an estimate of the rate
 APART = 0.03  # [s], smallest standard deviation of the exchange times for an estimate of the rate
 SLIP = 3e-3  # [s], largest deviation in excess of the error bound by the round trip
 JITTER = 1e-4  # [s], of the quickest exchange
+JUMP_S = 0.5  # [s] by which a clock must be ahead of the arrival times to be a clock that was set
+LATER = 3  # messages in a row with older but rising stamps, after which the clock was set back
 WINDOW_S = 2.0  # [s] in which at least one message is assumed to arrive without a delay
 
 
@@ -76,3 +79,46 @@ class ArrivalClock:
     def here(self, remote: float) -> float | None:
         """Return the time on our clock at time ``remote`` on the other clock [s]; None before the first message."""
         return remote + min(offset for _, offset in self._arrivals) if self._arrivals else None
+
+
+class StampClock:
+    """Maps the stamps of messages to our clock.
+
+    Messages that arrive out of order or again are recognised. A clock that is set forward or back, for example because
+    its program was restarted, is followed from the next message or the third message on.
+    """
+
+    def __init__(self) -> None:
+        self._clock = ArrivalClock()
+        self._newest, self._last, self._older, self._arrival = -math.inf, -math.inf, 0, -math.inf
+        self.jumps = 0
+        """Number of times that the clock was set."""
+
+    def here(self, stamp: float, now: float) -> float | None:
+        """Return the time on our clock at which a message was valid; None if it is out of order.
+
+        Args:
+            stamp: Time in the message, on the other clock [s]; zero or less if the sender does not fill it in, so that
+                the arrival time is used.
+            now: Time of arrival, on our clock [s].
+        """
+        if not stamp > 0.0:
+            return now
+        if stamp <= self._newest:
+            if stamp != self._newest:
+                self._older = self._older + 1 if stamp > self._last else 1
+            self._last = stamp
+            if self._older < LATER:
+                return None
+            self._restart()
+        elif stamp - self._newest - (now - self._arrival) > JUMP_S and math.isfinite(self._newest):
+            self._restart()
+        self._newest, self._last, self._older, self._arrival = stamp, stamp, 0, now
+        self._clock.record_arrival(stamp, now)
+        result = self._clock.here(stamp)
+        assert result is not None
+        return min(result, now)
+
+    def _restart(self) -> None:
+        self._clock = ArrivalClock()
+        self.jumps += 1

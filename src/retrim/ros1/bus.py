@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ..rospy_node import join, system_module
-from .network import NetworkBus
-from .session import Session
+from ..transport.network import NetworkBus
+from ..transport.session import Session
+from .node import join, system_module
 
 PREFIX = "/retrim"
 

@@ -1,6 +1,6 @@
 """Simulate a vehicle with ROS 1 and the plant ``bem``, for tests and trials of a node.
 
-``python -m retrim.testing.ros_peer http://127.0.0.1:11311 --disturbance large`` runs until Ctrl-C. The vehicle
+``python -m retrim.ros1.peer http://127.0.0.1:11311 --disturbance large`` runs until Ctrl-C. The vehicle
 flies to the start. It follows attitude targets while the peer receives them, and holds its position when they stop. The
 peer publishes odometry or only poses.
 """
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ..config.scenario import Scenario
-from ..plants.bridges.ros import NAMESPACE
-from ..plants.bridges.ros_link import ODOMETRY, POSE, TARGET, attitude_target
-from ..rospy_node import join, system_module
-from .peer_vehicle import PeerVehicle, fly_until_interrupt
+from ..testing.peer_vehicle import PeerVehicle, fly_until_interrupt
+from .link import ODOMETRY, POSE, TARGET, attitude_target
+from .node import join, system_module
+from .plant import NAMESPACE
 
 FRESH_S = 0.3  # [s]: time for which a target is valid
 

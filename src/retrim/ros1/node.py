@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 from urllib.parse import urlparse
 
-from .errors import ConfigError
+from ..errors import ConfigError
 
 SYSTEM = Path("/usr/lib/python3/dist-packages")
 """Debian's package folder, which virtual environments do not search."""
