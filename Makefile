@@ -118,7 +118,7 @@ $(STAMP): pyproject.toml constraints.txt | $(UV)
 
 # The developers' tools, the site's tools, and the independent plants that the tests fly.
 $(DEV): $(STAMP)
-	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,logs,export,mavlink,dask]'
+	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group dev --group docs --editable '.[plants,raptor,page,zenoh,ros2,logs,export,mavlink,dask]'
 	@touch $@
 
 # After a change of dependencies in pyproject.toml: names, versions, markers and hashes. Versions that still fit stay;

@@ -53,6 +53,7 @@ for _name, _place in {
     "crazyflow": "retrim.plants.crazyflow:entry",
     "mavlink": "retrim.plants.bridges.mavlink:entry",
     "crazyflie": "retrim.plants.bridges.crazyflie:entry",
+    "ros2": "retrim.plants.bridges.ros2:entry",
     "ros": "retrim.ros1.plant:entry",
     "betaflight": "retrim.plants.bridges.betaflight:entry",
 }.items():
