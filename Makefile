@@ -11,7 +11,7 @@ DEV := $(VENV)/.installed-dev
 # Some containers forbid compiled Python files; every process would then compile JAX anew, a second and a half each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup dev demo test check docs wheel mutants drill test-page test-links test-cluster test-ros test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
+.PHONY: setup dev demo test check docs wheel mutants drill test-page test-links test-cluster test-ros test-ros2 test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
 
 setup: $(STAMP)
 
@@ -98,6 +98,18 @@ test-ros: dev
 	$(BIN)/pytest -n 0 tests/transport/test_bus.py tests/onboard/test_noise_on_buses.py
 	$(BIN)/pytest -n 0 -m slow tests/live/test_two_machines.py tests/live/test_ros_vehicle.py
 
+# A genuine ROS 2 node (rclpy, rcl and Fast DDS from the package index), in an environment of its own, flies the simulated
+# vehicle. Nodes of this machine only are found.
+.ros2-env/.installed: pyproject.toml constraints.txt | $(UV)
+	$(UV) venv --quiet --clear --python $(PYTHON) .ros2-env
+	$(UV) pip install --quiet --python .ros2-env --constraints constraints.txt --editable '.[ros2,zenoh]' \
+		'ros-rclpy[fastrtps]' ros-nav-msgs ros-geometry-msgs ros-std-msgs
+	@touch $@
+
+test-ros2: dev .ros2-env/.installed
+	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST RETRIM_ROS2=.ros2-env/bin/python \
+		$(BIN)/pytest -n 0 -m "ros2 or not ros2" tests/ros2 tests/live/test_ros2_vehicle.py
+
 bench: setup
 	$(BIN)/retrim bench
 
@@ -130,4 +142,4 @@ pins: | $(UV)
 		--output-file tools/uv.txt
 
 clean:
-	rm -rf $(VENV) .uv build runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .ros2-env .uv build runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from retrim.plants.bridges.clock import RemoteClock
+from retrim.plants.bridges.clock import RemoteClock, StampClock
 
 
 def ask(clock, remote_of, times, *, there=1e-4, back=1e-4):
@@ -44,3 +44,56 @@ def test_a_clock_that_jumps_is_followed_at_once(slip):
     ask(clock, lambda t: t, 0.1 * np.arange(10))
     ask(clock, lambda t: t + slip, [1.0])
     assert clock.here(1.0 + slip) == pytest.approx(1.0, abs=1e-3)
+
+
+def arrive(clock, stamps, times):
+    return [clock.here(stamp, now) for stamp, now in zip(stamps, times, strict=True)]
+
+
+def test_the_quickest_message_tells_the_offset_of_a_clock():
+    clock, times = StampClock(), 100.0 + 0.02 * np.arange(50)
+    late = np.random.default_rng(1).uniform(0.0, 0.01, 50)
+    late[0] = 0.0
+    np.testing.assert_allclose(arrive(clock, times - 90.0, times + late), times)
+    assert clock.jumps == 0
+
+
+def test_messages_out_of_order_and_copies_are_recognised():
+    clock = StampClock()
+    stamps = 0.01 * np.array([1, 3, 2, 3, 3, 3, 5, 4, 7, 6])
+    result = [each is not None for each in arrive(clock, stamps, 50.0 + 0.01 * np.arange(10))]
+    assert result == [True, True, False, False, False, False, True, False, True, False]
+    assert clock.jumps == 0
+
+
+@pytest.mark.parametrize("jump", [-1e6, -1.0, -0.05, 0.6, 1e6])
+def test_a_clock_that_is_set_is_followed(jump):
+    clock, times = StampClock(), 2e6 + 0.01 * np.arange(30)
+    stamps = times + np.where(np.arange(30) < 10, 0.0, jump)
+    result = arrive(clock, stamps, times)
+    assert [k for k, each in enumerate(result) if each is None] == ([10, 11] if jump < 0.0 else [])
+    np.testing.assert_allclose(result[:10] + result[12:], np.delete(times, [10, 11]), atol=1e-6)
+    assert clock.jumps == 1
+
+
+def test_one_wrong_stamp_in_the_future_does_no_lasting_harm():
+    clock, times = StampClock(), 500.0 + 0.01 * np.arange(30)
+    stamps = times.copy()
+    stamps[10] += 1e9
+    result = arrive(clock, stamps, times)
+    assert [k for k, each in enumerate(result) if each is None] == [11, 12]
+    np.testing.assert_allclose(result[13:], times[13:])
+
+
+def test_no_message_is_from_the_future():
+    clock, rng = StampClock(), np.random.default_rng(2)
+    now = 10.0
+    for _ in range(300):
+        now += rng.uniform(0.0, 0.03)
+        here = clock.here(now + rng.normal(0.0, 0.5), now)
+        assert here is None or here <= now
+
+
+@pytest.mark.parametrize("stamp", [0.0, -1.0, float("nan")])
+def test_a_stamp_that_is_missing_is_replaced_by_the_arrival(stamp):
+    assert StampClock().here(stamp, 7.0) == 7.0

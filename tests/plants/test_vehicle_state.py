@@ -16,7 +16,7 @@ from retrim.onboard.guard import Limits
 from retrim.physics import Command, CommandPath, State
 from retrim.physics.actuator_response import ActuatorState
 from retrim.physics.command_path import CommandQueue
-from retrim.plants.bridges.vehicle_state import LONGEST_S, VehicleState
+from retrim.plants.bridges.vehicle_state import LONGEST_S, ExtraAcceleration, VehicleState
 
 ages = st.floats(0.0, LONGEST_S)
 LEANING, THRUST, SPIN = (0.3, -0.2, 1.0), 12.0, (0.0, 0.0, 1.5)  # about its thrust axis, so that the motion is known
@@ -48,6 +48,31 @@ def test_it_falls_without_thrust_and_hovers_with_it(age):
     np.testing.assert_allclose(hover_state.v, x.v, atol=1e-9)
     np.testing.assert_allclose(hover_state.p - fall_state.p, [0.0, 0.0, 0.5 * 9.81 * age**2], atol=1e-9)
     np.testing.assert_allclose(hover_state.v - fall_state.v, [0.0, 0.0, 9.81 * age], atol=1e-9)
+
+
+def test_what_a_steady_wind_adds_is_found_and_carried_on():
+    wind, estimate, rng = np.array([1.5, -1.0, 0.5]), ExtraAcceleration(), np.random.default_rng(0)
+    c, x, now = 12.0, state(0.015, rotation=(0.1, 0.2, 0.0)), 50.0
+    nominal = c * x.R[:, 2] - np.array([0.0, 0.0, 9.81])
+    for _ in range(150):
+        now += rng.uniform(0.008, 0.03)
+        age = rng.uniform(0.0, 0.02)
+        v = (now - age) * (nominal + wind) + rng.normal(0.0, 2e-3, 3)
+        x = x._replace(v=v, age=age)
+        estimate.record(x, c, now)
+        estimate.record(x, c, now + 1e-4)  # the same state once more
+    np.testing.assert_allclose(estimate.value, wind, atol=0.15)
+    expected = x.v + x.age * (nominal + wind)
+    np.testing.assert_allclose(x.extrapolate(c, estimate.value).v, expected, atol=0.15 * x.age + 1e-9)
+
+
+def test_a_gap_in_the_states_and_a_jump_of_velocity_do_little_harm():
+    estimate, x = ExtraAcceleration(), state(0.0, rotation=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0))
+    for now in (0.0, 0.02, 0.04, 5.0):  # 5 s without a state
+        estimate.record(x._replace(v=np.full(3, float(now > 1.0))), 9.81, now)
+    np.testing.assert_allclose(estimate.value, 0.0, atol=1e-9)
+    estimate.record(x._replace(v=np.full(3, -1.0)), 9.81, 5.02)
+    assert np.abs(estimate.value).max() <= 10.0
 
 
 def test_no_age_is_left_the_news_keep_theirs_and_a_truth_is_carried_on_by_its_own():

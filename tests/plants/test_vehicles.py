@@ -126,6 +126,8 @@ def test_a_port_that_is_taken_is_named():
         "crazyflie:udp:10.0.0.7:19850",
         "ros",
         "ros:10.0.0.7:11311/quad1/mavros",
+        "ros2",
+        "ros2:zenoh@10.0.0.7:7447:px4/px4_1",
     ],
 )
 def test_a_vehicle_is_known_by_its_name_and_address(plant):

@@ -111,7 +111,7 @@ class StampClock:
             if self._older < LATER:
                 return None
             self._restart()
-        elif stamp - self._newest - (now - self._arrival) > JUMP_S and math.isfinite(self._newest):
+        elif math.isfinite(self._newest) and stamp - self._newest - (now - self._arrival) > JUMP_S:
             self._restart()
         self._newest, self._last, self._older, self._arrival = stamp, stamp, 0, now
         self._clock.record_arrival(stamp, now)

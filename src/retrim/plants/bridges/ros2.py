@@ -20,6 +20,7 @@ from .ros2_link import MavrosLink, Ros2Link
 from .ros2_px4_link import Px4Link
 
 WAIT_S, LISTENER_S = 10.0, 5.0  # [s], limits for the first state, and for listeners to the setpoints
+CROWD_S = 25.0  # [s] for which a killed node may still be listed
 LOOK_EVERY_S = 0.5  # [s] between two looks at the other nodes
 RATE_S, LOWEST_RATE = 1.2, 15.0  # [s], [Hz]: the guard refuses states that are older than 0.1 s
 ENOUGH_THRUSTS = 5
@@ -68,13 +69,11 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
         remarks = "".join(f"; ignored: {note}" for note in link.notes)
         raise PlantError(f"{where}: no state came on {' or '.join(link.states)} in {WAIT_S:g} s{remarks}")
     looked = 0.0
-    until(lambda: is_clear() and not link.unheard() and not link.crowded(), LISTENER_S, keep_on)
+    until(lambda: is_clear() and not link.unheard(), LISTENER_S, keep_on)
     if (unheard := link.unheard()) and link.node.backend != "zenoh":  # PX4's zenoh module does not announce itself
         raise PlantError(f"{where}: nobody listens to {', '.join(unheard)}")
-    if crowded := link.crowded():
-        raise PlantError(
-            f"{where}: several nodes publish {', '.join(crowded)}; end all but one (a killed one is listed for 20 s)"
-        )
+    if not until(lambda: not link.crowded(), CROWD_S, keep_on):
+        raise PlantError(f"{where}: several nodes publish {', '.join(link.crowded())}; end all but one")
     until(lambda: False, RATE_S, keep_on)
     if link.rate < LOWEST_RATE:
         raise PlantError(

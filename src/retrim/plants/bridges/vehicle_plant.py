@@ -13,7 +13,7 @@ from ...physics.state import STANDARD_GRAVITY, Command, State
 from ..plant import Measurement, Plant, as_numpy, check_command, limit_command
 from .frames import heading_of
 from .polling import KeepOn, wait_until
-from .vehicle_state import VehicleState
+from .vehicle_state import ExtraAcceleration, VehicleState
 
 THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s]: limits for a vehicle that has arrived
 
@@ -41,6 +41,7 @@ class VehiclePlant(Plant, abc.ABC):
         self._tick: int | None = None
         self._began = 0.0
         self._thrust = STANDARD_GRAVITY
+        self._extra = ExtraAcceleration()
 
     @property
     def notes(self) -> Sequence[str]:
@@ -99,7 +100,9 @@ class VehiclePlant(Plant, abc.ABC):
         Raises:
             PlantError: See :meth:`read`.
         """
-        return self.read().extrapolate(self._thrust)
+        x = self.read()
+        self._extra.record(x, self._thrust, time.monotonic())
+        return x.extrapolate(self._thrust, self._extra.value)
 
     @abc.abstractmethod
     def wait(self, until: float) -> None:
@@ -147,6 +150,7 @@ class VehiclePlant(Plant, abc.ABC):
         else:
             self.take_off(np.asarray(x0.p, dtype=float), heading_of(np.asarray(x0.R, dtype=float)))
         self._tick, self._began, self._thrust = 0, time.monotonic(), STANDARD_GRAVITY
+        self._extra = ExtraAcceleration()
         return self._measure()
 
     def step(self, u: Command) -> tuple[Measurement, Command]:

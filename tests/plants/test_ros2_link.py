@@ -1,0 +1,442 @@
+"""Links to vehicles behind ROS 2: frames, signs, orders of quaternions, and what is compared before take-off."""
+
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from fake_ros2 import FakeNetwork, Talker
+from retrim import ConfigError, PlantError, Scenario
+from retrim.plants.bridges import frames, ros2
+from retrim.plants.bridges.ros2_address import Ros2Address, address_of
+from retrim.plants.bridges.ros2_link import MavrosLink
+from retrim.plants.bridges.ros2_px4_link import TOPICS, Px4Link
+from retrim.ros2.message_type import message_type, px4_hash
+from retrim.ros2.node import COMMAND, SENSOR
+
+pytest.importorskip("rosbags")
+ODOMETRY, POSE, TARGET = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "mavros_msgs/msg/AttitudeTarget"
+ODOM, POSES, ATTITUDE = (
+    f"/mavros/{each}" for each in ("local_position/odom", "local_position/pose", "setpoint_raw/attitude")
+)
+STATE, CONTROL = "/fmu/out/vehicle_odometry", "/fmu/out/vehicle_control_mode"
+NORTH = np.array([1.0, 0.0, 0.0, 0.0])  # w, x, y, z: level, nose to the north
+HALF = math.sqrt(0.5)
+EAST_IN_ROS = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w: level, nose to the east
+NORTH_IN_ROS = (0.0, 0.0, HALF, HALF)
+
+
+@pytest.fixture
+def network():
+    return FakeNetwork()
+
+
+@pytest.fixture
+def talker(network):
+    return Talker(network)
+
+
+@pytest.fixture
+def px4(network):
+    return Px4Link(network.node(), address_of("px4"))
+
+
+@pytest.fixture
+def mavros(network):
+    return MavrosLink(network.node(), address_of("mavros"))
+
+
+def stamped(message, t):
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(1e9 * t), 10**9)
+
+
+def odometry(talker, t=1.0, p=(1.0, 2.0, 3.0), q=NORTH_IN_ROS, v=(0.4, 0.0, 0.0), rates=(0.1, 0.2, 0.3), child="base"):
+    def fill(m):
+        stamped(m, t)
+        m.header.frame_id, m.child_frame_id = "map", child
+        for place, values in ((m.pose.pose.position, p), (m.twist.twist.linear, v), (m.twist.twist.angular, rates)):
+            place.x, place.y, place.z = values
+        o = m.pose.pose.orientation
+        o.x, o.y, o.z, o.w = q
+
+    talker.says(ODOM, ODOMETRY, fill)
+
+
+def vehicle(talker, t=1.0, p=(1.0, 2.0, -3.0), q=NORTH, v=(0.4, 0.5, 0.6), rates=(0.1, 0.2, 0.3), frame=1, of_v=1):
+    talker.says(
+        STATE, "px4_msgs/msg/VehicleOdometry", timestamp_sample=round(1e6 * t), pose_frame=frame, velocity_frame=of_v,
+        position=np.array(p, np.float32), q=np.array(q, np.float32), velocity=np.array(v, np.float32),
+        angular_velocity=np.array(rates, np.float32),
+    )  # fmt: skip
+
+
+# ---- states
+
+
+def test_px4_s_state_is_told_in_our_frames(talker, px4):
+    vehicle(talker)
+    x = px4.reading
+    np.testing.assert_allclose(x.p, [2.0, 1.0, 3.0])  # east, north, up
+    np.testing.assert_allclose(x.v, [0.5, 0.4, -0.6], rtol=1e-6)
+    np.testing.assert_allclose(x.omega, [0.1, -0.2, -0.3], rtol=1e-6)
+    assert frames.heading_of(x.R) == pytest.approx(math.pi / 2)  # counter-clockwise from east
+
+
+def test_px4_s_quaternions_begin_with_w(talker, px4):
+    vehicle(talker, q=(HALF, 0.0, 0.0, HALF))  # a quarter turn to the right, from north to east
+    np.testing.assert_allclose(px4.reading.R, np.eye(3), atol=1e-6)
+    vehicle(talker, t=2.0, q=(math.cos(0.1), math.sin(0.1), 0.0, 0.0))  # right side down, nose to the north
+    up = px4.reading.R[:, 2]
+    np.testing.assert_allclose(up, [math.sin(0.2), 0.0, math.cos(0.2)], atol=1e-6)  # thrust pulls to the east
+
+
+def test_px4_s_velocity_may_be_in_the_body(talker, px4):
+    vehicle(talker, q=(HALF, 0.0, 0.0, HALF), v=(1.0, 2.0, 3.0), of_v=3)  # nose to the east: forward, right, down
+    np.testing.assert_allclose(px4.reading.v, [1.0, -2.0, -3.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("bad", "why"), [
+    ({"frame": 0}, "in frame 0"), ({"of_v": 0}, "velocities in frame 0"), ({"p": (math.nan, 0, 0)}, "not finite"),
+    ({"q": (0, 0, 0, 0)}, "without an attitude"), ({"rates": (0, math.inf, 0)}, "not finite"),
+])  # fmt: skip
+def test_px4_s_states_that_make_no_sense_are_ignored(talker, px4, bad, why):
+    vehicle(talker, **bad)
+    assert (px4.reading, px4.ignored) == (None, 1)
+    assert why in px4.notes[0]
+
+
+def test_mavros_has_our_frames_and_quaternions_that_end_with_w(talker, mavros):
+    odometry(talker)
+    x = mavros.reading
+    np.testing.assert_allclose(x.p, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(x.R[:, 0], [0.0, 1.0, 0.0], atol=1e-9)  # the nose points to the north
+    np.testing.assert_allclose(x.v, [0.0, 0.4, 0.0], atol=1e-9)  # forward, in the child frame
+    np.testing.assert_allclose(x.omega, [0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize("child", ["map", ""])
+def test_a_twist_in_the_world_is_recognised(talker, mavros, child):
+    odometry(talker, child=child)
+    np.testing.assert_allclose(mavros.reading.v, [0.4, 0.0, 0.0])
+    np.testing.assert_allclose(mavros.reading.omega, [0.2, -0.1, 0.3], atol=1e-9)
+
+
+def test_both_describe_the_same_vehicle(talker, network):
+    """One state, told by PX4 and by mavros."""
+    px4, mavros = Px4Link(network.node(), address_of("px4")), MavrosLink(network.node(), address_of("mavros"))
+    rng = np.random.default_rng(3)
+    q = rng.normal(size=4)
+    q /= np.linalg.norm(q)
+    p, v, rates = rng.normal(size=(3, 3))
+    R = frames.attitude_of(q)  # q of PX4
+    from scipy.spatial.transform import Rotation
+
+    vehicle(talker, p=p, q=q, v=v, rates=rates)
+    odometry(
+        talker, p=frames.turned_world(p), q=Rotation.from_matrix(R).as_quat(), rates=frames.turned_body(rates),
+        v=R.T @ frames.turned_world(v),
+    )  # fmt: skip
+    for mine, other in zip(px4.reading[1:], mavros.reading[1:], strict=True):
+        np.testing.assert_allclose(mine, other, atol=1e-5)
+
+
+def test_velocities_come_from_poses_where_there_is_no_odometry(talker, mavros):
+    def pose(k):
+        def fill(m):
+            stamped(m, 100.0 + 0.01 * k)
+            m.pose.position.x = 0.02 * k  # 2 m/s
+            m.pose.orientation.z, m.pose.orientation.w = math.sin(0.005 * k), math.cos(0.005 * k)  # 1 rad/s
+
+        return fill
+
+    for k in range(40):
+        talker.says(POSES, POSE, pose(k))
+        time.sleep(0.01)
+    np.testing.assert_allclose(mavros.reading.v, [2.0, 0.0, 0.0], atol=0.4)  # the times are those of arrival at first
+    np.testing.assert_allclose(mavros.reading.omega, [0.0, 0.0, 1.0], atol=0.3)
+    odometry(talker, t=200.0)
+    talker.says(POSES, POSE, pose(60))
+    np.testing.assert_allclose(mavros.reading.p, [1.0, 2.0, 3.0])  # odometry is recent
+
+
+def test_states_that_arrive_out_of_order_or_twice_are_left_out(talker, px4):
+    for t, p in ((1.00, 0.0), (1.02, 2.0), (1.01, 1.0), (1.02, 9.0), (1.04, 4.0), (1.03, 3.0)):
+        vehicle(talker, t=t, p=(0.0, p, 0.0))
+        assert px4.reading.p[0] in (0.0, 2.0, 4.0)
+    assert px4.reading.p[0] == 4.0
+    assert px4.clock_jumps == 0
+
+
+@pytest.mark.parametrize("jump", [-3600.0, -0.2, 0.7, 3600.0])
+def test_a_clock_that_is_set_is_followed_within_three_states(talker, px4, jump):
+    for k in range(20):
+        vehicle(talker, t=5000.0 + 0.01 * k)
+        time.sleep(0.01)
+    for k in range(20, 26):
+        vehicle(talker, t=5000.0 + 0.01 * k + jump, p=(0.0, k, 0.0))
+        time.sleep(0.01)
+    now = time.monotonic()
+    assert px4.clock_jumps == 1
+    assert px4.reading.p[0] == 25.0
+    assert 0.0 <= now - px4.reading.stamp < 0.1
+    assert now - px4.last_message < 0.1
+
+
+def test_a_state_without_a_stamp_has_the_time_of_its_arrival(talker, mavros):
+    for _ in range(3):
+        odometry(talker, t=0.0)
+        assert 0.0 <= time.monotonic() - mavros.reading.stamp < 0.05
+
+
+# ---- setpoints
+
+
+def test_setpoints_are_told_in_px4_s_frames(talker, px4):
+    rates, wish, place = (
+        "/fmu/in/vehicle_rates_setpoint",
+        "/fmu/in/offboard_control_mode",
+        "/fmu/in/trajectory_setpoint",
+    )
+    for topic in (rates, wish, place):
+        talker.hears(topic, f"px4_msgs/msg/{TOPICS[topic.rpartition('/')[2]]}")
+    px4.fly_rates(0.3, np.array([0.1, 0.2, 0.4]))
+    (m,), (mode,) = talker.kept[rates], talker.kept[wish]
+    np.testing.assert_allclose([m.roll, m.pitch, m.yaw], [0.1, -0.2, -0.4], rtol=1e-6)
+    np.testing.assert_allclose(m.thrust_body, [0.0, 0.0, -0.3], rtol=1e-6)  # upwards
+    assert (mode.position, mode.body_rate, mode.attitude, mode.direct_actuator) == (False, True, False, False)
+    assert abs(1e-6 * m.timestamp - time.time()) < 5.0
+    px4.fly_to(np.array([1.0, 2.0, 3.0]), math.pi / 2)
+    (m,), mode = talker.kept[place], talker.kept[wish][-1]
+    np.testing.assert_allclose(m.position, [2.0, 1.0, -3.0])
+    assert m.yaw == pytest.approx(0.0, abs=1e-6)  # north
+    assert all(np.isnan(each).all() for each in (m.velocity, m.acceleration, m.jerk, m.yawspeed))
+    assert (mode.position, mode.body_rate) == (True, False)
+
+
+def test_a_command_is_for_any_system(talker, px4):
+    talker.hears("/fmu/in/vehicle_command", "px4_msgs/msg/VehicleCommand")
+    px4.command(176, 1.0, 6.0)
+    (m,) = talker.kept["/fmu/in/vehicle_command"]
+    assert (m.command, m.param1, m.param2, m.param3, m.from_external) == (176, 1.0, 6.0, 0.0, True)
+    assert (m.target_system, m.target_component) == (0, 0)
+
+
+def test_a_target_of_mavros_has_rates_in_our_frame(talker, mavros):
+    talker.hears(ATTITUDE, TARGET)
+    mavros.fly_rates(0.3, np.array([0.1, 0.2, 0.4]))
+    (m,) = talker.kept[ATTITUDE]
+    assert (m.body_rate.x, m.body_rate.y, m.body_rate.z) == (0.1, 0.2, 0.4)
+    assert m.thrust == pytest.approx(0.3)
+    assert m.type_mask == 128  # ignore the attitude
+    assert abs(m.header.stamp.sec - time.time()) < 5.0
+
+
+def test_the_mode_is_read(talker, px4):
+    for armed, offboard in ((False, False), (True, False), (True, True)):
+        talker.says(
+            CONTROL, "px4_msgs/msg/VehicleControlMode", flag_armed=armed, flag_control_offboard_enabled=offboard
+        )
+        assert (px4.armed, px4.mode[0] == 6) == (armed, offboard)
+
+
+def test_quality_of_service_is_that_of_px4(px4, mavros):
+    assert {px4.node.qos[topic] for topic in px4.node.qos} == {SENSOR}  # best effort, volatile
+    assert mavros.node.qos[ODOM] == SENSOR
+    assert mavros.node.qos[ATTITUDE] == COMMAND  # reliable, which every subscriber accepts
+
+
+# ---- versions
+
+
+def answering(talker, release="newest", known=True):
+    """PX4 answers questions about the formats of its inputs."""
+
+    def answer(m):
+        topic = bytes(m.topic_name).split(b"\0")[0].decode()
+        value = px4_hash(f"px4_msgs/msg/{TOPICS[topic.rpartition('/')[2]]}", release)
+        talker.says(
+            "/fmu/out/message_format_response", "px4_msgs/msg/MessageFormatResponse", protocol_version=1,
+            topic_name=m.topic_name, success=known, message_hash=value,
+        )  # fmt: skip
+
+    talker.hears("/fmu/in/message_format_request", "px4_msgs/msg/MessageFormatRequest", answer)
+
+
+def test_the_firmware_is_asked_for_its_formats(talker, px4):
+    answering(talker)
+    assert px4.format_fault() == ""
+    assert len(talker.kept["/fmu/in/message_format_request"]) == len(TOPICS)
+    assert px4.notes == []
+
+
+def test_another_release_of_the_firmware_is_named(talker, px4, network):
+    answering(talker, "1.14")
+    fault = px4.format_fault()
+    assert "/fmu/in/vehicle_command: px4_msgs/msg/VehicleCommand is that of px4_msgs 1.14 (before 1.15)" in fault
+    assert "in the firmware, and of px4_msgs 1.15 or later here" in fault
+    assert Px4Link(network.node(), address_of("px4-1.14")).format_fault() == ""
+
+
+def test_an_input_that_the_firmware_lacks_is_named(talker, px4):
+    answering(talker, known=False)
+    assert px4.format_fault().startswith("PX4 has no input /fmu/in/vehicle_rates_setpoint")
+
+
+def test_a_firmware_that_does_not_answer_is_noted(px4, monkeypatch):
+    monkeypatch.setattr("retrim.plants.bridges.ros2_px4_link.ANSWER_S", 0.1)
+    assert px4.format_fault() == ""
+    assert "PX4 does not tell the formats of its inputs" in px4.notes[0]
+
+
+@pytest.fixture
+def connects(monkeypatch, network):
+    """Make the plant's node one of the network, and its patience short."""
+    monkeypatch.setattr(ros2, "open_node", lambda *_: network.node())
+    monkeypatch.setattr(ros2, "WAIT_S", 0.4)
+    monkeypatch.setattr(ros2, "LISTENER_S", 0.4)
+    monkeypatch.setattr(ros2, "CROWD_S", 0.4)
+    monkeypatch.setattr("retrim.plants.bridges.ros2_px4_link.ANSWER_S", 0.1)
+
+    def connect(address):
+        plant = Scenario(plant=f"ros2:{address}").make("small")
+        try:
+            plant.connect()
+            return plant
+        finally:
+            plant.stop()
+
+    return connect
+
+
+@pytest.fixture
+def speaking(talker):
+    """Something that is done at 100 Hz, or less often."""
+    over = threading.Event()
+
+    def begin(say, rate=100.0):
+        def go():
+            k = 0
+            while not over.wait(1.0 / rate):
+                k += 1
+                say(talker, t=1000.0 + k / rate)
+
+        threading.Thread(target=go, daemon=True).start()
+
+    yield begin
+    over.set()
+    time.sleep(0.05)
+
+
+def listening(talker, release="newest"):
+    for topic, name in TOPICS.items():
+        talker.hears(f"/fmu/in/{topic}", f"px4_msgs/msg/{name}", release=release)
+
+
+def test_a_vehicle_that_is_there_is_connected(connects, speaking, talker):
+    listening(talker)
+    answering(talker)
+    speaking(vehicle)
+    assert connects("px4").notes == ()
+
+
+def test_nobody_there_is_named(connects):
+    with pytest.raises(PlantError, match=r"no state came on /mavros/local_position/odom or /mavros/.*pose in 0\.4 s"):
+        connects("mavros")
+
+
+def test_states_of_another_release_are_named(connects, speaking):
+    def old(talker, t):
+        talker.says(STATE, "px4_msgs/msg/VehicleOdometry", release="1.13")
+
+    speaking(old)
+    with pytest.raises(PlantError, match=r"px4_msgs 1\.13 \(before 1\.14\); this end has px4_msgs 1\.14 or"):
+        connects("px4")
+
+
+def test_a_listener_of_another_release_is_named(connects, speaking, talker):
+    listening(talker, "1.14")
+    speaking(vehicle)
+    with pytest.raises(PlantError, match=r"VehicleCommand is that of px4_msgs 1\.14 .* use the same px4_msgs"):
+        connects("px4")
+
+
+def test_a_firmware_of_another_release_is_named(connects, speaking, talker):
+    listening(talker)
+    answering(talker, "1.14")
+    speaking(vehicle)
+    with pytest.raises(PlantError, match=r"in the firmware, .* name the firmware's release, as in ros2:px4-1\.14"):
+        connects("px4")
+
+
+def test_setpoints_without_a_listener_are_named(connects, speaking):
+    speaking(vehicle)
+    with pytest.raises(PlantError, match="nobody listens to /fmu/in/vehicle_rates_setpoint, /fmu/in/offboard"):
+        connects("px4")
+
+
+def test_states_that_are_rare_are_named(connects, speaking, talker):
+    listening(talker)
+    speaking(vehicle, rate=5.0)
+    with pytest.raises(PlantError, match=r"states come at \d Hz; at least 15 Hz are needed on /fmu/out"):
+        connects("px4")
+
+
+def test_two_nodes_that_tell_a_state_are_named(connects, speaking, talker, network):
+    listening(talker)
+    speaking(vehicle)
+    network.node().advertise(STATE, message_type("px4_msgs/msg/VehicleOdometry"), SENSOR)
+    with pytest.raises(PlantError, match="several nodes publish /fmu/out/vehicle_odometry"):
+        connects("px4")
+
+
+# ---- addresses
+
+
+@pytest.mark.parametrize(("text", "address"), [
+    ("", Ros2Address("", "", "px4", "newest", "")),
+    ("px4", Ros2Address("", "", "px4", "newest", "")),
+    ("cyclonedds", Ros2Address("cyclonedds", "", "px4", "newest", "")),
+    ("px4-1.14/px4_1", Ros2Address("", "", "px4", "1.14", "/px4_1")),
+    ("mavros", Ros2Address("", "", "mavros", "newest", "/mavros")),
+    ("rclpy:mavros/quad1/mavros", Ros2Address("rclpy", "", "mavros", "newest", "/quad1/mavros")),
+    ("zenoh@10.0.0.7:7447:px4", Ros2Address("zenoh", "10.0.0.7:7447", "px4", "newest", "")),
+    ("mavros,pose=/mocap/quad1", Ros2Address("", "", "mavros", "newest", "/mavros", pose="/mocap/quad1")),
+    ("px4,odometry=/vio/odom", Ros2Address("", "", "px4", "newest", "", odometry="/vio/odom")),
+])  # fmt: skip
+def test_addresses(text, address):
+    assert address_of(text) == address
+    assert Scenario(plant=f"ros2:{text}" if text else "ros2").entry.is_vehicle
+
+
+@pytest.mark.parametrize("text", [
+    "px5", "mavros-1.14", "px4-1.13", "px4-9", "rclpy@10.0.0.7:7447:px4", "mavros/", "px4,imu=/x", "px4,pose=x",
+    "/a//b", "px4-1.14,odometry=/a b", "dds:px4", "ros2:px4",
+])  # fmt: skip
+def test_a_wrong_address_is_named_before_it_flies(text):
+    with pytest.raises(ConfigError, match=r"address '.*': (expected ros2:|a release follows px4)|absolute name"):
+        Scenario(plant=f"ros2:{text}")
+
+
+# ---- thrust
+
+
+@pytest.mark.parametrize("reports", [False, True])
+def test_thrust_is_scaled_by_the_autopilot_s_or_else_by_the_vehicle_file(network, talker, reports):
+    vehicle = Scenario(plant="simple").make_vehicle("small")
+    strongest = float(vehicle.thrust_max / vehicle.mass)
+    plant = Scenario(plant="ros2:px4").make("small")
+    plant._link = link = Px4Link(network.node(), address_of("px4"))
+    for _ in range(10 * reports):
+        talker.says(
+            "/fmu/out/vehicle_thrust_setpoint", "px4_msgs/msg/VehicleThrustSetpoint",
+            xyz=np.array([0.0, 0.0, -0.4], np.float32),
+        )  # fmt: skip
+    plant._learn_thrust()
+    assert plant.thrust.hover == pytest.approx(0.4 if reports else 9.81 / strongest, rel=1e-3)
+    talker.hears("/fmu/in/vehicle_rates_setpoint", "px4_msgs/msg/VehicleRatesSetpoint")
+    accepted = plant.send(np.array([9.81, 0.0, 0.0, 0.0]))
+    assert accepted[0] == pytest.approx(9.81)
+    assert talker.kept["/fmu/in/vehicle_rates_setpoint"][0].thrust_body[2] == pytest.approx(-plant.thrust.hover)
+    link.close()
