@@ -90,8 +90,8 @@ test-betaflight: betaflight
 	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
 		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m betaflight'
 
-# Buses, vehicles and whole flights over ROS 1 with a real rosmaster, installed if there is none, and over zenoh between
-# two network namespaces, which takes the rights of root.
+# Buses, vehicles and whole flights over ROS 1 with a real rosmaster, installed if there is none, and over zenoh and ROS 2
+# between two network namespaces, which takes the rights of root.
 test-ros: dev
 	command -v rosmaster >/dev/null || apt-get install --yes --no-install-recommends \
 		python3-rospy python3-rosmaster python3-std-msgs python3-nav-msgs python3-geometry-msgs

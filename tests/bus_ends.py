@@ -2,6 +2,7 @@
 
 import atexit
 import functools
+import os
 import time
 from contextlib import ExitStack
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from retrim.transport.shared_key import SharedKey
 from retrim.transport.shared_memory import SharedMemoryBus
 from retrim_paper.latency import free_port, rosmaster
 
-LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "zenoh, signed", "ros")
+LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "zenoh, signed", "ros2, signed", "ros")
 
 
 class Ends(NamedTuple):
@@ -57,8 +58,12 @@ def network(backend):
     """Where a new bus of a network is."""
     if backend == "ros":
         return master()
-    pytest.importorskip("zenoh")
     shared = SharedKey(bytes(32)) if backend.endswith("signed") else None
+    if backend.startswith("ros2"):
+        pytest.importorskip("cyclonedds")
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        return Address("ros2", "", 100 + os.getpid() % 100, f"bus{free_port()}", shared=shared)
+    pytest.importorskip("zenoh")
     return Address("zenoh", "127.0.0.1", free_port(), shared=shared)
 
 

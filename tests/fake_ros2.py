@@ -51,7 +51,7 @@ class FakeNode(Ros2Node):
 
 
 class Talker:
-    """The other end: it publishes messages, and keeps what it hears."""
+    """The other end: it publishes messages, and keeps those of others."""
 
     def __init__(self, network):
         self.node, self.publishers, self.kept = network.node(), {}, defaultdict(list)

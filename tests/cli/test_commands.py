@@ -146,7 +146,10 @@ def test_what_live_refuses(folder):
         (("--fault", "gaps"), "--fault gaps: a live flight has a clock of its own; fly it by `retrim fly`"),
         (("--fault", "lat"), "'lat'"),
         (("--page", "--page-host", "192.0.2.1"), "no free port from 8080 on at '192.0.2.1'"),
-        (("--learners", "somewhere"), "'somewhere' is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"),
+        (
+            ("--learners", "somewhere"),
+            "'somewhere' is no address of a bus; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT",
+        ),
         (("--learners", "zenoh:192.0.2.1:7447"), "learners beyond this machine need a shared key: --key FILE"),
         (("--learners", "zenoh:127.0.0.1:7447", "--key", "none"), "--key 'none': the key cannot be read"),
         (("--key", "p/policy.safetensors"), "--key 'p/policy.safetensors': a key has"),

@@ -1,4 +1,4 @@
-"""Vehicles behind a genuine ROS 2 node: conformance, whole flights that adapt, and what becomes of each fault.
+"""Vehicles behind a genuine ROS 2 node: conformance, whole flights that adapt, and the outcome of each fault.
 
 ``RETRIM_ROS2`` names the Python of an environment with rclpy and retrim. `make test-ros2` makes one and runs this. The
 peer's node is that of rclpy, with Fast DDS, which serialises odometry and poses itself. px4_msgs and mavros_msgs, which

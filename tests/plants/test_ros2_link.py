@@ -1,4 +1,4 @@
-"""Links to vehicles behind ROS 2: frames, signs, orders of quaternions, and what is compared before take-off."""
+"""Links to vehicles behind ROS 2: frames, signs, orders of quaternions, and comparisons before take-off."""
 
 import math
 import threading
@@ -124,7 +124,7 @@ def test_a_twist_in_the_world_is_recognised(talker, mavros, child):
 
 
 def test_both_describe_the_same_vehicle(talker, network):
-    """One state, told by PX4 and by mavros."""
+    """One state, from PX4 and from mavros."""
     px4, mavros = Px4Link(network.node(), address_of("px4")), MavrosLink(network.node(), address_of("mavros"))
     rng = np.random.default_rng(3)
     q = rng.normal(size=4)
@@ -372,7 +372,7 @@ def test_a_firmware_of_another_release_is_named(connects, speaking, talker):
 
 def test_setpoints_without_a_listener_are_named(connects, speaking):
     speaking(vehicle)
-    with pytest.raises(PlantError, match="nobody listens to /fmu/in/vehicle_rates_setpoint, /fmu/in/offboard"):
+    with pytest.raises(PlantError, match="no node listens to /fmu/in/vehicle_rates_setpoint, /fmu/in/offboard"):
         connects("px4")
 
 

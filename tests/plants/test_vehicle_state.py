@@ -100,6 +100,10 @@ class Spinning(PointVehicle):
         super().__init__(SimpleNamespace(dt=0.02))
         self.late, self.flying = late, True
 
+    def now(self):
+        self._extra = ExtraAcceleration()  # its time stands still, so its states tell nothing of an acceleration
+        return super().now()
+
     def read(self):
         return at(-self.late)._replace(age=self.late)
 

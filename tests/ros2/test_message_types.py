@@ -1,4 +1,4 @@
-"""Message types of ROS 2: hashes that ROS and PX4 themselves have, lengths, and what is refused."""
+"""Message types of ROS 2: hashes of ROS and of PX4, lengths, and refusals."""
 
 import numpy as np
 import pytest

@@ -120,6 +120,8 @@ def test_the_variables_of_ros_configure_cyclone(monkeypatch):
     assert 'address="127.0.0.1"' in configuration()
     assert 'name="lo"' in configuration()
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    monkeypatch.setenv("ROS_STATIC_PEERS", "127.0.0.1")
+    assert '<NetworkInterface address="127.0.0.1"/>' in configuration()  # that leads to the peer
     monkeypatch.setenv("ROS_STATIC_PEERS", "10.0.0.7;quad1.local")
     assert 'name="lo"' not in configuration()
     assert '<Peer address="10.0.0.7"/><Peer address="quad1.local"/>' in configuration()

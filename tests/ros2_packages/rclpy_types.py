@@ -1,6 +1,6 @@
 """Type supports for rclpy that are made from definitions, without a compiler.
 
-rclpy from the package index has neither px4_msgs nor mavros_msgs. The classes here tell rcl and Fast DDS the name, the
+rclpy from the package index has neither px4_msgs nor mavros_msgs. The classes here give rcl and Fast DDS the name, the
 hash and the size of such a type, so a genuine node can publish and receive its messages in serialised form. Messages
 cannot be converted to objects.
 """
@@ -52,7 +52,7 @@ pointer_of = ctypes.pythonapi.PyCapsule_GetPointer
 pointer_of.restype, pointer_of.argtypes = ctypes.c_void_p, (ctypes.py_object, ctypes.c_char_p)
 name_of = ctypes.pythonapi.PyCapsule_GetName
 name_of.restype, name_of.argtypes = ctypes.c_char_p, (ctypes.py_object,)
-_ALIVE = []  # what the C libraries refer to
+_ALIVE = []  # objects to which the C libraries refer
 
 
 def class_for(kind: MessageType, type_hash: str = "") -> type:

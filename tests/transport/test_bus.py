@@ -111,13 +111,14 @@ def test_of_a_network_only_what_is_newer_and_fits_is_taken():
 
 
 @pytest.mark.parametrize("text", ["", "zenoh", "zenoh:", "zenoh::7447", "zenoh:host:0", "zenoh:host:99999",
-                                  "tcp:host:1", "ros:host:port", "zenoh:host:1/", "ros:host:1/a b"])  # fmt: skip
+                                  "tcp:host:1", "ros:host:port", "zenoh:host:1/", "ros:host:1/a b", "ros2", "ros2:",
+                                  "ros2:233", "ros2:host:1", "ros2:1/"])  # fmt: skip
 def test_an_address_that_is_none_is_named(text):
-    with pytest.raises(ConfigError, match="is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT"):
+    with pytest.raises(ConfigError, match="is no address of a bus; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:"):
         Address.of(text)
 
 
-@pytest.mark.parametrize("text", ["zenoh:10.0.0.5:7447", "ros:robot:11311/quad1"])
+@pytest.mark.parametrize("text", ["zenoh:10.0.0.5:7447", "ros:robot:11311/quad1", "ros2:42", "ros2:0/quad1"])
 def test_an_address_is_what_it_says(text):
     assert str(Address.of(text)) == text
 

@@ -22,8 +22,8 @@ def learn(
     One process can learn for several flights. Ctrl-C ends it; the flights continue with their last policies.
 
     Args:
-        addresses: Addresses of the flights: zenoh:HOST:PORT for a flight computer, or ros:HOST:PORT/quad1 for a
-            rosmaster and a vehicle.
+        addresses: Addresses of the flights: zenoh:HOST:PORT for a flight computer, ros2:DOMAIN/quad1 for a
+            domain and a vehicle, or ros:HOST:PORT/quad1 for a rosmaster and a vehicle.
         key: File with the key that the flights also have; by default the key in RETRIM_KEY. Flights on other machines
             need one.
         trust: Python name that a flight may send, e.g. mine:task; its code is run here. Repeat it for each name.

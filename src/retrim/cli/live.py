@@ -77,7 +77,7 @@ def live(
             unlimited.
         seed: Seed of the start, the learners and the random parts of the scenario.
         learners: Address at which learners on another machine, started by `retrim learn`, reach this one:
-            zenoh:HOST:PORT (this machine listens there), or ros:HOST:PORT of a rosmaster. By default, they run here.
+            zenoh:HOST:PORT (this machine listens there), ros2:DOMAIN, or ros:HOST:PORT of a rosmaster. Default: here.
         key: File with the key that `retrim learn` also has; by default the key in RETRIM_KEY. Learners on another
             machine need one.
         page: Show the flight in a browser, with controls. Without `--seconds`, this is the default.

@@ -188,7 +188,8 @@ def learners_at(text: str | None, say: Callable[[str], None], key: Path | None =
     if address.kind == "zenoh" and find_spec("zenoh") is None:
         raise ConfigError("a bus by zenoh needs zenoh: pip install eclipse-zenoh")
     if not address.loopback:
-        where = address.host if address.kind == "zenoh" else "the network of its rosmaster"
+        networks = {"zenoh": address.host, "ros2": f"domain {address.port} of ROS 2"}
+        where = networks.get(address.kind, "the network of its rosmaster")
         say(f"warning: this machine listens on {where}; messages are signed, but anybody on the way can read them")
     return address
 

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 
 from ..errors import ConfigError
 from .message_type import message_type
-from .node import Ros2Node
+from .node import Ros2Node, domain_id
 from .zenoh_node import ROUTER
 
 BACKENDS = ("rclpy", "cyclonedds", "zenoh")
@@ -31,19 +31,20 @@ def choose_backend(packages: Iterable[str]) -> str:
     )
 
 
-def open_node(backend: str, packages: Iterable[str], router: str = "") -> Ros2Node:
+def open_node(backend: str, packages: Iterable[str], router: str = "", domain: int | None = None) -> Ros2Node:
     """Return a node.
 
     Args:
         backend: Name of the back end; empty to choose the first that is installed.
         packages: Packages of the message types that will be exchanged.
         router: ``HOST:PORT`` of the router of rmw_zenoh; empty for the one on this machine.
+        domain: Domain of ROS; None for the one of ``ROS_DOMAIN_ID``.
 
     Raises:
         ConfigError: The back end is not installed, or cannot join the network.
     """
     message_type("std_msgs/msg/Header")  # an error if rosbags is missing
-    return _opening(router)[backend or choose_backend(packages)]()
+    return _opening(router, domain_id() if domain is None else domain)[backend or choose_backend(packages)]()
 
 
 def is_installed(module: str) -> bool:
@@ -54,20 +55,20 @@ def is_installed(module: str) -> bool:
         return False
 
 
-def _opening(router: str) -> Mapping[str, Callable[[], Ros2Node]]:
+def _opening(router: str, domain: int) -> Mapping[str, Callable[[], Ros2Node]]:
     def cyclone() -> Ros2Node:
         from .cyclonedds_node import CycloneNode
 
-        return CycloneNode()
+        return CycloneNode(domain)
 
     def rclpy() -> Ros2Node:
         from .rclpy_node import RclpyNode
 
-        return RclpyNode()
+        return RclpyNode(domain)
 
     def zenoh() -> Ros2Node:
         from .zenoh_node import ZenohNode
 
-        return ZenohNode(router or ROUTER)
+        return ZenohNode(router or ROUTER, domain=domain)
 
     return {"rclpy": rclpy, "cyclonedds": cyclone, "zenoh": zenoh}

@@ -1,6 +1,7 @@
 """A ROS 2 node by Cyclone DDS from the package index, which talks to every node that uses DDS."""
 
 import os
+import socket
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -25,8 +26,11 @@ class CycloneNode(Ros2Node):
 
     backend = "cyclonedds"
 
-    def __init__(self) -> None:
+    def __init__(self, domain_number: int | None = None) -> None:
         """Join the domain.
+
+        Args:
+            domain_number: Domain of ROS; None for the one of ``ROS_DOMAIN_ID``.
 
         Raises:
             ConfigError: Cyclone DDS is not installed, or cannot join the domain.
@@ -37,7 +41,7 @@ class CycloneNode(Ros2Node):
             raise ConfigError("ROS 2 by Cyclone DDS needs cyclonedds: pip install cyclonedds") from error
         os.environ.setdefault("CYCLONEDDS_URI", configuration())
         try:
-            self._participant = domain.DomainParticipant(domain_id())
+            self._participant = domain.DomainParticipant(domain_id() if domain_number is None else domain_number)
         except Exception as error:  # its errors derive from Exception
             raise ConfigError(f"ROS 2 by Cyclone DDS: cannot join the domain ({error}); see CYCLONEDDS_URI") from error
         self._core, self._wait = core, core.WaitSet(self._participant)
@@ -145,10 +149,26 @@ def configuration() -> str:
     for peer in peers:
         if not all(sign.isalnum() or sign in "-.:[]" for sign in peer):
             raise ConfigError(f"ROS_STATIC_PEERS: {peer[:40]!r} is no address of a machine")
-    interfaces = '<Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces>' if local else ""
+    if local:
+        interfaces = '<NetworkInterface name="lo" multicast="true"/>'
+    else:  # otherwise it would take any interface, which need not be the one that leads to the peers
+        interfaces = "".join(
+            f'<NetworkInterface address="{each}"/>' for each in sorted(set(map(_way_to, peers))) if each
+        )
+    interfaces = interfaces and f"<Interfaces>{interfaces}</Interfaces>"
     listed = "".join(f'<Peer address="{peer}"/>' for peer in peers)
     return (
         f'<CycloneDDS><Domain id="any"><General>{interfaces}</General><Discovery><ParticipantIndex>auto'
         f"</ParticipantIndex><MaxAutoParticipantIndex>{PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{listed}</Peers>"
         "</Discovery></Domain></CycloneDDS>"
     )
+
+
+def _way_to(peer: str) -> str:
+    """Return the address of this machine's interface that leads to a peer; empty if there is none."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((peer, 7400))  # sends nothing
+            return str(probe.getsockname()[0])
+        except OSError:
+            return ""

@@ -17,7 +17,7 @@ _BUILDING = threading.Lock()
 
 
 class _Bytes(bytes):
-    """Bytes to which Cyclone DDS can attach what it knows of a message."""
+    """Bytes to which Cyclone DDS can attach the origin of a message."""
 
 
 def idl_type(kind: MessageType) -> Any:

@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 from ..errors import ConfigError
 from .message_type import NO_HASH, MessageType, title_by_hash
 
+LARGEST_DOMAIN = 232
 Publish = Callable[[bytes], None]
 """Publishes a message, given as CDR bytes with the header; any thread may call it."""
 Take = Callable[[bytes], None]
@@ -15,7 +16,7 @@ Take = Callable[[bytes], None]
 
 
 class Qos(NamedTuple):
-    """Quality of service. Subscribers receive only from publishers that offer at least what they request."""
+    """Quality of service. A subscriber receives only from publishers with at least its own quality."""
 
     reliable: bool = False
     """Whether lost messages are sent again."""
@@ -96,7 +97,7 @@ def domain_id() -> int:
         ConfigError: The variable is not a domain.
     """
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if not text.isascii() or not text.isdigit() or int(text) > 232:
+    if not text.isascii() or not text.isdigit() or int(text) > LARGEST_DOMAIN:
         raise ConfigError(f"ROS_DOMAIN_ID={text[:40]!r}: expected a number from 0 to 232")
     return int(text)
 

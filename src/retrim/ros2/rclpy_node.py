@@ -21,8 +21,11 @@ class RclpyNode(Ros2Node):
 
     backend = "rclpy"
 
-    def __init__(self) -> None:
+    def __init__(self, domain: int | None = None) -> None:
         """Join the network as the middleware of the user's ROS is configured.
+
+        Args:
+            domain: Domain of ROS; None for the one of ``ROS_DOMAIN_ID``.
 
         Raises:
             ConfigError: rclpy cannot be imported or started.
@@ -35,7 +38,9 @@ class RclpyNode(Ros2Node):
         self._qos_module = qos
         self._context = rclpy.context.Context()
         try:
-            rclpy.init(args=[], context=self._context, signal_handler_options=rclpy.SignalHandlerOptions.NO)
+            rclpy.init(
+                args=[], context=self._context, domain_id=domain, signal_handler_options=rclpy.SignalHandlerOptions.NO
+            )
             self._name = f"retrim_{os.getpid()}_{next(NUMBERS)}"
             self._node: Any = rclpy.create_node(
                 self._name, context=self._context, enable_rosout=False, start_parameter_services=False

@@ -28,12 +28,13 @@ class ZenohNode(Ros2Node):
 
     backend = "zenoh"
 
-    def __init__(self, address: str = ROUTER, *, listen: bool = False) -> None:
+    def __init__(self, address: str = ROUTER, *, listen: bool = False, domain: int | None = None) -> None:
         """Open a session.
 
         Args:
             address: ``HOST:PORT`` of the router.
             listen: Whether to wait at the address for others, in place of a router.
+            domain: Domain of ROS; None for the one of ``ROS_DOMAIN_ID``.
 
         Raises:
             ConfigError: zenoh is not installed, or the address cannot be used.
@@ -60,7 +61,7 @@ class ZenohNode(Ros2Node):
         except zenoh.ZError as error:
             reason = str(error).splitlines()[0].split(" at ")[0]
             raise ConfigError(f"zenoh: cannot open a session at {address!r} ({reason})") from error
-        self._domain, self._count = domain_id(), 0
+        self._domain, self._count = domain_id() if domain is None else domain, 0
         self._me = str(self._session.zid())
         self._lock = threading.Lock()
         self._held: list[Any] = [self._token(f"{self._identity('NN', 0)}")]

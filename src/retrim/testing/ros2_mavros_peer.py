@@ -1,4 +1,4 @@
-"""What the simulated peers of ROS 2 have in common, and the peer that has the topics of mavros."""
+"""Common parts of the simulated peers of ROS 2, and the peer with the topics of mavros."""
 
 import math
 import time
@@ -96,7 +96,7 @@ class Ros2Peer:
         raise NotImplementedError
 
     def report(self) -> None:
-        """Publish what changes slowly."""
+        """Publish the slow messages."""
 
     def publish(self, p: np.ndarray) -> None:
         """Publish the state, at a position in the world frame [m]."""

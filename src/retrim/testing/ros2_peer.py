@@ -2,7 +2,7 @@
 
 ``python -m retrim.testing.ros2_peer mavros --disturbance large`` runs until Ctrl-C. With ``mavros``, the vehicle flies
 to the start, follows attitude targets while it receives them, and holds its position when they stop. With ``px4``, it
-stands on the ground, and does what PX4 does: it is armed by a command, follows setpoints in offboard mode, lands, and
+stands on the ground, and behaves like PX4: it is armed by a command, follows setpoints in offboard mode, lands, and
 holds its position when setpoints stop.
 """
 

@@ -1,4 +1,4 @@
-"""Open buses between machines by address: ``zenoh:192.168.1.5:7447``, ``ros:192.168.1.5:11311/quad1``."""
+"""Open buses between machines by address: ``zenoh:192.168.1.5:7447``, ``ros2:42/quad1``, ``ros:192.168.1.5:11311``."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import ConfigError
+from ..ros2.node import LARGEST_DOMAIN, is_local
 from .network import NetworkBus
 from .session import GREETINGS, Session
 from .shared_key import MAKING, VARIABLE, SharedKey, read_key
 
 KINDS = ("zenoh", "ros")
+ROS2 = "ros2"
 LOOPBACK = ("127.0.0.1", "localhost")
+DOMAIN = re.compile(r"ros2:(?P<domain>\d{1,3})(/(?P<key>\w+))?", re.ASCII)
 ADDRESS = re.compile(r"(?P<kind>\w+):(?P<host>[^/]+):(?P<port>\d{1,5})(/(?P<key>\w+))?")
 
 
@@ -21,7 +24,9 @@ class Address:
 
     kind: str
     host: str
+    """Machine; empty for a domain of ROS 2, whose members find each other."""
     port: int
+    """Port, or domain of ROS 2."""
     key: str = ""
     """Key that selects one vehicle among several at the same address."""
     shared: SharedKey | None = field(default=None, repr=False, compare=False)
@@ -29,7 +34,8 @@ class Address:
 
     def __str__(self) -> str:
         """Return the text that :meth:`of` reads."""
-        return f"{self.kind}:{self.host}:{self.port}{'/' if self.key else ''}{self.key}"
+        where = f"{self.port}" if self.kind == ROS2 else f"{self.host}:{self.port}"
+        return f"{self.kind}:{where}{'/' if self.key else ''}{self.key}"
 
     @classmethod
     def of(cls, text: str, shared: SharedKey | None = None) -> "Address":
@@ -42,18 +48,20 @@ class Address:
         Raises:
             ConfigError: The text is not an address.
         """
+        if (domain := DOMAIN.fullmatch(text)) and int(domain["domain"]) <= LARGEST_DOMAIN:
+            return cls(ROS2, "", int(domain["domain"]), domain["key"] or "", shared)
         result = ADDRESS.fullmatch(text)
         if not result or result["kind"] not in KINDS or not 1 <= int(result["port"]) <= 65_535:
             raise ConfigError(
-                f"{text!r} is no address of a bus; one is zenoh:HOST:PORT or ros:HOST:PORT, with /KEY for one of "
-                "several vehicles there"
+                f"{text!r} is no address of a bus; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT, with /KEY for "
+                "one of several vehicles there"
             )
         return cls(result["kind"], result["host"], int(result["port"]), result["key"] or "", shared)
 
     @property
     def loopback(self) -> bool:
         """Whether the address can be reached only from this machine."""
-        return self.host in LOOPBACK
+        return is_local() if self.kind == ROS2 else self.host in LOOPBACK
 
     def check_shared(self) -> None:
         """Raise :class:`ConfigError` if other machines can reach the address and there is no shared key."""
@@ -68,7 +76,7 @@ class Address:
 
         Args:
             capacities: Maximum length of a message, by topic [bytes].
-            listen: Whether to wait at the address for other ends; for ROS 1, the master does so.
+            listen: Whether to wait at the address for other ends; for ROS 1, the master does so; ROS 2 needs none.
             writes: Topics that this end writes. Readers are connected to these topics immediately. Readers of
                 other topics are connected only by the first message, which may also be the last one.
 
@@ -83,6 +91,10 @@ class Address:
             from .zenoh import ZenohBus
 
             bus = ZenohBus(capacities, f"tcp/{where}", listen=listen, key=self.key, writes=writes, session=session)
+        elif self.kind == ROS2:
+            from .ros2 import Ros2Bus
+
+            bus = Ros2Bus(capacities, self.port, key=self.key, writes=writes, session=session)
         else:
             from ..ros1.bus import RosBus
 
@@ -103,6 +115,6 @@ def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
         ConfigError: There is no address, an address is invalid, or the key cannot be read.
     """
     if not texts:
-        raise ConfigError("no address; one is zenoh:HOST:PORT or ros:HOST:PORT")
+        raise ConfigError("no address; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT")
     shared = read_key(key)
     return [Address.of(text, shared) for text in texts]

@@ -53,7 +53,7 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
     """Wait for states, and compare the message types of both ends, before anything is armed.
 
     Raises:
-        PlantError: No state comes, too few come, nobody listens to the setpoints, or a type differs.
+        PlantError: No state comes, too few come, the setpoints have no listener, or a type differs.
     """
     where, looked = f"ros2 ({link.node.backend})", 0.0
 
@@ -71,7 +71,7 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
     looked = 0.0
     until(lambda: is_clear() and not link.unheard(), LISTENER_S, keep_on)
     if (unheard := link.unheard()) and link.node.backend != "zenoh":  # PX4's zenoh module does not announce itself
-        raise PlantError(f"{where}: nobody listens to {', '.join(unheard)}")
+        raise PlantError(f"{where}: no node listens to {', '.join(unheard)}")
     if not until(lambda: not link.crowded(), CROWD_S, keep_on):
         raise PlantError(f"{where}: several nodes publish {', '.join(link.crowded())}; end all but one")
     until(lambda: False, RATE_S, keep_on)

@@ -18,7 +18,7 @@ COMMON = ("nav_msgs", "geometry_msgs", "std_msgs")
 
 
 class Ros2Address(NamedTuple):
-    """Where a vehicle is, and what it speaks."""
+    """Place of a vehicle, and its topics."""
 
     backend: str
     """Back end of the node; empty to choose one."""
