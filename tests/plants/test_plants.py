@@ -17,11 +17,14 @@ from retrim import ConfigError, PlantError, load
 from retrim.cli.arguments import FlightArguments
 from retrim.config import PRESETS, Scenario, Setup
 from retrim.control import AbstractController
+from retrim.errors import RetrimError
 from retrim.physics import Command, Constant, Payload, State, small, so3
 from retrim.plants import Plant, crazyflow
+from retrim.plants.bridges import ros2
 from retrim.plants.crazyflow import CrazyflowPlant
 from retrim.plants.mujoco import MujocoPlant
 from retrim.plants.rotorpy import RotorpyPlant
+from retrim.ros2 import backends
 from retrim.runtime import ControllerPilot, FunctionPilot, fly
 
 EXTRAS = ("rotorpy", "mujoco", "crazyflow")
@@ -331,6 +334,15 @@ def test_missing_ros_is_named_before_anything_is_trained(monkeypatch):
     monkeypatch.setitem(sys.modules, "rospy", None)
     with pytest.raises(ConfigError, match="ROS 1 needs rospy from the system: apt install python3-rospy"):
         FlightArguments(plant="ros").scenario(load("hover/retrim"))
+
+
+@pytest.mark.parametrize("installed", [set(), {"rosbags"}])
+def test_missing_packages_of_ros_2_are_named_before_anything_is_trained(installed, monkeypatch):
+    for module in (ros2, backends):
+        monkeypatch.setattr(module, "is_installed", lambda name: name in installed)
+    why = "ROS 2 needs rclpy" if installed else "plant 'ros2' needs the package 'rosbags'"
+    with pytest.raises(RetrimError, match=rf"{why}.*pip install cyclonedds rosbags"):
+        FlightArguments(plant="ros2").scenario(load("hover/retrim"))
 
 
 def test_missing_firmware_is_named_before_anything_is_trained(monkeypatch):
