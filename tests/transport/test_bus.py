@@ -13,9 +13,13 @@ import pytest
 from bus_ends import LOCAL, NETWORK, await_message, network, two_ends
 from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
+from retrim.onboard.topics import INTO, OUT
 from retrim.ros1 import bus as ros
+from retrim.ros2.node import check_topic
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address
+from retrim.transport.ros2 import name_of
+from retrim.transport.session import GREETINGS
 from retrim.transport.shared_memory import SharedMemoryBus
 from retrim_paper.latency import free_port
 
@@ -166,6 +170,13 @@ def test_what_an_end_of_ros_writes_has_readers_before_the_first_message(monkeypa
     bus.publish("there", b"also")
     assert declaration[3:] == ["/retrim/quad1/there"]
     assert sending[1:] == [("/retrim/quad1/a", b"last"), ("/retrim/quad1/there", b"also")]
+
+
+def test_every_topic_between_machines_has_a_name_in_ros_2():
+    names = [name_of(topic) for topic in (*OUT, *INTO, *GREETINGS)]
+    for name in names:
+        check_topic(f"/retrim/quad1/{name}")
+    assert len(set(names)) == len(names)
 
 
 def test_a_master_that_there_is_not_is_named():

@@ -78,4 +78,9 @@ class Ros2Bus(NetworkBus):
         return receive
 
     def _name(self, topic: str) -> str:
-        return f"{self._prefix}/{topic.replace('.', '/')}"
+        return f"{self._prefix}/{name_of(topic)}"
+
+
+def name_of(topic: str) -> str:
+    """Return the name of a topic in ROS, whose parts must not begin with a digit."""
+    return "/".join(f"n{part}" if part[0].isdigit() else part for part in topic.split("."))
