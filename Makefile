@@ -106,9 +106,10 @@ test-ros: dev
 		'ros-rclpy[fastrtps]' ros-nav-msgs ros-geometry-msgs ros-std-msgs
 	@touch $@
 
+ROS2_TESTS := tests/ros2 tests/live/test_ros2_vehicle.py
 test-ros2: dev .ros2-env/.installed
 	ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST RETRIM_ROS2=.ros2-env/bin/python \
-		$(BIN)/pytest -n 0 -m "ros2 or not ros2" tests/ros2 tests/live/test_ros2_vehicle.py
+		$(BIN)/pytest -n 0 -m "ros2 or not ros2" $(ROS2_TESTS)
 
 bench: setup
 	$(BIN)/retrim bench
