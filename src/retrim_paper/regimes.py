@@ -24,7 +24,7 @@ from .vehicles import DELAY, THRUST_TO_WEIGHT, heavy_quadrotor, slow_quadrotor
 
 PUSH = "early-step"  # 2 m/s^2 per axis from 4 s on
 LAST, TAIL = 2.0, 10.0  # [s], scored intervals at the end of hover flights and of tracking flights
-LAP_ERROR = 0.1  # [m], largest mean error of a lap that counts
+LAP_RATIO = 3.5  # smallest ratio of the times of the first and the last lap
 CHANGES = 16.0  # [s], scored interval at the end of flights with a pick-up and a release
 VEHICLES = 8  # number of hidden vehicles
 VEHICLE_SEED = 48  # seed of their draw
@@ -66,23 +66,21 @@ def tracking_error(flight: Flight) -> float:
     return float(np.mean(flight.error[_tail(flight, TAIL)]))
 
 
-def lap_time(flight: Flight) -> float:
-    """Return the duration of the last lap [s], or infinity if its mean error exceeds 10 cm or there is no lap.
+def fastest_lap_error(flight: Flight) -> float:
+    """Return the mean error of the last lap [m], or infinity if the first lap took less than 3.5 times as long.
 
     Raises:
         ValueError: The flight does not follow a paced reference.
     """
     name, phase = flight.spec.scenario.reference, flight.log.phase
     if name is None or phase is None:
-        raise ValueError("lap_time needs a flight at a variable pace")
+        raise ValueError("fastest_lap_error needs a flight at a variable pace")
     start, end = (float(t) for t in make_reference(name).lap)
     laps = int((phase[-1] - start) // (end - start))
-    if laps < 1:
+    ends = np.interp(start + (end - start) * np.arange(laps + 1), phase, flight.log.t)
+    if laps < 2 or ends[1] - ends[0] < LAP_RATIO * (ends[-1] - ends[-2]):
         return float("inf")
-    ends = start + (end - start) * np.array([laps - 1, laps])
-    first, last = np.interp(ends, phase, flight.log.t)
-    error = float(np.mean(flight.error[(flight.log.t >= first) & (flight.log.t <= last)]))
-    return float(last - first) if error <= LAP_ERROR else float("inf")
+    return float(np.mean(flight.error[(flight.log.t >= ends[-2]) & (flight.log.t <= ends[-1])]))
 
 
 def rms_error(flight: Flight) -> float:
@@ -135,7 +133,7 @@ def regimes() -> tuple[Regime, ...]:
     on_path_rms = Score(rms_error, f"RMS error, last {TAIL:g} s")
     calm = Score(seconds_to_calm, "time after the stop until the swing remains below 5° [ms]")
     in_height = Score(height_error, f"RMS height error, last {TAIL:g} s")
-    per_lap = Score(lap_time, f"time of the last lap; an error above {LAP_ERROR:g} m counts as lost")
+    per_lap = Score(fastest_lap_error, f"mean error, last lap; a ratio of lap times below {LAP_RATIO:g} counts as lost")
     above_table = Score(height_error_above_table, f"RMS height error, last {TAIL:g} s; a contact counts as lost")
     return (
         Regime(

@@ -11,7 +11,7 @@ from retrim.runkit import Run
 from retrim.runkit.flights import Flight, FlightSpec
 from retrim.runkit.reporter import Silent
 from retrim.runtime.flight import Log, States
-from retrim_paper.regimes import height_error_above_table, lap_time
+from retrim_paper.regimes import fastest_lap_error, height_error_above_table
 from retrim_paper.tables.where_learning_pays import OPPONENTS, _cell, _methods, decide, regimes, where_learning_pays
 
 NONE_LOST = dict.fromkeys((*OPPONENTS, "adapted"), 0)
@@ -61,16 +61,16 @@ def test_a_contact_with_the_table_counts_as_a_loss(lowest, touches):
     assert np.isinf(height_error_above_table(flight)) == touches
 
 
-@pytest.mark.parametrize(("error", "seconds"), [(0.05, 2.5), (0.2, np.inf)])
-def test_a_lap_time_is_that_of_the_last_whole_lap(error, seconds):
-    """The figure-8 begins its laps of 5 s at 3 s; at a pace of 2, a lap takes 2.5 s."""
+@pytest.mark.parametrize(("pace", "error"), [(4.0, 0.05), (3.0, np.inf)])
+def test_the_error_of_the_last_lap_counts_if_the_lap_is_fast(pace, error):
+    """The figure-8 begins its laps of 5 s at 3 s; the first one is flown at a pace of 1."""
     t = 0.02 * np.arange(1001)
-    phase = np.where(t < 10.0, t, 10.0 + 2.0 * (t - 10.0))
+    phase = np.where(t < 10.0, t, 10.0 + pace * (t - 10.0))
     states = States(np.zeros((1001, 3)), np.stack([np.eye(3)] * 1001), np.zeros((1001, 3)))
     log = Log(t, states, states, np.zeros((1001, 4)), 0.02, False, phase=phase)
     spec = FlightSpec(Scenario(reference="figure8=max"), "full", 0)
-    flight = Flight(spec, "large", log, np.full(1001, error), "error", 2.0)
-    assert lap_time(flight) == pytest.approx(seconds)
+    flight = Flight(spec, "large", log, np.where(t < 10.0, 0.2, 0.05), "error", 2.0)
+    assert fastest_lap_error(flight) == pytest.approx(error)
 
 
 def test_regimes_have_unique_names_and_registered_methods():

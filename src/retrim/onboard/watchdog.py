@@ -113,8 +113,9 @@ class Watchdog:
             self._rows[-1][COMMAND] = sample.accepted
         if self._sample is None:
             self._start = sample.t
-        accounts = [0.0, 0.0, 0.0, sample.age, 0.0, Mode.POLICY]
-        head = [sample.tick, sample.t - self._start, sample.age]
+        t = sample.t - self._start
+        accounts = [0.0, 0.0, 0.0, sample.age, 0.0, t, Mode.POLICY]
+        head = [sample.tick, t, sample.age]
         self._rows.append(np.concatenate([head, sample.state, sample.truth, sample.accepted, accounts]))
         self._sample, self._stamp = sample, Stamp(sample.tick, sample.send_time)
         return True

@@ -77,7 +77,8 @@ def _find_correction(log_map: LogMap, read: Callable[[Other, slice], Ticks], val
         holds = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items())
         if not correction or not holds or _least(after) < AGREES:
             continue
-        if (rank := (round(_least(after), 1), sum(after.values()))) > best:
+        # Rounded, so that of two equivalent statements, the first one is named.
+        if (rank := (round(_least(after), 1), round(sum(after.values()), 6))) > best:
             name, best = min(correction, key=lambda each: wrong[each]), rank
             result = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
     return result
