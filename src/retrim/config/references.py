@@ -127,5 +127,5 @@ def _speed(name: str, text: str) -> float:
     except ValueError:
         speed = math.nan
     if not 0.1 <= speed <= FASTEST:
-        raise ConfigError(f"reference {name!r}: {text!r} is no top speed of 0.1 to {FASTEST:g} m/s")
+        raise ConfigError(f"reference {name!r}: {text!r} is no top speed of 0.1 to {FASTEST:g} m/s, and not max")
     return speed
