@@ -14,15 +14,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.actuator_response import ActuatorState
-from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.abstract_reference import AbstractReference
 from ..tasks.reference import Reference
 from ..tasks.shifted_reference import HARMONICS, basis, set_shift, shift_references
-from .condition import Condition
 from .controller import AbstractController
-from .vehicle_report import VehicleEstimate, VehicleReport
+from .wrapped_controller import WrappedController
 
 RATE = 0.15  # [1/s], rate at which the error of a slow harmonic decays; at 0.6, the vehicle swings up
 BANDWIDTH = 6.0  # [rad/s]; faster harmonics are learned more slowly, since a vehicle follows them late
@@ -38,10 +35,9 @@ class LapState(eqx.Module):
     inner: Any
 
 
-class LapLearning(AbstractController[LapState]):
+class LapLearning(WrappedController[LapState]):
     """Shifts the reference of a controller by a periodic function of the phase, until the mean error vanishes."""
 
-    inner: AbstractController[Any]
     reference: AbstractReference
     """Reference of the flight, world frame."""
     dt: float = eqx.field(static=True)
@@ -62,40 +58,7 @@ class LapLearning(AbstractController[LapState]):
 
     def with_age(self, age: float | Float[Array, ""]) -> "LapLearning":
         """Return the same controller for measurements that are ``age`` seconds old."""
-        return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
-
-    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "LapLearning":
-        """Return the same controller for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a))
-
-    def with_vehicle(self, member: Member) -> "LapLearning":
-        """Return the same controller for an identified vehicle."""
-        return dataclasses.replace(self, inner=self.inner.with_vehicle(member))
-
-    def with_actuators(self, actuators: ActuatorState) -> "LapLearning":
-        """Return the same controller for a tick in which thrust and body rates are known."""
-        return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))
-
-    def follow(self, estimate: VehicleEstimate) -> "LapLearning":
-        """Return the controller for a vehicle that another process identifies."""
-        return dataclasses.replace(self, inner=self.inner.follow(estimate))
-
-    @property
-    def identifies(self) -> bool:
-        """Whether the inner controller identifies its vehicle in flight."""
-        return self.inner.identifies
-
-    def condition(self, memory: LapState) -> Condition | None:
-        """Return the condition of the inner controller."""
-        return self.inner.condition(memory.inner)
-
-    def vehicle(self, memory: LapState) -> VehicleReport | None:
-        """Return the vehicle that the inner controller has identified."""
-        return self.inner.vehicle(memory.inner)
-
-    def disturbance(self, memory: LapState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the disturbance that the inner controller expects."""
-        return self.inner.disturbance(memory.inner, x, u)
+        return dataclasses.replace(super().with_age(age), age=jnp.array(age))
 
     def init(self, x: State) -> LapState:
         """Return the memory at the start of a flight, without a shift."""

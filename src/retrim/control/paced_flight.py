@@ -8,16 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.actuator_response import ActuatorState
-from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.abstract_reference import AbstractReference, Point
 from ..tasks.paced_reference import Clock, at_pace, pace_references, set_clock
 from .attitude import attitude_of, thrust_of
-from .condition import Condition
 from .controller import AbstractController
 from .pace import PaceLimits, largest_factors, largest_growth, points_ahead
-from .vehicle_report import VehicleEstimate, VehicleReport
+from .wrapped_controller import WrappedController
 
 FIRST_SPEED, FIRST_ACCELERATION = 1.0, 1.0  # [m/s], [m/s^2], largest values of the first lap
 TOLERANCE = 0.1  # [m]: the share of the pace limits grows while the error is smaller
@@ -42,15 +39,13 @@ class PacedState(eqx.Module):
     inner: Any
 
 
-class PacedFlight(AbstractController[PacedState]):
+class PacedFlight(WrappedController[PacedState]):
     """Moves the reference of a controller at a variable pace.
 
     The flight begins with a slow lap. While the tracking error is small, the pace grows towards the largest pace that
     the model permits, with the disturbance that the inner controller expects; a large error reduces the pace.
     """
 
-    inner: AbstractController[Any]
-    """Controller whose references are paced; see :meth:`of`."""
     reference: AbstractReference
     """Reference as a function of the phase, world frame."""
     limits: PaceLimits
@@ -76,40 +71,7 @@ class PacedFlight(AbstractController[PacedState]):
 
     def with_age(self, age: float | Float[Array, ""]) -> "PacedFlight":
         """Return the same controller for measurements that are ``age`` seconds old."""
-        return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
-
-    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "PacedFlight":
-        """Return the same controller for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a))
-
-    def with_vehicle(self, member: Member) -> "PacedFlight":
-        """Return the same controller for an identified vehicle."""
-        return dataclasses.replace(self, inner=self.inner.with_vehicle(member))
-
-    def with_actuators(self, actuators: ActuatorState) -> "PacedFlight":
-        """Return the same controller for a tick in which thrust and body rates are known."""
-        return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))
-
-    def follow(self, estimate: VehicleEstimate) -> "PacedFlight":
-        """Return the controller for a vehicle that another process identifies."""
-        return dataclasses.replace(self, inner=self.inner.follow(estimate))
-
-    @property
-    def identifies(self) -> bool:
-        """Whether the inner controller identifies its vehicle in flight."""
-        return self.inner.identifies
-
-    def condition(self, memory: PacedState) -> Condition | None:
-        """Return the condition of the inner controller."""
-        return self.inner.condition(memory.inner)
-
-    def vehicle(self, memory: PacedState) -> VehicleReport | None:
-        """Return the vehicle that the inner controller has identified."""
-        return self.inner.vehicle(memory.inner)
-
-    def disturbance(self, memory: PacedState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the disturbance that the inner controller expects."""
-        return self.inner.disturbance(memory.inner, x, u)
+        return dataclasses.replace(super().with_age(age), age=jnp.array(age))
 
     def clock(self, memory: PacedState) -> Clock:
         """Return the clock of the last command."""
