@@ -14,7 +14,7 @@ from retrim.control.controller import AbstractController
 from retrim.control.gravity_frame import GravityFrame
 from retrim.control.slung_load import LoadCompensation
 from retrim.estimation.disturbance_observer import DisturbanceObserver
-from retrim.physics import CommandPath, Constant, PointMass, SlungLoad, State, SumOfDisturbances
+from retrim.physics import Command, CommandPath, Constant, PointMass, SlungLoad, State, SumOfDisturbances
 from retrim.physics.slung_load import swing_angle
 from retrim.plants import SimPlant
 from retrim.runtime import ControllerPilot, fly
@@ -127,3 +127,15 @@ def test_a_turned_world_turns_the_frame(key):
     np.testing.assert_allclose(pull_turned, jnp.stack([-pull[1], pull[0], pull[2]]), atol=1e-12)
     assert float(a[:2] @ z[2:4]) > 0.0  # along the velocity of the load: this takes energy from the swing
     assert float(a[2]) == 0.0
+
+
+def test_a_planned_state_includes_the_weight_of_the_load():
+    """A vehicle with a load of 30 % needs 1.3 times its own thrust, so a flight at a variable pace is slower."""
+    frame, x = controller(), State.at(jnp.asarray(HOME))
+    memory = frame.init(x)
+    estimate = memory.load.estimate
+    heavy = dataclasses.replace(estimate, z=estimate.z.at[7].set(0.3))
+    memory = dataclasses.replace(memory, load=dataclasses.replace(memory.load, estimate=heavy))
+    up = thrust_of(jnp.zeros(3))
+    needed = up - frame.disturbance(memory, x, Command.hover())
+    np.testing.assert_allclose(needed, 1.3 * up, rtol=1e-6)

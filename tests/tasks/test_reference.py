@@ -393,7 +393,8 @@ def test_a_path_must_be_finite_and_of_three_or_four_numbers():
     "sizes", [{"seconds": 0.0}, {"lap": 2.0}, {"lap": -0.1}, {"lap": 2.5}, {"points": 1}, {"seconds": math.nan}]
 )
 def test_impossible_sizes(sizes):
-    with pytest.raises(ValueError, match="cannot be"):
+    name, value = next(iter(sizes.items()))
+    with pytest.raises(ValueError, match=f"Reference: {name} must be .*got {value}"):
         Reference.of(line, **({"seconds": 2.0} | sizes))
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..control.gravity_frame import NormLimited, limit_norm
+from ..control.gravity_frame import ConstantResidual, NormLimited, limit_norm
 from ..learn.env import Env
 from ..learn.residuals.model import FittedResidual
 from ..learn.residuals.rates import RateFit
@@ -59,7 +59,7 @@ class RestView(AbstractView):
         home = env.task.home()
         d = limit_norm(residual(State.at(home), Command.hover(home.dtype)), self.limit)
         env = as_it_turns(env, turning_of(residual))
-        return dataclasses.replace(env.with_residual(residual), frame_disturbance=Same(d))
+        return dataclasses.replace(env.with_residual(residual), frame_disturbance=ConstantResidual(d))
 
 
 def turning_of(residual: Residual) -> RateFit | None:
@@ -83,14 +83,3 @@ def as_it_turns(env: Env, fit: RateFit | None) -> Env:
     """Return the environment with the identified lag and bias of the rates, if they were identified."""
     env = with_lag(env, fit)
     return env if fit is None else dataclasses.replace(env, dynamics=RateBiasedModel(env.dynamics, fit.bias))
-
-
-class Same(eqx.Module):
-    """A disturbance that is independent of state and command."""
-
-    d: Float[Array, "3"]
-    """Disturbance in the world frame [m/s^2]."""
-
-    def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the disturbance."""
-        return self.d

@@ -226,7 +226,7 @@ class Setup:
 
         pilot = find_method(method).make(MethodRequest(self, policy, key, latency, state))
         if isinstance(pilot, ControllerPilot):
-            pilot.controller = self.paced(pilot.controller)
+            pilot.controller = self.choose_pace(pilot.controller)
         pilot.dt = pilot.dt or self.preset.dt  # a controller does not store its control period
         return pilot
 
@@ -237,9 +237,9 @@ class Setup:
         """
         residual = FittedResidual(self.learner.residual_model, state.residual)
         policy = state.policy.policy.merged()
-        return self.paced(adapted_flight(self.preset, self.flight_task, self.vehicle, policy, residual))
+        return self.choose_pace(adapted_flight(self.preset, self.flight_task, self.vehicle, policy, residual))
 
-    def paced(self, controller: AbstractController[Any]) -> AbstractController[Any]:
+    def choose_pace(self, controller: AbstractController[Any]) -> AbstractController[Any]:
         """Return a controller that also chooses the pace of a paced reference; unchanged for any other reference.
 
         Args:

@@ -92,11 +92,17 @@ class GravityFrame(AbstractController[GravityFrameState]):
         return dataclasses.replace(self, actuators=actuators)
 
     def disturbance(self, memory: GravityFrameState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the estimated disturbance and the part of the learned residual that depends on the state."""
-        estimate = self.trust_estimate.astype(x.p.dtype) * memory.observer.d_hat
-        if self.known_residual is None:
-            return estimate
-        return estimate + StateDependentResidual(self.known_residual, self.trust_residual, self.place)(x, u)
+        """Return the estimated disturbance, the state-dependent part of the learned residual, and the pull of a load.
+
+        In a planned state, the load is expected to hang along the thrust.
+        """
+        result = self.trust_estimate.astype(x.p.dtype) * memory.observer.d_hat
+        if self.known_residual is not None:
+            result = result + StateDependentResidual(self.known_residual, self.trust_residual, self.place)(x, u)
+        if memory.load is not None:
+            share = self.trust_residual.astype(x.p.dtype) * memory.load.estimate.load.share
+            result = result - share * u.c * x.R[:, 2]
+        return result
 
     def init(self, x: State) -> GravityFrameState:
         """Return the memory at the start of a flight."""
@@ -159,7 +165,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
             return observer(before, t, x), None, jnp.zeros_like(x.p)
         load, pull = self.load.predict(load, before.last, x, dt)
         without = self.trust_residual.astype(x.p.dtype) * pull
-        after = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, Held(without)))(before, t, x)
+        after = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, ConstantResidual(without)))(before, t, x)
         u, _ = observer.acted(before, x)
         missed = after.innovation + without
         if known is not None:
@@ -235,11 +241,11 @@ class StateDependentResidual(eqx.Module):
         return self.share.astype(x.p.dtype) * beyond
 
 
-class Held(eqx.Module):
-    """A constant residual."""
+class ConstantResidual(eqx.Module):
+    """A residual that is independent of state and command."""
 
     a: Float[Array, "3"]
-    """Acceleration, world [m/s^2]."""
+    """Acceleration in the world frame [m/s^2]."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return the acceleration."""

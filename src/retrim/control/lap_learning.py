@@ -67,7 +67,7 @@ class LapLearning(WrappedController[LapState]):
 
     def __call__(self, memory: LapState, t: Float[Array, ""], x: State) -> tuple[Command, LapState]:
         """Correct the shift by the present error, and return the command of the inner controller."""
-        shift = self._corrected(memory.shift, t - self.age.astype(t.dtype), x)
+        shift = self._correct(memory.shift, t - self.age.astype(t.dtype), x)
         u, inner = set_shift(self.inner, shift)(memory.inner, t, x)
         return u, LapState(shift, inner)
 
@@ -75,7 +75,7 @@ class LapLearning(WrappedController[LapState]):
         """Pass the accepted command to the inner controller."""
         return LapState(memory.shift, set_shift(self.inner, memory.shift).accepted(memory.inner, u))
 
-    def _corrected(self, shift: Float[Array, "3 h"], t: Float[Array, ""], x: State) -> Float[Array, "3 h"]:
+    def _correct(self, shift: Float[Array, "3 h"], t: Float[Array, ""], x: State) -> Float[Array, "3 h"]:
         phase, lap = self.reference.phase(t), self.reference.phase_lap
         error = x.p - self.reference(t).p
         is_lap = (phase > lap[0]) & (jnp.sum(error * error) < NEAR**2)

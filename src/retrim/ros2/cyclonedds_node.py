@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..errors import ConfigError
-from .cyclonedds_types import idl_type, undescribed
+from .cyclonedds_types import idl_type, without_description
 from .message_type import MessageType
 from .node import Endpoint, Publish, Qos, Ros2Node, Take, check_topic, domain_id, is_local, ros_name
 
@@ -62,7 +62,7 @@ class CycloneNode(Ros2Node):
         from cyclonedds.pub import DataWriter
 
         place = self._topic(topic, kind)
-        with _MAKING, undescribed(place):
+        with _MAKING, without_description(place):
             writer = DataWriter(self._participant, place, qos=self._qos(kind, qos))
         raw = place.data_type
 
@@ -77,7 +77,7 @@ class CycloneNode(Ros2Node):
 
         core = self._core
         place = self._topic(topic, kind)
-        with _MAKING, undescribed(place):
+        with _MAKING, without_description(place):
             reader = DataReader(self._participant, place, qos=self._qos(kind, qos))
         mask = core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
         condition = core.ReadCondition(reader, mask)

@@ -64,7 +64,7 @@ def _idl_field(store: Any, field: tuple[Any, Any], version: str) -> Any:
 
 
 @contextmanager
-def undescribed(topic: Any) -> Iterator[None]:
+def without_description(topic: Any) -> Iterator[None]:
     """Let the readers and writers that are made meanwhile not describe the fields of their type to others.
 
     Two ends that both describe their types match only if one can resolve the description of the other. Fast DDS 3

@@ -57,8 +57,12 @@ class Reference(AbstractReference):
             ValueError: The sizes are invalid, or the path does not return 3 or 4 finite numbers; the message then
                 contains the time.
         """
-        if not (seconds > 0 and points >= 2 and (lap is None or 0 <= lap < seconds)):
-            raise ValueError(f"Reference: seconds = {seconds}, lap = {lap}, points = {points} cannot be")
+        if not seconds > 0:
+            raise ValueError(f"Reference: seconds must be positive, got {seconds}")
+        if points < 2:
+            raise ValueError(f"Reference: points must be at least 2, got {points}")
+        if lap is not None and not 0 <= lap < seconds:
+            raise ValueError(f"Reference: lap must be at least 0 and less than seconds = {seconds}, got {lap}")
         times = np.linspace(0.0, seconds, points)
         last = seconds - STEP if lap is None else math.inf
         rows = flat_rows(path, times, last)

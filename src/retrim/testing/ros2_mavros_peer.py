@@ -1,5 +1,6 @@
 """Common parts of the simulated peers of ROS 2, and the peer with the topics of mavros."""
 
+import abc
 import math
 import time
 from collections.abc import Callable
@@ -58,7 +59,7 @@ class Habits:
             self._kept = None
 
 
-class Ros2Peer:
+class Ros2Peer(abc.ABC):
     """A vehicle and its autopilot; :meth:`step` is called once every :attr:`Habits.period`."""
 
     def __init__(
@@ -91,16 +92,17 @@ class Ros2Peer:
             self.publish(self.vehicle.p + later * self.vehicle.v)
         self._calls += 1
 
+    @abc.abstractmethod
     def advance(self) -> None:
         """Advance the vehicle by a tick."""
-        raise NotImplementedError
 
     def report(self) -> None:
-        """Publish the slow messages."""
+        """Publish the slow messages; by default, there are none."""
+        return
 
+    @abc.abstractmethod
     def publish(self, p: np.ndarray) -> None:
         """Publish the state, at a position in the world frame [m]."""
-        raise NotImplementedError
 
     def advertise(self, topic: str, name: str, qos: Qos) -> tuple[MessageType, Publish]:
         """Advertise a topic."""

@@ -69,11 +69,14 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
         remarks = "".join(f"; ignored: {note}" for note in link.notes)
         raise PlantError(f"{where}: no state came on {' or '.join(link.states)} in {WAIT_S:g} s{remarks}")
     looked = 0.0
-    until(lambda: is_clear() and not link.unheard(), LISTENER_S, keep_on)
-    if (unheard := link.unheard()) and link.node.backend != "zenoh":  # PX4's zenoh module does not announce itself
-        raise PlantError(f"{where}: no node listens to {', '.join(unheard)}")
-    if not until(lambda: not link.crowded(), CROWD_S, keep_on):
-        raise PlantError(f"{where}: several nodes publish {', '.join(link.crowded())}; end all but one")
+    until(lambda: is_clear() and not link.topics_without_listener(), LISTENER_S, keep_on)
+    if (
+        silent := link.topics_without_listener()
+    ) and link.node.backend != "zenoh":  # PX4's zenoh module does not announce itself.
+        raise PlantError(f"{where}: no node listens to {', '.join(silent)}")
+    if not until(lambda: not link.topics_with_several_publishers(), CROWD_S, keep_on):
+        topics = ", ".join(link.topics_with_several_publishers())
+        raise PlantError(f"{where}: several nodes publish {topics}; end all but one")
     until(lambda: False, RATE_S, keep_on)
     if link.rate < LOWEST_RATE:
         raise PlantError(

@@ -85,11 +85,11 @@ class Ros2Link(RosStates):
         """Return a sentence for each topic whose type differs between the two ends, as far as they are discovered."""
         return [text for topic, kind in self._kinds.items() for text in mismatches(topic, kind, self._others(topic))]
 
-    def unheard(self) -> list[str]:
+    def topics_without_listener(self) -> list[str]:
         """Return the topics on which this end publishes without a listener."""
         return [topic for topic in self.inputs if not any(not each.publishes for each in self._others(topic))]
 
-    def crowded(self) -> list[str]:
+    def topics_with_several_publishers(self) -> list[str]:
         """Return the state topics on which more than one node publishes."""
         return [topic for topic in self.states if sum(each.publishes for each in self._others(topic)) > 1]
 
