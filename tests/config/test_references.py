@@ -1,4 +1,4 @@
-"""References by name: files with how they are flown, families, and what is refused."""
+"""References by name: files with their suffixes, families, and names that are refused."""
 
 import math
 
@@ -71,7 +71,7 @@ def test_every_registered_name_makes_a_reference():
         assert isinstance(make_reference(name), Reference)
 
 
-# ---- what a flight of them needs
+# ---- requirements of a flight
 
 
 def test_a_flight_lasts_as_long_as_a_reference_that_ends(lap):

@@ -320,7 +320,7 @@ def test_pretraining_has_the_presets_second_decay(case):
     assert float(change) == pytest.approx(-rate * cosine * m / (math.sqrt(v) + 1e-8), rel=1e-6)
 
 
-# ---- what a caller may get wrong
+# ---- wrong arguments
 
 
 def test_what_does_not_fit_is_one_line():

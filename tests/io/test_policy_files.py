@@ -136,7 +136,7 @@ def test_a_header_that_lies_is_refused_even_with_a_checksum(tmp_path, setup, val
     assert "\n" not in str(error.value)
 
 
-# ---- what was learnt
+# ---- learner states
 
 
 @pytest.mark.parametrize("method", ["full", "lora"])

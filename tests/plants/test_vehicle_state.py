@@ -1,4 +1,4 @@
-"""A state that is carried on to the present: exact where what drives it is constant, and made up for once."""
+"""Extrapolation of a state to the present: exact for constant thrust and rates, and applied once."""
 
 from types import SimpleNamespace
 
@@ -90,18 +90,18 @@ def test_what_is_old_is_not_carried_on_for_long():
     assert older.news == 5.0
 
 
-# ---- what a controller makes of it
+# ---- a controller behind a link
 
 
 class Spinning(PointVehicle):
-    """It spins about its thrust axis, under one thrust; what it says of itself is as old as ``late``."""
+    """A vehicle that spins about its thrust axis at constant thrust; its messages are ``late`` seconds old."""
 
     def __init__(self, late):
         super().__init__(SimpleNamespace(dt=0.02))
         self.late, self.flying = late, True
 
     def now(self):
-        self._extra = ExtraAcceleration()  # its time stands still, so its states tell nothing of an acceleration
+        self._extra = ExtraAcceleration()  # the time of this vehicle does not advance, so its states do not show an acceleration
         return super().now()
 
     def read(self):
@@ -120,7 +120,7 @@ def at(t):
 
 
 def use(x, age):
-    """What a controller that looks ahead takes for the present state."""
+    """The state that a predicting controller uses as the present one."""
     acting = Command(jnp.array(THRUST), jnp.array(SPIN))
     prediction = Prediction.of(CommandPath.of(), 0.02).with_age(age)
     queue = CommandQueue.of(acting, 0.02, longest=0.0)
@@ -134,7 +134,7 @@ def agrees(result, true):
 
 @pytest.mark.parametrize("late", [0.0, 0.005, 0.02, LONGEST_S, 0.08, 0.3])
 def test_a_controller_that_looks_ahead_works_with_the_present_state(late):
-    """However old the news are: a link and a controller make up for their age once, together."""
+    """Link and controller together compensate the age of a message once."""
     plant = Spinning(late)
     plant.reset(None)
     measurement, _ = plant.step(Command(jnp.array(THRUST), jnp.array(SPIN)))
@@ -153,5 +153,5 @@ def test_so_does_one_in_a_live_flight(late):
 
 @pytest.mark.parametrize("late", [0.101, 0.12, 1.0])
 def test_the_guard_is_told_how_old_the_news_are(late):
-    """It refuses a state by the age of what the vehicle said, not by what is left of it."""
+    """The age of the message decides, not the age that remains after the extrapolation."""
     assert _sample(3, 0.02, Spinning(late).now(), np.zeros(4)).age == pytest.approx(late)
