@@ -101,7 +101,8 @@ class Spinning(PointVehicle):
         self.late, self.flying = late, True
 
     def now(self):
-        self._extra = ExtraAcceleration()  # the time of this vehicle does not advance, so its states do not show an acceleration
+        # The time of this vehicle does not advance, so its states do not show an acceleration.
+        self._extra = ExtraAcceleration()
         return super().now()
 
     def read(self):
