@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import shlex
 import signal
 import subprocess
 import sys
@@ -29,6 +30,11 @@ from retrim.runkit.stopwatch import Stopwatch
 )
 def test_no_place_on_this_machine_is_recorded(words, rest, tmp_path):
     assert command_line(words.format(here=tmp_path).split()) == f"retrim {rest}"
+
+
+def test_a_shell_reads_the_same_words():
+    words = ["reproduce", "where_learning_pays", "--columns", "geometric + I", "INDI, wrong by two"]
+    assert shlex.split(command_line(words)) == ["retrim", *words]
 
 
 def test_versions_are_those_of_what_is_installed():

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import platform
+import shlex
 import subprocess
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -105,7 +106,7 @@ def cores() -> int:
 
 
 def command_line(words: Sequence[str]) -> str:
-    """Return the command with ``--out`` removed and absolute paths reduced to file names."""
+    """Return the command, quoted for a shell, with ``--out`` removed and absolute paths reduced to file names."""
     shown_words, words = list[str](), list(words)
     while words:
         option, sign, value = words.pop(0).partition("=")
@@ -115,4 +116,4 @@ def command_line(words: Sequence[str]) -> str:
             shown_words.append(f"{option}={Path(value).name if Path(value).is_absolute() else value}")
         else:
             shown_words.append(Path(option).name if Path(option).is_absolute() else option)
-    return " ".join(["retrim", *shown_words])
+    return shlex.join(["retrim", *shown_words])

@@ -87,7 +87,7 @@ def where_learning_pays(
         lines.append(line)
         results += rows
     head = ("regime", "condition", "score", *columns, ADAPTED, "published", "verdict")
-    document.add(TableSection(head, tuple(lines), "Regimes"), results)
+    document.add(TableSection(head, tuple(lines)), results)
     if not run.interrupted:
         clear_flights(run)
 
