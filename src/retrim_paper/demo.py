@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from retrim.config.loading import changed, load_for
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
+from retrim.errors import ConfigError
 from retrim.evaluation.figures import picture
 from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import rows
@@ -42,7 +43,16 @@ class Demonstration(NamedTuple):
 
 
 def demonstrate(
-    name: str, plant: str, run: Run, reporter: Reporter, *, seconds: float, starts: int, seed: int, slow: bool = True
+    name: str,
+    plant: str,
+    run: Run,
+    reporter: Reporter,
+    *,
+    seconds: float,
+    starts: int,
+    seed: int,
+    slow: bool = True,
+    gif: bool = False,
 ) -> Demonstration | None:
     """Pretrain a hover policy, fly it under unknown disturbances, and re-train it in flight.
 
@@ -57,6 +67,7 @@ def demonstrate(
         starts: Flights per disturbance and method.
         seed: Seed for training, starts and flights.
         slow: Whether the second quadrotor is flown.
+        gif: Whether to write an animation of the second quadrotor.
 
     Returns:
         The tables and pictures; None if pretraining was interrupted.
@@ -66,6 +77,8 @@ def demonstrate(
     """
     check_seeds([seed])
     check_flights(starts, seconds)
+    if gif and not slow:
+        raise ConfigError("the animation shows the second quadrotor; leave out --no-slow or --gif")
     preset = load_for("hover", name)
     scenario, setup = Scenario("large", plant=plant), Setup.from_preset(preset)
     count = len(LEVELS) * 2 * starts
@@ -86,7 +99,7 @@ def demonstrate(
     second = None
     if slow and not run.interrupted:
         family = changed(load_for("hover", "hover/any"), pretrain={"num_updates": UPDATES})
-        second = fly_slow_vehicle(study, family, run, reporter, starts=min(starts, MOST), seed=seed)
+        second = fly_slow_vehicle(study, family, run, reporter, starts=min(starts, MOST), seed=seed, gif=gif)
     result += [] if second is None else second.rows
     with interrupts_only_set(run.stop):
         run.write_results(result, seeds=[seed], preset=preset.name, losses=losses)
@@ -96,4 +109,4 @@ def demonstrate(
     pictures = [path for each in scenarios for path in picture(flights, setup, each, run.folder)]
     tables = [table] if second is None else [table, second.table]
     pictures += [] if second is None else second.pictures
-    return Demonstration(tables, [path for path in pictures if path.suffix == ".png"], run.folder / "hover_large.png")
+    return Demonstration(tables, [path for path in pictures if path.suffix != ".svg"], run.folder / "hover_large.png")

@@ -11,9 +11,10 @@ from retrim.config.methods import find_method
 from retrim.config.presets import Preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
-from retrim.evaluation.figures import picture
+from retrim.evaluation.figures import animate, picture
 from retrim.evaluation.metrics import metres, rows
 from retrim.evaluation.study import Study, fly_all
+from retrim.io.files import write_whole
 from retrim.runkit.document import TableSection
 from retrim.runkit.flights import Flight
 from retrim.runkit.reporter import Reporter
@@ -48,7 +49,7 @@ class SlowVehicle(NamedTuple):
 
 
 def fly_slow_vehicle(
-    known_study: Study, family: Preset, run: Run, reporter: Reporter, *, starts: int, seed: int
+    known_study: Study, family: Preset, run: Run, reporter: Reporter, *, starts: int, seed: int, gif: bool = False
 ) -> SlowVehicle | None:
     """Fly a quadrotor with a slow rate loop by a policy for a different vehicle, INDI, and a policy for many vehicles.
 
@@ -59,6 +60,7 @@ def fly_slow_vehicle(
         reporter: Receives lines and progress.
         starts: Flights per method.
         seed: Seed for training, starts and flights.
+        gif: Whether to write an animation of the first flight of each method.
 
     Returns:
         The table, the rows and the pictures; None if the run was interrupted.
@@ -87,6 +89,11 @@ def fly_slow_vehicle(
         flight for each, own in zip(entrants, flights, strict=True) if each.vehicle != "known" for flight in own
     ]
     pictures = picture(shown_flights, setup, scenario, run.folder, stem="slow_vehicle", title=FIGURE, labels=LABELS)
+    if gif:
+        reporter.say("drawing the animation")
+        path = run.folder / "slow_vehicle.gif"
+        write_whole(path, animate(shown_flights, setup, scenario, FIGURE, LABELS))
+        pictures.append(path)
     result = [
         row | {"preset": each.study.preset.name, "vehicle_known": each.vehicle}
         for each, own in zip(entrants, flights, strict=True)

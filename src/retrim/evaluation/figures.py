@@ -24,7 +24,7 @@ from ..tasks.observation import AbstractObservation
 from ..tasks.reference import Reference
 from ..tasks.track import AbstractTrack
 from ..tasks.transition import SplicedReference
-from ..viz import plots
+from ..viz import animation, plots
 
 BY_HAND = ("asked", "knobs", "reference")
 """Kinds of events that a user causes in a live flight."""
@@ -88,6 +88,34 @@ def picture(
     figure = plots.flight_figure(title, groups, spans(scenario.disturbance, task.home(), seconds), beside)
     clean = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in f"{preset.task}_{scenario.disturbance}")
     return plots.save(figure, folder, stem or clean)
+
+
+def animate(
+    flights: Sequence[Flight], setup: Setup, scenario: Scenario, title: str, labels: Mapping[str, str]
+) -> bytes:
+    """Return an animated GIF with the first flight of each method in one scenario.
+
+    Args:
+        flights: Flights; those of other scenarios are left out, and at least one must remain.
+        setup: Set-up of the policy's preset.
+        scenario: Scenario whose flights are shown.
+        title: Title of the animation.
+        labels: Method labels by name; by default those in tables.
+    """
+    firsts = dict[str, Flight]()
+    for flight in flights:
+        if flight.spec.scenario == scenario:
+            firsts.setdefault(flight.spec.method, flight)
+    home, colours = setup.flight_task.home(), _colours(list(firsts))
+    actors = [
+        animation.Actor(
+            labels.get(method, find_method(method).label.strip("*")), plots.GROUPS[colours[method] % len(plots.GROUPS)],
+            flight.log.t, flight.log.p - np.asarray(home), flight.log.R, flight.error, flight.log.terminated,
+        )
+        for method, flight in firsts.items()
+    ]  # fmt: skip
+    seconds = max(float(actor.t[-1]) for actor in actors)
+    return animation.animate(title, actors, spans(scenario.disturbance, home, seconds))
 
 
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:

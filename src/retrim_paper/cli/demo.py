@@ -19,6 +19,7 @@ def demo(
     starts: int = 8,
     seed: int = 0,
     slow: bool = True,
+    gif: bool = False,
     out: Path | None = None,
 ) -> Callable[[threading.Event], int]:
     """Pretrain a hover policy, push it, re-train it in flight, and fly a second, unknown quadrotor.
@@ -30,12 +31,15 @@ def demo(
         starts: Flights per disturbance and method, each from a different start.
         seed: Seed for training and flights.
         slow: Whether to fly the second quadrotor, which has a slow rate loop.
+        gif: Whether to write an animation of the second quadrotor, slow_vehicle.gif.
         out: Folder for the policy, results.json and the pictures; by default a new folder under runs/.
     """
 
     def execute(stop: threading.Event) -> int:
         run = report_start(Run("demo", out, stop=stop))
-        result = demonstrate(preset, plant, run, RichReporter(), seconds=seconds, starts=starts, seed=seed, slow=slow)
+        result = demonstrate(
+            preset, plant, run, RichReporter(), seconds=seconds, starts=starts, seed=seed, slow=slow, gif=gif
+        )
         if result is None:
             return INTERRUPTED
         for table in result.tables:
