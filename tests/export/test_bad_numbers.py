@@ -26,7 +26,7 @@ from retrim.testing import check_controller
 
 BEFORE, AFTER, SHARE = 6, 12, 1e-5
 NUMBERS = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf, "1e30": 1e30, "frozen": None}
-FAST = ("-std=c99", "-O3", "-ffast-math", "-Wall", "-Wextra", "-Werror")
+FAST = (*FLAGS, "-ffast-math")
 CAREFUL = (*FLAGS, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 MAIN = """
 #include <stdio.h>

@@ -24,7 +24,7 @@ from .runner import Runner
 
 ROWS = 10_000
 STEPS = 2_000  # single observations that are used to measure the time of a step
-FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-Werror")
+FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 LONGEST = 300.0  # [s]: time limit of the compiler and of the compiled program
 MAIN = """#include <stdio.h>
 #include <time.h>
