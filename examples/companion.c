@@ -144,7 +144,7 @@ int main(int count, char **words)
         memcpy(payload + 20, target, sizeof target);
         payload[36] = link.system, payload[37] = link.component, payload[38] = RATES_ONLY;
         send_message(&link, ATTITUDE_TARGET, 49, payload, sizeof payload);
-        printf("%s: %.2f %.2f %.2f m, command %.2f m/s2 %.2f %.2f %.2f rad/s\n", link.is_offboard ? "policy" : "pilot",
-               link.p[0], link.p[1], link.p[2], u[0], u[1], u[2], u[3]);
+        if (tick % 50 == 0) printf("%s: %.2f %.2f %.2f m, %.2f m/s2, %.2f %.2f %.2f rad/s\n", was_offboard ? "policy"
+               : "pilot", link.p[0], link.p[1], link.p[2], u[0], u[1], u[2], u[3]);
     }
 }

@@ -3,6 +3,7 @@
 The flights need real time, so they are slow.
 """
 
+import os
 import re
 import shutil
 import signal
@@ -18,13 +19,14 @@ from jax import random
 
 from helpers import tiny_preset
 from retrim import Scenario
-from retrim.config import load
+from retrim.config import changed, load
 from retrim.config.setup import Setup
 from retrim.export.c_header import write_c
 from retrim.export.c_selftest import DAMAGE
 from retrim.export.checking import FLAGS
 from retrim.export.portable import portable_of
 from retrim.onboard.realtime import sleep_until
+from retrim.testing.px4 import MotionCapture, Px4Simulation
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no C compiler")
 
@@ -215,3 +217,61 @@ def test_the_watchdog_ends_the_flight(cause, flight):
     assert (flight.peer.mode, flight.peer.failsafes) == (HOLD, 1)
     assert flight.peer.vehicle.flies
     assert re.fullmatch(r"watchdog: state \d+ ms old, tick -?\d+ ms late\n", flight.process.communicate()[1])
+
+
+PX4 = os.environ.get("RETRIM_PX4", "")
+SIH = Path(__file__).parents[2] / "examples" / "px4_sih.toml"
+
+
+class Px4Pilot:
+    """A pilot who flies PX4's simulation by position setpoints, and the motion capture beside it."""
+
+    def __init__(self):
+        self.cameras = MotionCapture()
+        self.link = self.cameras.link
+
+    def run(self, seconds, *, place=None):
+        """Fly on; return the true positions every 0.1 s."""
+        positions = []
+        for _ in range(round(10 * seconds)):
+            if place is not None:
+                self.link.fly_to(place, EAST)
+            self.cameras.step(time.monotonic() + 0.1)
+            positions.append(self.link.truth.p if self.link.truth else np.full(3, np.inf))
+        return np.array(positions)
+
+
+@pytest.mark.skipif(not PX4, reason="RETRIM_PX4 names no unpacked PX4")
+@pytest.mark.px4
+def test_it_hovers_through_px4_and_px4_falls_back_when_it_is_paused(tmp_path):
+    setup = Setup.from_preset(changed(load("hover/retrim"), vehicle=str(SIH)))
+    with jax.numpy_dtype_promotion("standard"):
+        program = build(tmp_path, setup.pretrained(), setup)
+    with Px4Simulation(Path(PX4), tmp_path):
+        pilot = Px4Pilot()
+        try:
+            pilot.run(12.0, place=GOAL)
+            pilot.link.command(176, 1.0, *map(float, OFFBOARD))
+            pilot.link.command(400, 1.0)
+            pilot.run(12.0, place=GOAL)
+            assert (pilot.link.armed, pilot.link.mode) == (True, OFFBOARD)
+            words = [program, "14540", "0.49"]
+            process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            try:
+                pilot.run(0.5, place=GOAL)
+                errors = np.linalg.norm(pilot.run(15.0)[30:] - GOAL, axis=1)
+                print(f"error [m] from 3 to 15 s: mean {errors.mean():.3f}, largest {errors.max():.3f}")
+                assert pilot.link.mode == OFFBOARD
+                assert errors.mean() < 0.15
+                assert process.poll() is None
+                process.send_signal(signal.SIGSTOP)
+                pilot.run(0.3)
+                process.send_signal(signal.SIGCONT)
+                pilot.run(3.0)
+                assert process.poll() == WATCHDOG
+                assert pilot.link.mode != OFFBOARD
+            finally:
+                process.kill()
+                process.communicate()
+        finally:
+            pilot.link.close()
