@@ -3,7 +3,7 @@
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -80,7 +80,8 @@ def animate(
 
     end, frames = max(float(actor.t[-1]) for actor in actors), list[Image.Image]()
     with sheet((9.0, 5.0), 9.0) as figure:
-        canvas, stage = FigureCanvasAgg(figure), _Stage(figure, title, actors, spans, end)
+        canvas: Any = FigureCanvasAgg(figure)  # matplotlib states no types for its methods
+        stage = _Stage(figure, title, actors, spans, end)
         figure.set_dpi(width / 9.0)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # the layout of the first frame remains
