@@ -10,7 +10,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.config.vehicles import make_vehicle
@@ -25,9 +25,9 @@ MASS, INERTIA, ROTOR_MAX = 1.0, (0.03, 0.03, 0.06), 20.0  # [kg], [kg m^2], [N]
 ARM, TORQUE_RATIO = 0.235 / 2.0**0.5, 0.013  # [m]: rotors at the corners of a square, 0.235 m from the centre
 LINEAR_DRAG, QUADRATIC_DRAG = (0.3, 0.3, 0.0), 0.08  # per mass: [1/s] and [1/m]
 LOSS, LOSS_SCALE, NOISE = 0.1, 1.3, 0.02  # an input u loses LOSS (u / LOSS_SCALE)^2; its noise is NOISE sqrt(u)
-RATES_MAX = (20.0, 20.0, 3.0)  # [rad/s], of the on-board rate loop
-RATE_GAINS = (50.0, 50.0, 5.0)  # [1/s], of the on-board rate loop; the rotors have little torque about z
-YAW_SHARE = 0.8  # largest share of a rotor's mean thrust that yaw may add or remove
+RATES_MAX = (35.0, 35.0, 3.0)  # [rad/s], of the on-board rate loop; without drag, the lemniscate needs 31 at 12 m/s
+RATE_GAINS = (20.0, 20.0, 5.0)  # [1/s], of the on-board rate loop; twice as fast, attitude steps exceed the torque
+LEAST_AUTHORITY = 1.25  # [N] by which torque may change a rotor's thrust, even if the collective thrust is smaller
 
 
 class NoisyState(eqx.Module):
@@ -78,10 +78,7 @@ class SimplifiedQuadrotor(AbstractSubstepDynamics[NoisyState]):
         key, draw = random.split(s.key)
         inertia, levers = jnp.array(INERTIA, dtype), jnp.array([ARM, ARM, TORQUE_RATIO], dtype)
         torque = inertia * jnp.array(RATE_GAINS, dtype) * (u.omega - b.omega) + jnp.cross(b.omega, inertia * b.omega)
-        yaw_max = YAW_SHARE * TORQUE_RATIO * MASS * u.c
-        torque = torque.at[2].set(jnp.clip(torque[2], -yaw_max, yaw_max))
-        thrusts = MASS * u.c / 4.0 + signs(dtype).T @ (torque / levers) / 4.0
-        inputs = jnp.clip(thrusts / ROTOR_MAX, 0.0, 1.0)
+        inputs = jnp.clip(mix(MASS * u.c / 4.0, torque / levers / 4.0) / ROTOR_MAX, 0.0, 1.0)
         noise = NOISE * jnp.sqrt(inputs) * random.normal(draw, (4,), dtype)
         acting = effects.gain * ROTOR_MAX * jnp.clip(inputs - LOSS * (inputs / LOSS_SCALE) ** 2 + noise, 0.0, 1.0)
         up = jnp.array([0.0, 0.0, 1.0], dtype)
@@ -91,6 +88,24 @@ class SimplifiedQuadrotor(AbstractSubstepDynamics[NoisyState]):
         force = jnp.sum(acting) * up - drag
         turning = levers * (signs(dtype) @ acting) - jnp.cross(effects.moment / mass, force)
         return NoisyState(rigid_body(b, b.motors, b.integral, force, turning, mass, whole, effects.push), key)
+
+
+def mix(mean: Float[Array, ""], change: Float[Array, "3"]) -> Float[Array, "4"]:
+    """Return the thrust of each rotor [N], with torques that the rotors can produce without a change of their sum.
+
+    Roll and pitch come first, and yaw has what remains. Without this limit, a large torque would cut off rotors at zero
+    and raise the collective thrust: the inertia is large, and at hover the rotors can produce 54 rad/s^2 only.
+
+    Args:
+        mean: Mean thrust of the rotors [N].
+        change: Change of a rotor's thrust for the wanted torque about each axis [N].
+    """
+    room = jnp.minimum(jnp.maximum(mean, LEAST_AUTHORITY), ROTOR_MAX - mean)
+    tilt = signs(mean.dtype)[:2].T @ change[:2]
+    largest = jnp.max(jnp.abs(tilt))
+    tilt = tilt * jnp.minimum(1.0, room / jnp.maximum(largest, 1e-6))
+    rest = jnp.maximum(room - largest, 0.0)
+    return mean + tilt + signs(mean.dtype)[2] * jnp.clip(change[2], -rest, rest)
 
 
 def vehicle_file() -> VehicleSpec:
