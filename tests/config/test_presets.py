@@ -63,7 +63,7 @@ def test_a_hundred_hertz_has_the_same_times():
         ({"actuator_tau": -0.1}, r"actuator_tau: Input should be greater than 0"),
         ({"reward": "sharp"}, r"reward = 'sharp' is for task = 'track', not for 'hover'"),
         ({"reward": "view"}, r"reward = 'view' is for task = 'vision', not for 'hover'"),
-        ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2', 'stiff', 'sharp' or 'view'"),
+        ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2', 'stiff', 'sharp', 'exact' or 'view'"),
     ],
 )
 def test_what_does_not_fit_together(tables, message):

@@ -45,6 +45,8 @@ class GravityView(AbstractView):
     def __call__(self, env: Env, residual: Residual) -> Env:
         """Add the residual to the model; the controller compensates for it (with the frame) and for a rate bias."""
         env = with_lag(env, turning_of(residual))
+        if env.task.observation.previews_residual:
+            return dataclasses.replace(env.with_residual(residual), task=env.task.with_residual(residual))
         return dataclasses.replace(env.with_residual(residual), frame_disturbance=NormLimited(residual, self.limit))
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Key
 
 from ..control.network_policy import NetworkPolicy
 from ..control.policy import AbstractPolicy
+from ..control.thrust_network import ThrustNetwork
 from ..errors import ConfigError
 from ..physics.vehicle import Vehicle
 from .initialisers import make_untrained_policy
@@ -74,4 +75,12 @@ def _perceptron(request: NetworkRequest) -> AbstractPolicy:
     return policy
 
 
+def _thrust(request: NetworkRequest) -> ThrustNetwork:
+    table = request.preset.track
+    if table is None or table.observation != "thrust":
+        raise ConfigError("network 'thrust' needs [track] observation = 'thrust'")
+    return ThrustNetwork.of(request.size, request.vehicle, request.key, request.hidden_sizes)
+
+
 register_network("mlp", _perceptron)
+register_network("thrust", _thrust)

@@ -116,10 +116,10 @@ class Track:
     reference: Printable = "circle"
     """Training reference: circle, figure8, star, a CSV file, module:name, or several of these joined by +. With the
     suffix =max, the pace grows up to the limits of the vehicle."""
-    observation: Literal["blind", "relative", "both", "preview", "flat"] = "both"
+    observation: Literal["blind", "relative", "both", "preview", "flat", "thrust"] = "both"
     """Observation. blind: o = [p, R, v], without the reference; relative: o = [p - p_ref, R, v - v_ref]; both: o = [p,
     R, v, p - p_ref, v - v_ref]; preview: the reference relative to the vehicle, now and up to 0.4 s ahead; flat:
-    preview plus acceleration and jerk."""
+    preview plus acceleration and jerk; thrust: the error and the thrust that the path needs ahead, in body axes."""
     start_spread: Positive = 1.0
     """Largest distance of a start from the reference, per axis [m]."""
     gravity_copies: int = Field(default=0, ge=0, le=100, strict=True)
@@ -130,7 +130,7 @@ class Track:
     @property
     def looks_ahead(self) -> bool:
         """Whether the policy observes the future of its reference, so one policy can follow several references."""
-        return self.observation in ("preview", "flat")
+        return self.observation in ("preview", "flat", "thrust")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -181,9 +181,10 @@ class Preset:
     name: Plain = "hover/paper"
     task: TaskName = "hover"
     """Task: hover, track, vision, or module:name."""
-    reward: Literal["paper", "l2", "stiff", "sharp", "view"] = "paper"
+    reward: Literal["paper", "l2", "stiff", "sharp", "exact", "view"] = "paper"
     """Reward. paper: as printed in the paper; l2: ours, with a tip at the goal in hover; stiff: for hover, with cheap
-    commands and a steep tip; sharp: l2 with a tip at the reference; view: l2 that also keeps keypoints in the image."""
+    commands and a steep tip; sharp: l2 with a tip at the reference; exact: only the errors of
+    sharp, for forces that change the command of the reference; view: l2 that also keeps keypoints in the image."""
     vehicle: Printable | VehicleSpec = "small"
     """Training vehicle: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)
@@ -220,7 +221,7 @@ class Preset:
         for name in ("track", "vision"):
             if getattr(self, name) is not None and self.task != name:
                 raise ValueError(f"a table [{name}] needs task = {name!r}, not {self.task!r}")
-        for reward, task in (("stiff", "hover"), ("sharp", "track"), ("view", "vision")):
+        for reward, task in (("stiff", "hover"), ("sharp", "track"), ("exact", "track"), ("view", "vision")):
             if self.reward == reward and self.task != task and self.task in BUILT_IN_TASKS:
                 raise ValueError(f"reward = {reward!r} is for task = {task!r}, not for {self.task!r}")
         if self.axes == "heading" and self.task in ("track", "vision"):

@@ -20,7 +20,8 @@ from ..tasks.occluded import OccludedKeypoints
 from ..tasks.preview import Preview
 from ..tasks.reference import Reference
 from ..tasks.task import AbstractTask
-from ..tasks.track import AbstractTrack, L2Track, SharpTrack
+from ..tasks.thrust_preview import ThrustPreview
+from ..tasks.track import AbstractTrack, ExactTrack, L2Track, SharpTrack
 from ..tasks.track import Track as PaperTrack
 from ..tasks.tracking_error import RelativeObs, StateAndErrorObs
 from ..tasks.vehicle_obs import VehicleObs
@@ -40,8 +41,9 @@ TRACK_OBSERVATIONS: dict[str, Callable[["TaskRequest", Reference], AbstractObser
     "both": lambda request, reference: StateAndErrorObs(reference, request.state_observation()),
     "preview": lambda request, reference: Preview(reference, *request.observed_commands()),
     "flat": lambda request, reference: Preview(reference, *request.observed_commands(), (LEAD,)),
+    "thrust": lambda request, reference: ThrustPreview(reference, *request.observed_commands()),
 }
-TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "sharp": SharpTrack}
+TRACKS: dict[str, type[AbstractTrack]] = {"paper": PaperTrack, "l2": L2Track, "sharp": SharpTrack, "exact": ExactTrack}
 
 
 @dataclass(frozen=True)

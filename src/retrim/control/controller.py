@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..errors import FrameError
 from ..physics.actuator_response import ActuatorState
+from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
@@ -124,6 +125,20 @@ class AbstractController(eqx.Module, Generic[M]):
         del memory
         return None
 
+    @property
+    def previews_residual(self) -> bool:
+        """Whether the controller uses a learned residual ahead of time, so that its frame does not contain it."""
+        return False
+
+    def with_residual(self, residual: Residual) -> "AbstractController[M]":
+        """Return the same controller with an expected disturbance; by default, it is ignored.
+
+        Args:
+            residual: Acceleration beyond the nominal model, world frame [m/s^2].
+        """
+        del residual
+        return self
+
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractController[M]":
         """Return the same controller for states and commands in ``frame``.
 
@@ -163,6 +178,15 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
     def with_actuators(self, actuators: ActuatorState) -> "PolicyController":
         """Return the same policy with the observation for a vehicle whose thrust and rates are known."""
         return dataclasses.replace(self, observation=self.observation.with_actuators(actuators))
+
+    @property
+    def previews_residual(self) -> bool:
+        """Whether the observation contains a learned residual ahead of time."""
+        return self.observation.previews_residual
+
+    def with_residual(self, residual: Residual) -> "PolicyController":
+        """Return the same policy with the observation of an expected disturbance."""
+        return dataclasses.replace(self, observation=self.observation.with_residual(residual))
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "PolicyController":
         """Return the same policy with the observation in ``frame``."""

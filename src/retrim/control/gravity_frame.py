@@ -129,6 +129,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
                 there = x.p + (self.lead + self.age).astype(x.p.dtype) * x.v
                 change = self.place(there) - self.place(x.p)
                 disturbance = disturbance + self.trust_residual.astype(x.p.dtype) * change
+            if self.inner.previews_residual:
+                disturbance = jnp.zeros_like(x.p)
         observer_state, load, pull = self._observe(observer, memory, t, x, unsteady)
         now = x
         if load is not None:
@@ -140,6 +142,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
         frame = EffectiveGravityFrame.of(limit_norm(disturbance, observer.limit))
         bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
         acting, flying = Command(last.c, last.omega + bias), self.inner
+        if unsteady is not None:
+            flying = flying.with_residual(unsteady)
         if self.actuators is not None:
             acting, flying = self.actuators.command, flying.with_actuators(frame.actuators(self.actuators))
         x = ahead(now, acting, frame.d, self.age.astype(x.p.dtype))

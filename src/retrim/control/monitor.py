@@ -27,11 +27,11 @@ from jaxtyping import Array, Float, Int
 from ..physics.actuator_response import ActuatorState
 from ..physics.command_path import CommandPath, PathState
 from ..physics.path_family import Member
-from ..physics.state import Command, State, where
+from ..physics.state import STANDARD_GRAVITY, Command, State, where
 from ..tasks.task import AbstractTask
 from .condition import Cause, Condition, Stage
 from .controller import AbstractController, PolicyController
-from .gravity_frame import GravityFrame, GravityFrameState
+from .gravity_frame import GravityFrame, GravityFrameState, StateDependentResidual
 from .near_target import NearTarget
 from .policy import AbstractPolicy
 from .swings import Swings
@@ -45,6 +45,9 @@ CALM = 2.0  # swings up to which the estimate has its full weight
 RAMP = 0.2  # [s], rise of the weight of the estimate at the start, since a launch with late measurements disturbs it
 HOLD = 10.0  # [s], waiting time before the first return
 REACH, WIDENING = 0.3, 0.1  # [m] and [m/s], largest error for the base policy after an oscillation, and its growth
+# [1/s^2] and [m]: without a residual that its observation previews, a policy falls behind by about the residual divided
+# by its stiffness, so an adapted flight is worse only beyond this distance.
+STIFFNESS, ALLOWANCE = 50.0, 0.4
 MEAN_TAU = 1.0  # [s], time constant of the mean of the estimate
 
 
@@ -174,8 +177,10 @@ class Monitor(AbstractController[MonitorState]):
         """Return the memory after the tests of this tick."""
         dt, d_hat = self.frame.observer.nominal.dt, s.flight.observer.d_hat
         d = s.d + (dt / MEAN_TAU) * (d_hat - s.d)
-        swings = s.swings.after(d_hat, dt)
-        twin = self._step(s, t, x)
+        known = self._known_force(s, x)
+        # A small part of a large known force, which comes and goes on the path, is not a swing of its own.
+        swings = s.swings.after(d_hat / (1.0 + known / STANDARD_GRAVITY), dt)
+        twin = self._step(s, t, x, jnp.minimum(known / STIFFNESS, ALLOWANCE))
         over = twin.ticks >= round(INTERVAL / dt)
         excess = twin.excess / twin.ticks
         worse = over & (excess > MARGIN)
@@ -207,8 +212,8 @@ class Monitor(AbstractController[MonitorState]):
             hold=jnp.where(fails, 2.0 * s.hold, s.hold),
         )
 
-    def _step(self, s: MonitorState, t: Float[Array, ""], x: State) -> Twin:
-        """Return the twin one tick later."""
+    def _step(self, s: MonitorState, t: Float[Array, ""], x: State, allowance: Float[Array, ""]) -> Twin:
+        """Return the twin one tick later; the vehicle's error may exceed that of the twin by ``allowance`` [m]."""
         nominal, base = self.frame.observer.nominal, dataclasses.replace(self._inner, policy=s.base)
         excess = self.task.error(t, x) - self.task.error(t, s.twin.x)
         near = self.task.error(t, s.twin.x) < LOST  # also false for an error that is not a number
@@ -220,8 +225,17 @@ class Monitor(AbstractController[MonitorState]):
             u, memory = base.with_actuators(path.actuators)(memory, t, at)
             acting, path = self.path(path, u, nominal.dt)
         after = nominal.state(nominal.step(nominal.init(at), acting, s.d))
-        excess = s.twin.excess + jnp.where(near, excess, 0.0)
+        excess = s.twin.excess + jnp.where(near, excess - allowance, 0.0)
         return Twin(after, memory, excess, s.twin.ticks + 1, path)
+
+    def _known_force(self, s: MonitorState, x: State) -> Float[Array, ""]:
+        """Return the size of the residual that the observation previews [m/s^2]; the twin's world lacks this force."""
+        frame, none = self.frame, jnp.zeros_like(x.p[0])
+        if frame.known_residual is None or not frame.inner.previews_residual:
+            return none
+        unsteady = StateDependentResidual(frame.known_residual, jnp.ones_like(none), frame.place)
+        force = unsteady(x, s.flight.observer.commands.newest)
+        return jnp.where(s.stage == Stage.ADAPTED, jnp.sqrt(jnp.sum(force * force)), none)
 
     def _at_hover(self, x: State) -> PathState | None:
         if self.path is None:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics.actuator_response import ActuatorState
+from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import Command, State
@@ -50,6 +51,15 @@ class NearTarget(AbstractController[Any]):
     def with_actuators(self, actuators: ActuatorState) -> "NearTarget":
         """Return the same controller for a tick in which thrust and body rates are known."""
         return NearTarget(self.inner.with_actuators(actuators), self.task, self.reach)
+
+    @property
+    def previews_residual(self) -> bool:
+        """Whether the inner controller uses a learned residual ahead of time."""
+        return self.inner.previews_residual
+
+    def with_residual(self, residual: Residual) -> "NearTarget":
+        """Return the same controller with an expected disturbance."""
+        return NearTarget(self.inner.with_residual(residual), self.task, self.reach)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "NearTarget":
         """Return the same controller for states and commands in ``frame``."""

@@ -6,6 +6,7 @@ from typing import Any, Generic, TypeVar
 from jaxtyping import Array, Float
 
 from ..physics.actuator_response import ActuatorState
+from ..physics.dynamics import Residual
 from ..physics.path_family import Member
 from ..physics.state import Command, State
 from .condition import Condition
@@ -43,6 +44,15 @@ class WrappedController(AbstractController[M], Generic[M]):
     def follow(self: W, estimate: VehicleEstimate) -> W:
         """Return the controller for a vehicle that another process identifies."""
         return self._around(self.inner.follow(estimate))
+
+    @property
+    def previews_residual(self) -> bool:
+        """Whether the inner controller uses a learned residual ahead of time."""
+        return self.inner.previews_residual
+
+    def with_residual(self: W, residual: Residual) -> W:
+        """Return the same controller with an expected disturbance."""
+        return self._around(self.inner.with_residual(residual))
 
     @property
     def identifies(self) -> bool:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..errors import FrameError
 from ..physics.actuator_response import ActuatorState
+from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import PathBelief
 from ..physics.state import STANDARD_GRAVITY, Command, State
@@ -78,6 +79,20 @@ class AbstractObservation(eqx.Module, Generic[M]):
             FrameError: The observation does not support other frames.
         """
         raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
+
+    @property
+    def previews_residual(self) -> bool:
+        """Whether a learned residual belongs into the observation; by default, the frame of flight contains it."""
+        return False
+
+    def with_residual(self, residual: Residual) -> "AbstractObservation[M]":
+        """Return the same observation with an expected disturbance; by default, it is not observed.
+
+        Args:
+            residual: Acceleration beyond the nominal model, world frame [m/s^2].
+        """
+        del residual
+        return self
 
     @property
     def measures_state(self) -> bool:

@@ -11,6 +11,7 @@ from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
+from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
 from ..physics.state import STANDARD_GRAVITY, Command, State
@@ -150,6 +151,15 @@ class AbstractTask(eqx.Module):
     def error(self, t: Float[Array, ""], x: State) -> Float[Array, ""]:
         """Return the error of a state; by default, the distance from the target position [m]."""
         return jnp.sqrt(jnp.sum((x.p - self.target(t)) ** 2))
+
+    def with_residual(self, residual: Residual) -> "AbstractTask":
+        """Return the task with an expected disturbance in its observation; by default, it is not observed.
+
+        Args:
+            residual: Acceleration beyond the nominal model, world frame [m/s^2].
+        """
+        del residual
+        return self
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractTask":
         """Return the same task for states and commands in ``frame``.

@@ -10,6 +10,7 @@ from jax import random
 from jaxtyping import Array, Bool, Float, Key
 
 from ..physics import so3
+from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .abstract_reference import AbstractReference, Point
@@ -89,6 +90,10 @@ class AbstractTrack(AbstractTask):
         """Return the distance to the nearest point on the reference's lap [m]."""
         return self.reference.distance(x.p)
 
+    def with_residual(self, residual: Residual) -> "AbstractTrack":
+        """Return the task with the observation of an expected disturbance."""
+        return dataclasses.replace(self, observation=self.observation.with_residual(residual))
+
     def in_frame(self, frame: EffectiveGravityFrame) -> "AbstractTrack":
         """Return the task with the reference in ``frame``."""
         observation = self.observation.in_frame(frame)
@@ -133,3 +138,17 @@ class SharpTrack(L2Track):
         here = self.reference(t)
         tip = jnp.sqrt(jnp.sum((x.p - here.p) ** 2) + 0.01**2) - 0.01
         return self._reward(here, x, u) - 3.0 * tip
+
+
+class ExactTrack(AbstractTrack):
+    """Tracking with a reward that contains only the errors, with a tip at the reference.
+
+    The command of the reference is not part of it: with drag, a fast path needs a different one.
+    """
+
+    def reward(self, t: Float[Array, ""], x: State, u: Command) -> Float[Array, ""]:
+        """Return -L_H(5 (p - p_ref)) - L_H(v - v_ref) - 3 (sqrt(|p - p_ref|^2 + (1 cm)^2) - 1 cm)."""
+        del u
+        here = self.reference(t)
+        tip = jnp.sqrt(jnp.sum((x.p - here.p) ** 2) + 0.01**2) - 0.01
+        return -huber(5.0 * (x.p - here.p)) - huber(x.v - here.v) - 3.0 * tip

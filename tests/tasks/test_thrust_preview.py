@@ -1,0 +1,118 @@
+"""The thrust preview: invariances of its numbers, and the place of a known disturbance in them."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import random
+from jax.test_util import check_grads
+
+from retrim.config.loading import load
+from retrim.config.setup import Setup
+from retrim.control.network_policy import NetworkPolicy
+from retrim.control.thrust_network import ThrustNetwork
+from retrim.errors import ConfigError
+from retrim.physics import Command, State, so3
+from retrim.physics.effective_gravity import EffectiveGravityFrame
+from retrim.physics.state import STANDARD_GRAVITY
+from retrim.physics.vehicle import small
+from retrim.tasks.free_heading import with_free_heading
+from retrim.tasks.shapes import figure8
+from retrim.tasks.thrust_preview import POINTS, ThrustPreview
+
+REFERENCE = figure8()
+OBSERVATION = ThrustPreview(REFERENCE, jnp.ones(3))
+T = jnp.array(4.3)
+X = State(
+    REFERENCE(T).p + jnp.array([0.1, -0.05, 0.02]), so3.exp(jnp.array([0.2, -0.1, 0.3])), jnp.array([0.5, 1.0, 0.1])
+)
+LAST = Command(jnp.array(9.0), jnp.array([0.1, 0.2, -0.1]))
+
+
+def observe(observation, x=X, last=LAST):
+    return np.asarray(observation(observation.init(x), T, x, last)[0])
+
+
+def constant(a):
+    return lambda x, u: jnp.array(a)
+
+
+def test_a_constant_residual_and_the_frame_of_the_same_push_give_the_same_directions():
+    d = (1.5, -1.0, 0.5)
+    frame = EffectiveGravityFrame.of(jnp.array(d))
+    framed = observe(OBSERVATION.in_frame(frame), frame.state(X), frame.command(LAST))
+    scale = float(frame.scale)
+    plain = observe(OBSERVATION.with_residual(constant(d)))
+    end = 6 + 3 * POINTS
+    np.testing.assert_allclose(framed[:end], scale * plain[:end], atol=1e-5)
+    np.testing.assert_allclose(framed[end : end + 2], plain[end : end + 2], atol=1e-5)
+
+
+def test_a_turn_of_the_vehicle_turns_the_observed_vectors():
+    turn = so3.exp(jnp.array([0.4, 0.2, -0.6]))
+    before, after = (observe(OBSERVATION, State(X.p, R, X.v)) for R in (X.R, so3.mul(X.R, turn)))
+    count = 2 + POINTS
+    vectors = before[: 3 * count].reshape(count, 3)
+    np.testing.assert_allclose(after[: 3 * count].reshape(count, 3), vectors @ np.asarray(turn), atol=1e-5)
+
+
+def test_a_residual_that_depends_on_velocity_is_evaluated_along_the_reference():
+    drag = OBSERVATION.with_residual(lambda x, u: -0.4 * x.v)
+    end = 6 + 3 * POINTS
+    change = (observe(drag) - observe(OBSERVATION))[6:end].reshape(POINTS, 3) * STANDARD_GRAVITY
+    ahead = np.stack([np.asarray(REFERENCE(T + 0.04 * k).v) for k in range(POINTS)])
+    expected = 0.4 * (np.asarray(X.v)[None] + ahead - ahead[:1])
+    np.testing.assert_allclose(change, expected @ np.asarray(X.R), atol=1e-4)
+
+
+def test_the_network_hovers_at_rest():
+    vehicle = small()
+    network = ThrustNetwork.of(OBSERVATION.size, vehicle, random.key(0), (8,))
+    rest = dataclasses.replace(OBSERVATION, reference=figure8(1e-3, 1e-3))
+    x = State.at(rest.reference(T).p)
+    o, _ = rest(rest.init(x), T, x, Command.hover())
+    np.testing.assert_allclose(network(o), np.zeros(4), atol=0.05)
+
+
+@pytest.mark.parametrize("length", [3.0, 8.0])
+def test_a_free_heading_turns_about_the_thrust_axis_at_a_constant_rate(length):
+    free, plain = with_free_heading(figure8(length, 1.0)), figure8(length, 1.0)
+    np.testing.assert_array_equal(free.rows[:, :7], plain.rows[:, :7])
+    rates, own = np.asarray(free.rows[:, 7:10]), np.asarray(plain.rows[:, 7:10])
+    on_lap = np.arange(len(rates)) * float(free.every) > float(free.lap[0]) + 0.02
+    np.testing.assert_allclose(rates[on_lap, 2], rates[on_lap][0, 2], atol=1e-6)
+    # The rate at which the thrust axis tilts does not depend on the heading.
+    np.testing.assert_allclose(np.linalg.norm(rates[:, :2], axis=1), np.linalg.norm(own[:, :2], axis=1), atol=0.02)
+
+
+def test_a_free_heading_closes_the_lap():
+    free = with_free_heading(figure8(8.0, 3.0))
+    start, end = (free(jnp.array(t)).heading for t in (float(free.lap[0]), float(free.lap[1]) - 1e-4))
+    np.testing.assert_allclose([np.cos(start), np.sin(start)], [np.cos(end), np.sin(end)], atol=0.02)
+
+
+def test_the_gradient_of_the_network_is_that_of_finite_differences():
+    network = ThrustNetwork.of(OBSERVATION.size, small(), random.key(1), (8, 8))
+    o = OBSERVATION(OBSERVATION.init(X), T, X, LAST)[0]
+
+    def output(gains, lead):
+        return jnp.sum(dataclasses.replace(network, gains=jnp.asarray(gains), lead=jnp.asarray(lead))(o) ** 2)
+
+    check_grads(output, (network.gains, network.lead), order=1, modes=["rev"], atol=1e-3, rtol=1e-3)
+
+
+def test_feedback_is_limited_so_that_a_distant_vehicle_stays_upright():
+    network = ThrustNetwork.of(OBSERVATION.size, small(), random.key(1), (8,))
+    policy = NetworkPolicy.create(network, small())
+    far = State(X.p + jnp.array([50.0, -30.0, 0.0]), jnp.eye(3), REFERENCE(T).v)
+    u = policy(OBSERVATION(OBSERVATION.init(far), T, far, LAST)[0])
+    assert float(jnp.max(jnp.abs(u.omega))) <= 6.0 + 1e-3
+    assert float(u.c) > 8.0
+
+
+def test_a_network_that_needs_the_thrust_preview_refuses_other_observations():
+    preset = load("track/retrim")
+    preset = dataclasses.replace(preset, pretrain=dataclasses.replace(preset.pretrain, network="thrust"))
+    with pytest.raises(ConfigError, match="needs \\[track\\] observation = 'thrust'"):
+        Setup.from_preset(preset).new_policy(random.key(0))
