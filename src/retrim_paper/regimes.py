@@ -19,6 +19,7 @@ from retrim.config.scenario import Scenario
 from retrim.physics import State, TableEdge
 from retrim.runkit.flights import Flight
 
+from .rotor_benchmark.benchmark import PUBLISHED, SECONDS, benchmark_preset, title_of
 from .slung_load import END, seconds_to_calm
 from .vehicles import DELAY, THRUST_TO_WEIGHT, heavy_quadrotor, slow_quadrotor
 
@@ -208,6 +209,7 @@ def regimes() -> tuple[Regime, ...]:
             "a third of the mass, 3 cm off the centre",
             hover, (Scenario("off-centre=0.03"),), 20.0, at_rest,
         ),
+        *_public_benchmark(on_path),
         Regime(
             "S10 weak rotor, 50 %",
             "one rotor has half of its thrust",
@@ -232,3 +234,20 @@ def regimes() -> tuple[Regime, ...]:
             "gusts", "4 m/s and Dryden turbulence, known vehicle", hover, (Scenario("gusts"),), 20.0, at_rest,
         ),
     )  # fmt: skip
+
+
+def _public_benchmark(score: Score) -> tuple[Regime, ...]:
+    """Return the ten cells of the benchmark of GP-MPC and neural MPC; they command rotor thrusts, and retrim rates."""
+    preset = benchmark_preset()
+    return tuple(
+        Regime(
+            f"S9 {title_of(name)}",
+            "the simulator of neural MPC; they command rotor thrusts, here thrust and body rates",
+            preset,
+            (Scenario(plant="neural-mpc", reference=name),),
+            SECONDS,
+            score,
+            published=values.text(),
+        )
+        for name, values in PUBLISHED.items()
+    )

@@ -10,8 +10,20 @@ from retrim.config.references import make_reference
 from retrim.config.scenario import Scenario
 from retrim.config.vehicles import make_vehicle
 from retrim.physics import Command, ExternalEffects, State, so3
+from retrim.physics.substep import SIGNS
 from retrim.testing import check_plant
-from retrim_paper.rotor_benchmark.plant import LOSS, LOSS_SCALE, SimplifiedQuadrotor, vehicle_file
+from retrim_paper.rotor_benchmark.benchmark import PUBLISHED
+from retrim_paper.rotor_benchmark.plant import (
+    ARM,
+    INERTIA,
+    LEAST_AUTHORITY,
+    LOSS,
+    LOSS_SCALE,
+    ROTOR_MAX,
+    SimplifiedQuadrotor,
+    mix,
+    vehicle_file,
+)
 from retrim_paper.rotor_benchmark.references import NAMES, RADIUS
 
 VEHICLE = make_vehicle(vehicle_file())
@@ -53,6 +65,25 @@ def test_the_body_rates_follow_their_commands():
     np.testing.assert_allclose(end.body.omega, u.omega, atol=0.3)  # rotor noise remains
 
 
+@pytest.mark.parametrize("mean", [0.5, 2.45, 8.0, 19.0])
+@pytest.mark.parametrize("change", [(0.3, -0.2, 0.1), (30.0, 5.0, 2.0), (0.0, 0.0, 9.0)])
+def test_a_large_torque_does_not_change_the_collective_thrust(mean, change):
+    thrusts = np.asarray(mix(jnp.array(mean), jnp.array(change)))
+    np.testing.assert_allclose(thrusts.mean(), mean, rtol=1e-5)
+    assert thrusts.max() <= ROTOR_MAX + 1e-4
+    assert thrusts.min() >= min(0.0, mean - LEAST_AUTHORITY) - 1e-4
+    wanted = np.asarray(SIGNS).T @ np.array(change) + mean
+    if wanted.min() >= 0.0 and wanted.max() <= ROTOR_MAX:
+        np.testing.assert_allclose(thrusts, wanted, rtol=1e-5)
+
+
+def test_a_torque_at_hover_is_limited_to_the_weight_on_the_arm():
+    x = State.at(jnp.array([0.0, 0.0, 1.0]))
+    u = Command(jnp.array(9.80665), jnp.array([30.0, 0.0, 0.0]))
+    after = MODEL.substep(MODEL.init(x), u, CALM)
+    assert 45.0 < float(after.body.omega[0]) / 1e-3 < 9.80665 * ARM / INERTIA[0] + 6.0  # and rotor noise
+
+
 def test_it_is_a_plant_by_name():
     check_plant(Scenario(plant="neural-mpc").make, settle_s=1.5)
 
@@ -67,3 +98,14 @@ def test_trajectories_have_the_published_mean_speed(name):
     np.testing.assert_allclose(mean, float(speed), rtol=2e-3)
     extent = np.ptp(np.asarray(at.p), axis=0)
     np.testing.assert_allclose(extent, [2.0 * RADIUS, (2.0 if shape == "circle" else 1.0) * RADIUS, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_trajectories_are_within_the_limits_of_the_vehicle(name):
+    assert make_reference(name).infeasibility(VEHICLE) is None
+
+
+def test_every_cell_has_its_published_errors():
+    assert tuple(PUBLISHED) == NAMES
+    assert PUBLISHED["lemniscate-5m-12"] == (46, 28)
+    assert all(cell.perfect < cell.learned for cell in PUBLISHED.values())
