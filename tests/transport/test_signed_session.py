@@ -3,6 +3,7 @@
 import os
 import pickle
 import secrets
+import threading
 
 import pytest
 
@@ -76,6 +77,31 @@ def test_messages_arrive_in_both_directions_whoever_was_first(wire):
         assert (read_messages(ground, "out"), read_messages(flight, "into")) == (b"out %d" % i, b"into %d" % i)
     assert flight.refusals == ground.refusals == 0
     assert flight.fault == ground.fault == ""
+
+
+def test_a_repeated_message_does_not_overtake_a_newer_one(wire):
+    """A network that keeps the last message only would lose the newer one."""
+    flight, ground = End(wire, 0), End(wire, 1)
+    flight.publish("out", b"first")
+    newer = threading.Thread(target=flight.publish, args=("out", b"second"))
+    record = flight._send
+
+    def send_slowly(topic, frame):
+        if topic == "out" and not newer.ident:
+            newer.start()
+            newer.join(0.2)
+        record(topic, frame)
+
+    flight._send = send_slowly
+    wire.settle()
+    newer.join(5.0)
+    counts = [
+        HEAD.unpack_from(frame)[3] for topic, frame in [*wire.record, *[f[1:] for f in wire.frames]] if topic == "out"
+    ]
+    assert newer.ident
+    assert counts == sorted(counts)
+    wire.settle()
+    assert ground.latest("out").data == b"second"
 
 
 @pytest.mark.parametrize("again", [0, 1])

@@ -39,6 +39,8 @@ class NetworkBus(Bus):
         self._answering: threading.Thread | None = None
         self._over = False
         self._capacities, self._lock = dict(capacities), threading.Lock()
+        # Held from the choice of a message until it is sent: a repeated message must not overtake a newer one.
+        self._sending = threading.Lock()
         self._last = dict.fromkeys(capacities, Message(0, b""))
         self._versions = dict.fromkeys(capacities, (0, 0))  # writer and its version
         self._me = secrets.randbits(63) + 1
@@ -60,10 +62,11 @@ class NetworkBus(Bus):
     def publish(self, topic: str, data: bytes) -> None:
         """Replace the last message of ``topic``."""
         check_fits(topic, data, self._capacities)
-        with self._lock:
-            message = Message(self._last[topic].version + 1, bytes(data))
-            self._last[topic], self._versions[topic] = message, (self._me, message.version)
-        self._transmit(topic, message)
+        with self._sending:
+            with self._lock:
+                message = Message(self._last[topic].version + 1, bytes(data))
+                self._last[topic], self._versions[topic] = message, (self._me, message.version)
+            self._transmit(topic, message)
 
     def latest(self, topic: str, after: int = 0) -> Message | None:
         """Return the last message of ``topic`` if it is newer than ``after``."""
@@ -133,4 +136,5 @@ class NetworkBus(Bus):
             with self._lock:
                 mine = [topic for topic, (writer, _) in self._versions.items() if writer == self._me]
             for topic in mine:
-                self._transmit(topic, self._last[topic])
+                with self._sending:
+                    self._transmit(topic, self._last[topic])
