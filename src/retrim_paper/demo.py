@@ -66,7 +66,7 @@ def demonstrate(
         seconds: Length of a flight.
         starts: Flights per disturbance and method.
         seed: Seed for training, starts and flights.
-        slow: Whether the second quadrotor is flown.
+        slow: Whether to fly the second quadrotor.
         gif: Whether to write an animation of the second quadrotor.
 
     Returns:

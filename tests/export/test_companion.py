@@ -134,7 +134,7 @@ def test_it_reads_and_writes_messages_as_pymavlink_does(untrained):
 
 
 class Flight:
-    """A pilot, the autopilot of a peer, and the program beside them."""
+    """Start a pilot, the autopilot of a peer, and the program."""
 
     def __init__(self, peer, process):
         self.peer, self.process = peer, process
@@ -224,7 +224,7 @@ SIH = Path(__file__).parents[2] / "examples" / "px4_sih.toml"
 
 
 class Px4Pilot:
-    """A pilot who flies PX4's simulation by position setpoints, and the motion capture beside it."""
+    """Fly PX4's simulation with position setpoints, and send the poses of a motion capture system."""
 
     def __init__(self):
         self.cameras = MotionCapture()

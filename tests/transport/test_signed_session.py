@@ -38,7 +38,7 @@ class Wire:
         self.ends, self.frames, self.record = [], [], []
 
     def settle(self):
-        """Carry messages until none is left."""
+        """Deliver all messages."""
         for _ in range(20):
             for end in self.ends:
                 end._attend()

@@ -183,8 +183,8 @@ class Preset:
     """Task: hover, track, vision, or module:name."""
     reward: Literal["paper", "l2", "stiff", "sharp", "exact", "view"] = "paper"
     """Reward. paper: as printed in the paper; l2: ours, with a tip at the goal in hover; stiff: for hover, with cheap
-    commands and a steep tip; sharp: l2 with a tip at the reference; exact: only the errors of
-    sharp, for forces that change the command of the reference; view: l2 that also keeps keypoints in the image."""
+    commands and a steep tip; sharp: l2 with a tip at the reference; exact: the errors of sharp
+    without its commands, for drag that changes the commands; view: l2 that also keeps keypoints in the image."""
     vehicle: Printable | VehicleSpec = "small"
     """Training vehicle: small, large, kingfisher, module:name, or a vehicle file."""
     dt: float = Field(default=0.02, ge=0.002, le=0.1, strict=True)

@@ -48,7 +48,7 @@ def self_test(name: str, policy: Portable) -> list[str]:
     has_step = policy.observation is not None
     return [
         *_hash(name),
-        *_missed(name),
+        *_deviation(name),
         "/* Runs all cases; returns 0 or the number of the first that fails, and writes the largest deviation. */",
         f"static inline int {name}_run_cases(float *worst)",
         "{",
@@ -69,7 +69,7 @@ def self_test(name: str, policy: Portable) -> list[str]:
         "                            j & 1 ? 1e30f : -1e30f};",
         f"        if (!{name}_bound(y, command)) return {LIMITS};",
         f"        for (int i = 0; i < 4; ++i) before[i] = y[i] > 0.0f ? {name}_high[i] : {name}_low[i];",
-        f"        if ({name}_missed(command, before) > {name.upper()}_TOLERANCE) return {LIMITS};",
+        f"        if ({name}_deviation(command, before) > {name.upper()}_TOLERANCE) return {LIMITS};",
         "    }",
         f"    for (int k = 0; k < {len(BAD)} * {size}; ++k) {{",
         f"        float spoilt[{size}];",
@@ -81,9 +81,9 @@ def self_test(name: str, policy: Portable) -> list[str]:
         "    *worst = 0.0f;",
         f"    for (int k = 0; k < {n}; ++k) {{",
         f"        const int finite = {name}_command({name}_test_observations + {size} * k, command);",
-        f"        const float missed = finite ? {name}_missed(command, {name}_test_commands + 4 * k) : 1.0f;",
-        f"        if (!first && missed > {name.upper()}_TOLERANCE) first = {VECTORS} + k;",
-        "        if (missed > *worst) *worst = missed;",
+        f"        const float deviation = finite ? {name}_deviation(command, {name}_test_commands + 4 * k) : 1.0f;",
+        f"        if (!first && deviation > {name.upper()}_TOLERANCE) first = {VECTORS} + k;",
+        "        if (deviation > *worst) *worst = deviation;",
         "    }",
         *(_flight(name, len(policy.test_flight)) if has_step else []),
         "    return first;",
@@ -156,15 +156,15 @@ def _hash(name: str) -> list[str]:
     ]
 
 
-def _missed(name: str) -> list[str]:
+def _deviation(name: str) -> list[str]:
     return [
         "/* Largest difference between two finite commands, as a fraction of the range. */",
-        f"static inline float {name}_missed(const float *command, const float *expected)",
+        f"static inline float {name}_deviation(const float *command, const float *expected)",
         "{",
         "    float worst = 0.0f;",
         "    for (int j = 0; j < 4; ++j) {",
-        f"        const float missed = fabsf(command[j] - expected[j]) / ({name}_high[j] - {name}_low[j]);",
-        "        if (missed > worst) worst = missed;",
+        f"        const float deviation = fabsf(command[j] - expected[j]) / ({name}_high[j] - {name}_low[j]);",
+        "        if (deviation > worst) worst = deviation;",
         "    }",
         "    return worst;",
         "}",
@@ -181,9 +181,9 @@ def _flight(name: str, ticks: int) -> list[str]:
         f"    for (int tick = 0; tick < {ticks}; ++tick) {{",
         f"        const float *x = {name}_test_states + 15 * tick;",
         f"        const int finite = {name}_step(&undisturbed, x, x + 3, x + 12, before);",
-        f"        const float missed = finite ? {name}_missed(before, {name}_test_flight + 4 * tick) : 1.0f;",
-        f"        if (!first && missed > {name.upper()}_TOLERANCE) first = {TICKS} + tick;",
-        "        if (missed > *worst) *worst = missed;",
+        f"        const float deviation = finite ? {name}_deviation(before, {name}_test_flight + 4 * tick) : 1.0f;",
+        f"        if (!first && deviation > {name.upper()}_TOLERANCE) first = {TICKS} + tick;",
+        "        if (deviation > *worst) *worst = deviation;",
         f"        if ({name}_step(&memory, x, x + 3, x + 12, command) != finite",
         "            || memcmp(command, before, sizeof before)) {",
         "            *worst = 1.0f;",

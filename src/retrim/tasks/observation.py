@@ -138,6 +138,20 @@ class AbstractObservation(eqx.Module, Generic[M]):
         return None
 
 
+def with_command(
+    memory: Float[Array, "history 4"], last: Command, omega_max: Float[Array, "3"]
+) -> Float[Array, "history 4"]:
+    """Return the scaled last commands, oldest first, after one more command.
+
+    Args:
+        memory: Scaled commands until now.
+        last: Command in the past tick: thrust [m/s^2] and body rates [rad/s].
+        omega_max: Largest body rates of the vehicle [rad/s].
+    """
+    scaled_command = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / omega_max])
+    return jnp.concatenate([memory, scaled_command[None]])[1:]
+
+
 class StateObs(AbstractObservation[Float[Array, "history 4"]]):
     """o = [p, R, v] and the last ``history`` commands, oldest first: 15 + 4 ``history`` numbers.
 
@@ -163,8 +177,7 @@ class StateObs(AbstractObservation[Float[Array, "history 4"]]):
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
         """Return the scaled state and commands."""
-        scaled_command = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
-        memory = jnp.concatenate([memory, scaled_command[None]])[1:]
+        memory = with_command(memory, last, self.omega_max)
         state = jnp.concatenate([(x.p - self.origin) / POSITION_SCALE, x.R.reshape(9), x.v / VELOCITY_SCALE])
         return jnp.concatenate([state, memory.reshape(-1)]), memory
 

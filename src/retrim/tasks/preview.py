@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics.effective_gravity import EffectiveGravityFrame
-from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..physics.state import Command, State
 from .abstract_reference import AbstractReference
-from .observation import VELOCITY_SCALE, AbstractObservation
+from .observation import VELOCITY_SCALE, AbstractObservation, with_command
 
 POSITIONS = (0.0, 0.08, 0.16, 0.28, 0.4)  # [s] ahead
 VELOCITIES = (0.0, 0.2)
@@ -42,8 +42,7 @@ class Preview(AbstractObservation[Float[Array, "history 4"]]):
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
         """Return the reference relative to the vehicle, in world axes, with attitude, velocity and commands."""
-        scaled_command = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
-        memory = jnp.concatenate([memory, scaled_command[None]])[1:]
+        memory = with_command(memory, last, self.omega_max)
         # Evaluate all instants at once, since each separate evaluation of a reference would be compiled again.
         first, second = len(POSITIONS), len(POSITIONS) + len(VELOCITIES)
         ahead = jax.vmap(self.reference)(t + jnp.array((*POSITIONS, *VELOCITIES, *self.accelerations), dtype=t.dtype))

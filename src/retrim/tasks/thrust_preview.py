@@ -1,9 +1,9 @@
 """Observation of a tracking policy in body axes: the tracking error, and the thrust that the path needs from now on.
 
-A point mass obeys e'' = R c e3 - f(t), where e is the tracking error and f = a_ref + g e3 - d the mass-normalised
-thrust that the path needs, with the expected disturbance d. The path, the gravity and the disturbance enter only
-through f. In body axes, a policy therefore sees the same numbers for every position, heading, tilt and direction of
-gravity, and a disturbance that is known ahead is one more part of the path.
+The tracking error e of a point mass follows e'' = R c e3 - f(t). Here, f = a_ref + g e3 - d is the mass-normalised
+thrust that the path needs, and d is the expected disturbance. Path, gravity and disturbance appear only in f. In body
+axes, a policy therefore receives the same numbers for every position, heading, tilt and direction of gravity. A
+disturbance that is known ahead is one more part of the path.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from .abstract_reference import AbstractReference, Point
-from .observation import AbstractObservation
+from .observation import AbstractObservation, with_command
 
 POINTS, STEP = 7, 0.04  # number of previewed thrusts, and the time between them [s]
 POSITION_SCALE = 0.5  # [m]
@@ -68,8 +68,7 @@ class ThrustPreview(AbstractObservation[Float[Array, "history 4"]]):
         self, memory: Float[Array, "history 4"], t: Float[Array, ""], x: State, last: Command
     ) -> tuple[Float[Array, " o"], Float[Array, "history 4"]]:
         """Return the tracking error and the previewed thrust in body axes, with the nose and the last commands."""
-        scaled_command = jnp.concatenate([(last.c / STANDARD_GRAVITY - 1.0)[None], last.omega / self.omega_max])
-        memory = jnp.concatenate([memory, scaled_command[None]])[1:]
+        memory = with_command(memory, last, self.omega_max)
         scale, push = jnp.ones_like(x.p[0]), jnp.zeros_like(x.p)
         if self.frame is not None:
             x, last = self.frame.world_state(x), self.frame.world_command(last)
