@@ -16,9 +16,10 @@ HOVER = np.array([9.81, 0.0, 0.0, 0.0])
 class PointVehicle(VehiclePlant):
     """It stands at the origin, is pushed, and does what ``faults`` say."""
 
-    def __init__(self, request, *, push=(0.3, -0.2, 0.1), never_arms=False, lost_after=None):
+    def __init__(self, request, *, push=(0.3, -0.2, 0.1), never_arms=False, lost_after=None, lands_in=0.0):
         super().__init__(request.dt, np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0]))
         self.push, self.never_arms, self.lost_after = push, never_arms, lost_after
+        self.lands_in = lands_in
         self.x, self.u, self.at, self.flying, self.reads = None, HOVER, 0.0, False, 0
 
     def connect(self, keep_on=lambda: True):
@@ -60,6 +61,8 @@ class PointVehicle(VehiclePlant):
         time.sleep(max(0.0, until - time.monotonic()))
 
     def land(self):
+        if self.flying:
+            time.sleep(self.lands_in)
         self.flying, self.x = False, None
 
 
@@ -68,4 +71,5 @@ def entry(**faults):
 
 
 point, unarmed, lost = entry(), entry(never_arms=True), entry(lost_after=40)
+slow_to_land = entry(lands_in=3.0)
 calm = entry(push=(0.0, 0.0, 0.0))

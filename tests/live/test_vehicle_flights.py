@@ -83,6 +83,12 @@ def test_it_is_flown_from_the_hand_over_to_the_landing(spec):
     assert np.linalg.norm(flying[-1, 3:6] - HOME) < 0.3
 
 
+def test_a_slow_landing_is_not_a_hang(spec):
+    status, _ = fly_once(replace(spec, layers=(), scenario=Scenario(plant="fake_vehicle:slow_to_land")))
+    assert status.end_reason == "landed"
+    assert not status.hangs
+
+
 @pytest.fixture
 def alone(spec):
     """The same without learners."""

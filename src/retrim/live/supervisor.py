@@ -15,7 +15,7 @@ from ..onboard.heartbeat import Heart
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import STOPPED, last_height, last_note, last_send_time, pack_note, ticks_of
 from ..onboard.note_fields import plain
-from ..onboard.pulses import SILENCE, Pulses
+from ..onboard.pulses import SILENCE, Pulses, is_last_command
 from ..onboard.realtime import cores_of
 from ..onboard.recorder import Recorder
 from ..transport.message import describe
@@ -212,7 +212,8 @@ class Supervisor:
 
     def _end_hanging(self) -> None:
         """End processes that are alive but silent."""
-        for role in self._pulses.hanging([role for role in self.processes if self._alive(role)]):
+        allowances = {"plant": LANDING} if is_last_command(self.bus) else {}
+        for role in self._pulses.hanging([role for role in self.processes if self._alive(role)], allowances):
             self.hangs[role] = self.hangs.get(role, 0) + 1
             self._end(role)
 

@@ -1,13 +1,18 @@
 """Detect a flight's hanging processes, which are alive but do not send heartbeats."""
 
+import contextlib
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 
+from ..errors import MessageError
 from ..transport.bus import Bus
 from .heartbeat import beat_topic
+from .messages import Setpoint
 
 SILENCE = 2.0  # [s] without a heartbeat, after which a process counts as hanging
 LOOK = 0.25  # [s], longest silence that one check adds, since a stall of the machine is not silence of the process
+NO_ALLOWANCES: Mapping[str, float] = MappingProxyType({})
 
 
 class Pulses:
@@ -35,23 +40,36 @@ class Pulses:
         self._versions[role], self._silent[role] = self._version(role), 0.0
         self._allowances[role] = self._silence if within is None else within
 
-    def hanging(self, roles: Iterable[str]) -> list[str]:
+    def hanging(self, roles: Iterable[str], allowances: Mapping[str, float] = NO_ALLOWANCES) -> list[str]:
         """Return the processes that have been silent for too long.
 
         Args:
             roles: Processes that are alive. Other processes and those without expected heartbeats are not checked.
+            allowances: Longer time limits for some of the roles, at this check [s].
         """
         now = self._clock()
         elapsed, self._last = min(now - self._last, LOOK), now
-        return [role for role in roles if role in self._versions and self._hangs(role, elapsed)]
+        return [role for role in roles if role in self._versions and self._hangs(role, elapsed, allowances)]
 
-    def _hangs(self, role: str, elapsed: float) -> bool:
+    def _hangs(self, role: str, elapsed: float, allowances: Mapping[str, float]) -> bool:
         if self._version(role) != self._versions[role]:
             self.expect(role)
             return False
         self._silent[role] += elapsed
-        return self._silent[role] > self._allowances[role]
+        return self._silent[role] > max(self._allowances[role], allowances.get(role, 0.0))
 
     def _version(self, role: str) -> int:
         message = self._bus.latest(beat_topic(role))
         return 0 if message is None else message.version
+
+
+def is_last_command(bus: Bus) -> bool:
+    """Return whether control or the watchdog has published the last command of the flight.
+
+    After it, the process of the plant publishes no samples, although its autopilot may need seconds for the landing.
+    """
+    for message in map(bus.latest, ("setpoint", "fallback")):
+        with contextlib.suppress(MessageError):
+            if message is not None and Setpoint.unpack(message.data).is_final:
+                return True
+    return False
