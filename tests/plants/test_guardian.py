@@ -1,0 +1,174 @@
+"""A guardian commands the vehicle of a link that was killed, and does not interfere with other links."""
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+import tty
+
+import numpy as np
+import pytest
+
+from retrim import ConfigError
+from retrim.plants.bridges import guardian
+from retrim.plants.bridges.guardian import Guardian, Phase, SafeCommands
+
+FRAME = struct.Struct("<2d")  # thrust per mass [m/s^2], tilt [rad]
+AWAY, SINK, STOP = (FRAME.pack(*each) for each in ((10.0, 0.2), (9.3, 0.0), (0.0, 0.0)))
+SINKS_S, STOPS_S, PERIOD = 1.0, 0.2, 0.02
+COMMANDS = SafeCommands((Phase((SINK,), PERIOD, SINKS_S), Phase((STOP,), PERIOD, STOPS_S)))
+G = 9.81
+LATE_S = 0.5  # [s] by which a process without real-time priority may be late while other tests use all cores
+
+# Its program is loaded by its path, because a package that imports JAX would take seconds in each of these processes.
+LINK = """
+import importlib.util, os, sys, time
+spec = importlib.util.spec_from_file_location("guardian", sys.argv[1])
+guardian = sys.modules["guardian"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(guardian)
+descriptor, to, away, ends = int(sys.argv[2]), eval(sys.argv[3]), bytes.fromhex(sys.argv[4]), sys.argv[6]
+phases = tuple(guardian.Phase((bytes.fromhex(data),), *times) for data, *times in eval(sys.argv[5]))
+guard = guardian.Guardian(guardian.SafeCommands(phases), descriptor, to)
+send = guardian.sender_of(os.dup(descriptor), to)
+until = time.monotonic() + (0.3 if ends else 60.0)
+while time.monotonic() < until:
+    if ends != "before it commands":
+        send(away, 0.1)
+        guard.feed()
+    time.sleep(0.02)
+if ends == "released":
+    guard.release()
+"""
+
+
+class Stack:
+    """A flight stack that holds its last command for ever, and a link to it in a process of its own."""
+
+    def __init__(self, kind, ends=""):
+        self.kind, self.frames = kind, []
+        """Arrival [s], thrust per mass and tilt of each command."""
+        to = None
+        if kind == "udp":
+            self._mine, theirs = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+            self._mine.bind(("127.0.0.1", 0))
+            to = self._mine.getsockname()
+        elif kind == "tcp":
+            with socket.create_server(("127.0.0.1", 0)) as server:
+                theirs = socket.create_connection(server.getsockname())
+                self._mine = server.accept()[0]
+        else:
+            mine, line = os.openpty()
+            tty.setraw(line)
+            self._mine, theirs = (os.fdopen(each, "r+b", buffering=0) for each in (mine, line))
+        phases = [(each.packets[0].hex(), each.period, each.duration) for each in COMMANDS.phases]
+        words = [guardian.__file__, theirs.fileno(), to, AWAY.hex(), phases, ends]
+        self.link = subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", LINK, *map(str, words)], pass_fds=[theirs.fileno()],
+            start_new_session=True,
+        )  # fmt: skip
+        theirs.close()
+
+    def listen(self, seconds):
+        """Receive commands."""
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0.0:
+            if select.select([self._mine], [], [], left)[0]:
+                with contextlib.suppress(OSError):  # a line, when its last holder has closed it
+                    data = os.read(self._mine.fileno(), 4096)
+                    now = time.monotonic()
+                    self.frames += [(now, *values) for values in FRAME.iter_unpack(data)]
+                    if data:
+                        continue
+                time.sleep(0.01)
+
+    def close(self):
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.link.pid, signal.SIGKILL)
+        self.link.wait()
+        self._mine.close()
+
+    def commands(self, since, tilt):
+        """Arrivals of the commands with a tilt, from an instant on."""
+        return [at for at, _, each in self.frames if each == tilt and at > since]
+
+    def speed(self, since, until):
+        """Horizontal speed that a vehicle has gained between two instants, with the last command held [m/s]."""
+        frames = [frame for frame in self.frames if frame[0] <= since][-1:]
+        frames += [frame for frame in self.frames if since < frame[0] <= until]
+        times = np.array([since, *(frame[0] for frame in frames[1:]), until])
+        return float(sum(dt * c * np.sin(tilt) for dt, (_, c, tilt) in zip(np.diff(times), frames, strict=True)))
+
+
+@pytest.fixture
+def stack(request):
+    result = Stack(*request.param)
+    yield result
+    result.close()
+
+
+def of(*kinds, ends=""):
+    return pytest.mark.parametrize("stack", [(kind, ends) for kind in kinds], indirect=True, ids=kinds)
+
+
+@of("udp", "tcp", "serial")
+def test_a_vehicle_whose_link_is_killed_with_its_group_does_not_fly_away(stack):
+    stack.listen(0.8)
+    assert stack.commands(0.0, 0.2)
+    assert not stack.commands(0.0, 0.0)  # the guardian is silent while the link commands
+    killed = time.monotonic()
+    os.killpg(stack.link.pid, signal.SIGKILL)
+    stack.listen(LATE_S + SINKS_S + STOPS_S + 1.0)
+    end = time.monotonic()
+    safe = stack.commands(killed, 0.0)
+    assert abs(stack.speed(killed, end)) < 10.0 * np.sin(0.2) * LATE_S
+    assert len(safe) > 0.5 * (SINKS_S + STOPS_S) / PERIOD
+    assert stack.frames[-1][1:] == (0.0, 0.0)  # the last phase is the last command
+    assert safe[-1] - safe[0] == pytest.approx(SINKS_S + STOPS_S, abs=LATE_S)
+
+
+@of("udp")
+def test_a_link_that_is_silent_is_replaced_until_it_commands_again(stack):
+    stack.listen(0.6)
+    stack.link.send_signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    stack.listen(COMMANDS.timeout + LATE_S)
+    (first, *_), held = stack.commands(stopped, 0.0), stack.commands(0.0, 0.2)[-1]
+    assert first - held > 0.5 * COMMANDS.timeout
+    stack.link.send_signal(signal.SIGCONT)
+    stack.listen(LATE_S)
+    back = time.monotonic()
+    stack.listen(0.4)
+    assert stack.commands(back, 0.2)
+    assert not stack.commands(back, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("stack", "safe"), [(("udp", "released"), False), (("udp", "before it commands"), False), (("udp", "exit"), True)],
+    indirect=["stack"], ids=["released", "before it commands", "exit"],
+)  # fmt: skip
+def test_only_a_link_that_has_commanded_and_does_not_release_it_is_replaced(stack, safe):
+    stack.listen(1.0 + LATE_S)
+    assert stack.link.wait(5.0) == 0
+    assert bool(stack.commands(0.0, 0.0)) == safe
+
+
+def test_it_starts_no_phase_of_no_time():
+    for phases, timeout in (((), 0.25), ((Phase((b"x",), 0.0, 1.0),), 0.25), (COMMANDS.phases, float("nan"))):
+        with pytest.raises(ConfigError, match="expected phases and times"):
+            SafeCommands(phases, timeout)
+
+
+def test_a_guardian_that_has_ended_stops_no_link():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        guard = Guardian(COMMANDS, line.fileno(), ("127.0.0.1", 9))
+        guard.process.kill()
+        guard.process.wait()
+        for _ in range(3):
+            guard.feed()
+        guard.release()
+        guard.release()
