@@ -27,9 +27,9 @@ def fly(folder, monkeypatch, more, seconds=25.0):
     plant, sensors = Scenario(plant="betaflight").make("small"), []
     configure, packet = betaflight_firmware.settings, betaflight_world.state_packet
 
-    def spy(omega, force):
+    def spy(omega, force, R):
         sensors.append((time.monotonic(), *omega, *force))
-        return packet(omega, force)
+        return packet(omega, force, R)
 
     monkeypatch.setattr(betaflight_firmware, "settings", lambda steps: [*configure(steps), *LOGS, *more])
     monkeypatch.setattr(betaflight_world, "state_packet", spy)

@@ -55,6 +55,7 @@ for _name, _place in {
     "crazyflie": "retrim.plants.bridges.crazyflie:entry",
     "ros2": "retrim.plants.bridges.ros2:entry",
     "ros": "retrim.ros1.plant:entry",
+    "msp": "retrim.plants.bridges.msp_plant:entry",
     "betaflight": "retrim.plants.bridges.betaflight:entry",
 }.items():
     PLANTS.register_place(_name, _place)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -51,12 +52,13 @@ def find_firmware() -> Path:
 class Firmware:
     """A configured, running board with its own folder."""
 
-    def __init__(self, program: Path, steps: int) -> None:
+    def __init__(self, program: Path, steps: int, more: Sequence[str] = ()) -> None:
         """Start a board, configure it, save the settings and start it again.
 
         Args:
             program: The firmware.
             steps: Body rate at full stick, in units of 10 deg/s.
+            more: Further lines for its command line.
 
         Raises:
             PlantError: The board does not start, or refuses a setting.
@@ -68,7 +70,7 @@ class Firmware:
         self._process: subprocess.Popen[bytes] | None = None
         try:
             self._start()
-            self._configure(settings(steps))
+            self._configure([*settings(steps), *more])
             board = self._start()
             for thread in os.listdir(f"/proc/{board}/task"):  # not earlier: its busy loop would starve the others
                 in_real_time(int(thread))

@@ -1,6 +1,7 @@
 """UDP packets to and from Betaflight's simulated board (SITL, 4.6), little endian."""
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,26 +14,32 @@ THROTTLE_FROM, THROTTLE_SPAN = 1050.0, 950.0  # [us]: start and length of the th
 IDLE = 0.055  # smallest share of a motor's range while the board is armed
 CHANNELS, ARM = 16, 4  # number of receiver channels, and index of the one that arms
 REST = np.array([0.0, 0.0, STANDARD_GRAVITY])
+LEVEL = np.eye(3)
 GYRO = np.array([1.0, -1.0, -1.0])  # from forward-left-up body rates
 RATE_STICKS = np.array([1.0, 1.0, -1.0])  # roll, pitch and yaw up, from forward-left-up body rates
 OUR_ROTORS = [0, 1, 3, 2]  # the board's are front-right, back-left, front-left, back-right; our last two are swapped
 _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct.Struct("<4f")
 
 
-def state_packet(omega: np.ndarray, specific_force: np.ndarray = REST) -> bytes:
-    """Return a packet with body rates and a specific force; a board in rate mode flies by the rates alone.
+def state_packet(omega: np.ndarray, specific_force: np.ndarray = REST, R: np.ndarray = LEVEL) -> bytes:
+    """Return a packet with body rates, a specific force and an attitude; in rate mode a board flies by the rates alone.
 
     The time stamp is constant, so the board uses its own clock, which the jitter of varying stamps would disturb.
 
     Args:
         omega: Body rates, forward-left-up [rad/s].
         specific_force: Specific force, forward-left-up [m/s^2], which the board writes to its Blackbox.
+        R: Attitude, body to world, by which the board levels the vehicle in ANGLE mode.
     """
-    still = (*-specific_force, 1.0, 0.0, 0.0, 0.0, *(0.0,) * 6, 101325.0)
-    return _STATE.pack(1.0, *(GYRO * omega), *still)
+    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
+
+    q = np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1)
+    return _STATE.pack(1.0, *(GYRO * omega), *-specific_force, *q, *(0.0,) * 6, 101325.0)
 
 
-def sticks_packet(throttle: float, omega: np.ndarray, fastest: float, *, armed: bool) -> bytes:
+def sticks_packet(
+    throttle: float, omega: np.ndarray, fastest: float, *, armed: bool, switches: Sequence[int] = ()
+) -> bytes:
     """Return a receiver packet.
 
     Args:
@@ -40,11 +47,13 @@ def sticks_packet(throttle: float, omega: np.ndarray, fastest: float, *, armed: 
         omega: Body rates, forward-left-up [rad/s].
         fastest: Body rate at full stick [rad/s].
         armed: Whether the arming switch is on.
+        switches: Channels after the one that arms [us]; the others are low.
     """
     roll, pitch, yaw = np.clip(CENTRE + SPAN * RATE_STICKS * omega / fastest, LOW, HIGH).round().astype(int)
     up = round(float(np.clip(THROTTLE_FROM + THROTTLE_SPAN * throttle, LOW, HIGH))) if throttle > 0.0 else LOW
     channels = [int(roll), int(pitch), up, int(yaw)] + [LOW] * (CHANNELS - ARM)
     channels[ARM] = HIGH if armed else LOW
+    channels[ARM + 1 : ARM + 1 + len(switches)] = switches
     return _STICKS.pack(1.0, *channels)
 
 

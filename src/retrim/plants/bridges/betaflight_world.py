@@ -3,7 +3,7 @@
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -94,6 +94,7 @@ class World:
         self.motors, self.slip = np.zeros(4), 0.0
         """Last motor commands, 0 to 1, and the time that the world has lost since the release [s]."""
         self._sticks, self._is_armed, self._free = (0.0, np.zeros(3)), False, False
+        self._switches: tuple[int, ...] = ()
         self.place(State.at(jnp.array([0.0, 0.0, 1.0])))
         self._thread.start()
 
@@ -107,10 +108,11 @@ class World:
             )
             self._stamp = time.monotonic()
 
-    def tell(self, throttle: float, omega: np.ndarray, *, armed: bool = True) -> None:
-        """Move the sticks."""
+    def tell(self, throttle: float, omega: np.ndarray, *, armed: bool = True, switches: Sequence[int] = ()) -> None:
+        """Move the sticks and the switches; see :func:`.betaflight_wire.sticks_packet`."""
         with self._lock:
             self._sticks, self._is_armed = (throttle, np.array(omega, dtype=float)), armed
+            self._switches = tuple(switches)
 
     def release(self) -> None:
         """Release the vehicle."""
@@ -154,12 +156,12 @@ class World:
                         self._over.set()  # contact with the ground is not simulated
                 rates = self._output[15:18] if self._free else np.zeros(3)
                 specific_force = self._output[18:21] if self._free else REST
-                sticks = (
-                    sticks_packet(*self._sticks, self._fastest, armed=self._is_armed) if k % STICKS_EVERY == 0 else None
-                )
-            self._out.sendto(state_packet(rates, specific_force), (HOST, STATE))
-            if sticks is not None:
-                self._out.sendto(sticks, (HOST, STICKS))
+                attitude = self._output[3:12].reshape(3, 3)
+                sticks, is_armed, switches = self._sticks, self._is_armed, self._switches
+            self._out.sendto(state_packet(rates, specific_force, attitude), (HOST, STATE))
+            if k % STICKS_EVERY == 0:
+                packet = sticks_packet(*sticks, self._fastest, armed=is_armed, switches=switches)
+                self._out.sendto(packet, (HOST, STICKS))
 
 
 def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:

@@ -1,16 +1,21 @@
-"""Endpoints for an autopilot's bytes: a UDP port or a serial line."""
+"""Endpoints for an autopilot's bytes: a UDP port, a TCP connection or a serial line."""
 
 import contextlib
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from ...errors import ConfigError, PlantError
 from ..extras import import_extra
 
 LONGEST = 65_535
+FORMS = {
+    "udp": "udp:HOST:PORT, as udp:127.0.0.1:14540,",
+    "tcp": "tcp:HOST:PORT, as tcp:127.0.0.1:5761,",
+    "serial": "serial:DEVICE:BAUD, as serial:/dev/ttyACM0:921600",
+}
 NAP_S = 0.02  # [s], longest time between two calls of the periodic work
 
 
@@ -73,6 +78,44 @@ class UdpEndpoint:
         self._socket.close()
 
 
+class TcpEndpoint:
+    """A TCP connection to an autopilot, or to a bridge in front of its serial line."""
+
+    def __init__(self, host: str, port: int, patience: float = 3.0) -> None:
+        """Connect.
+
+        Raises:
+            PlantError: Nothing accepts the connection within ``patience`` [s].
+        """
+        try:
+            self._socket = socket.create_connection((host, port), timeout=patience)
+        except (OSError, OverflowError) as error:
+            raise PlantError(f"tcp:{host}:{port} cannot be connected to: {error}") from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the socket's descriptor."""
+        return self._socket.fileno()
+
+    def receive(self) -> tuple[bytes, Any] | None:
+        """Return received data; the sender is ``"line"``."""
+        try:
+            data = self._socket.recv(LONGEST)
+        except OSError:
+            return None
+        return (data, "line") if data else None
+
+    def send(self, data: bytes, to: Any) -> None:
+        """Send data."""
+        with contextlib.suppress(OSError):
+            self._socket.send(data)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
 class SerialEndpoint:
     """A serial line: a telemetry port, or a flight controller on USB."""
 
@@ -111,29 +154,27 @@ class SerialEndpoint:
         self._line.close()
 
 
-def address_of(text: str) -> tuple[str, str, int]:
+def address_of(text: str, kinds: Sequence[str] = ("udp", "serial")) -> tuple[str, str, int]:
     """Return the parts of an address: its kind, the host or device, and the port or the baud rate.
 
     Args:
-        text: ``udp:HOST:PORT`` to listen on, or ``serial:DEVICE:BAUD``.
+        text: ``udp:HOST:PORT`` to listen on, ``tcp:HOST:PORT`` to connect to, or ``serial:DEVICE:BAUD``.
+        kinds: Kinds that the link supports.
 
     Raises:
         ConfigError: The text is not an address.
     """
     kind, _, rest = text.partition(":")
     place, _, number = rest.rpartition(":")
-    most = 65_535 if kind == "udp" else 20_000_000
+    most = 20_000_000 if kind == "serial" else 65_535
     if (
-        kind not in ("udp", "serial")
+        kind not in kinds
         or not place
         or not (number.isascii() and number.isdecimal())
         or not 0 < int(number[-9:]) <= most
         or len(number) > 9
     ):
-        raise ConfigError(
-            f"address {text!r}: expected udp:HOST:PORT, as udp:127.0.0.1:14540, or serial:DEVICE:BAUD, as "
-            f"serial:/dev/ttyACM0:921600"
-        )
+        raise ConfigError(f"address {text!r}: expected {' or '.join(FORMS[each] for each in kinds)}")
     return kind, place, int(number)
 
 
@@ -161,8 +202,13 @@ def open_endpoint(address: str) -> Endpoint:
         ConfigError: The text is not an address.
         PlantError: The endpoint cannot be opened.
     """
-    kind, place, number = address_of(address)
-    return UdpEndpoint(place, number) if kind == "udp" else SerialEndpoint(place, number)
+    kind, place, number = address_of(address, tuple(FORMS))
+    make: dict[str, Callable[[str, int], Endpoint]] = {
+        "udp": UdpEndpoint,
+        "tcp": TcpEndpoint,
+        "serial": SerialEndpoint,
+    }
+    return make[kind](place, number)
 
 
 def pump(endpoint: Endpoint, until: float, chores: Callable[[float], None], take: Callable[[bytes, Any], None]) -> None:

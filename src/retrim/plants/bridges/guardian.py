@@ -16,6 +16,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -102,8 +103,10 @@ class Guardian:
 
     def leave(self) -> None:
         """Let the guardian send its safe commands now, as when the link is killed; idempotent."""
-        with contextlib.suppress(OSError):
-            self._pipe.close()
+        if not self._pipe.closed:
+            with contextlib.suppress(OSError):
+                self._pipe.close()
+            threading.Thread(target=self.process.wait, daemon=True).start()  # it may need seconds
 
     def _write(self, data: bytes) -> None:
         if not self._pipe.closed:

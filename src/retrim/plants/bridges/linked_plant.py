@@ -15,10 +15,13 @@ from .vehicle_state import Reading
 class VehicleLink(Protocol):
     """Attributes that every link provides."""
 
-    reading: Reading | None
-    """Newest state; None until the first one arrives."""
-    last_message: float
-    """Time of the last received message, on the monotonic clock [s]."""
+    @property
+    def reading(self) -> Reading | None:
+        """Newest state; None until the first one arrives."""
+
+    @property
+    def last_message(self) -> float:
+        """Time of the last received message, on the monotonic clock [s]."""
 
 
 L = TypeVar("L", bound=VehicleLink)

@@ -1,0 +1,198 @@
+"""Fly Betaflight's firmware with a simulated vehicle, pilot and motion capture, to try the link ``msp``.
+
+``python -m retrim.testing.betaflight_peer`` starts the board, whose MSP port is ``tcp:127.0.0.1:5761``. The pilot
+takes off and hovers. Motion capture publishes the pose over ROS 2 (``/mocap/quad``). Enter turns the pilot's switch of
+the mode MSP OVERRIDE on or off; Ctrl-C ends the flight.
+"""
+
+import argparse
+import math
+import os
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..config.scenario import Scenario
+from ..errors import PlantError
+from ..onboard.guard import GeometricHover, Limits
+from ..onboard.realtime import be_punctual
+from ..physics.bem import BemQuadrotor
+from ..physics.so3 import rotz
+from ..physics.state import STANDARD_GRAVITY, State
+from ..plants.bridges.betaflight_firmware import Firmware, find_firmware
+from ..plants.bridges.betaflight_wire import HIGH, LOW, throttle_of
+from ..plants.bridges.betaflight_world import World
+from ..plants.plant import as_numpy
+from ..ros2.backends import open_node
+from ..ros2.message_type import message_type
+from ..ros2.node import SENSOR, Ros2Node
+
+DT = 0.01  # [s]
+LISTENS_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
+ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+MASK = 0b1001111  # four sticks, and the channel of ANGLE
+SETTINGS = [
+    f"set msp_override_channels_mask = {MASK}",
+    "aux 1 50 1 1700 2100 0 0",  # MSP OVERRIDE on AUX2
+    "aux 2 1 2 1700 2100 0 0",  # ANGLE on AUX3, which only the companion turns
+]
+GROUND = 0.03  # [m]
+
+
+class BetaflightPeer:
+    """A board, a vehicle and its pilot; :meth:`step` advances the pilot by 0.01 s."""
+
+    def __init__(
+        self, scenario: Scenario, place: np.ndarray, node: Ros2Node | None, topic: str, *, poses: bool = True
+    ) -> None:
+        """Start the board, arm it, and hover.
+
+        Args:
+            scenario: Vehicle and disturbance; its plant is not used.
+            place: Position at which the pilot hovers, world [m].
+            node: Node through which motion capture publishes; None for no motion capture.
+            topic: Topic of the state.
+            poses: Whether poses are published, or odometry.
+
+        Raises:
+            PlantError: The firmware is not installed, or does not start.
+        """
+        vehicle = scenario.make_vehicle("small")
+        model = BemQuadrotor.of(vehicle, 0.02, thrust_error=scenario.thrust_error)
+        low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
+        steps = math.ceil(math.degrees(1.05 * float(np.abs(high[1:]).max())) / 10.0)
+        self._firmware = Firmware(find_firmware(), steps, SETTINGS)
+        self._esc, self._thrust_map, self._mass = vehicle.esc, float(model.loop.thrust_map), float(vehicle.mass)
+        self.world = World(model, scenario.make_disturbance("small"), math.radians(10.0 * steps))
+        fence = np.full(3, 1e3)
+        self._pilot, self._place = GeometricHover(Limits(-fence, fence, low, high), DT), place
+        self.override = False
+        """Whether the pilot's switch of MSP OVERRIDE is on."""
+        self._node, self._poses = node, poses
+        self._kind = None if node is None else message_type(POSE if poses else ODOMETRY)
+        self._publish = None if node is None or self._kind is None else node.advertise(topic, self._kind, SENSOR)
+        self._arm()
+
+    def step(self) -> None:
+        """Move the pilot's sticks, and publish the state."""
+        if not self._firmware.runs:
+            raise PlantError("the firmware has ended")
+        x = self.world.state()
+        u = self._pilot.command(np.concatenate([x.p, x.R.ravel(), x.v]), self._place)
+        if self.override:
+            self._pilot.integral[:] = 0.0
+        self.world.tell(self._throttle(float(u[0])), u[1:], switches=self._switches)
+        if self._publish is not None and self._kind is not None:
+            self._publish(self._kind.encode(self._message(x.p, x.R, x.v, x.omega)))
+
+    @property
+    def height(self) -> float:
+        """Height of the vehicle [m]."""
+        return float(self.world.state().p[2])
+
+    def close(self) -> None:
+        """End the world and the board."""
+        self.world.close()
+        self._firmware.stop()
+
+    @property
+    def _switches(self) -> tuple[int, ...]:
+        return (HIGH if self.override else LOW,)
+
+    def _arm(self) -> None:
+        world = self.world
+        time.sleep(LISTENS_S)
+        world.tell(0.0, np.zeros(3), armed=True, switches=self._switches)
+        until = time.monotonic() + ARMS_S
+        while world.motors.min() <= 0.0:
+            if time.monotonic() > until:
+                self.close()
+                raise PlantError(f"the firmware does not arm within {ARMS_S:g} s")
+            time.sleep(0.02)
+        world.place(State(jnp.asarray(self._place, float), rotz(jnp.asarray(0.0)), jnp.zeros(3)))
+        world.tell(self._throttle(STANDARD_GRAVITY), np.zeros(3), switches=self._switches)
+        time.sleep(SPINS_S)
+        world.release()
+
+    def _throttle(self, c: float) -> float:
+        speed = math.sqrt(max(0.0, c) * self._mass / (4.0 * self._thrust_map))
+        return max(1e-3, throttle_of(float(self._esc.throttle(jnp.asarray(speed)))))
+
+    def _message(self, p: np.ndarray, R: np.ndarray, v: np.ndarray, omega: np.ndarray) -> object:
+        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
+
+        assert self._kind is not None
+        message = self._kind.new()
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
+        message.header.frame_id = "map"
+        pose = message.pose if self._poses else message.pose.pose
+        pose.position.x, pose.position.y, pose.position.z = map(float, p)
+        q = Rotation.from_matrix(R).as_quat()
+        pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = map(float, q)
+        if not self._poses:
+            message.child_frame_id = "base_link"
+            twist, velocity = message.twist.twist, R.T @ v
+            twist.linear.x, twist.linear.y, twist.linear.z = map(float, velocity)
+            twist.angular.x, twist.angular.y, twist.angular.z = map(float, omega)
+        return message
+
+
+def parse(words: list[str] | None = None) -> argparse.Namespace:
+    """Return the options of the peer."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--vehicle", default="", help="vehicle file; by default the vehicle `small`")
+    parser.add_argument("--disturbance", default="none", help="as for `retrim fly`")
+    parser.add_argument("--place", type=float, nargs=3, default=(0.0, 0.0, 1.0), help="where the pilot hovers [m]")
+    parser.add_argument("--topic", default="/mocap/quad", help="topic of the state")
+    parser.add_argument("--odometry", action="store_true", help="odometry in place of poses")
+    parser.add_argument("--backend", default="", help="rclpy, cyclonedds or zenoh; by default, what is installed")
+    return parser.parse_args(words)
+
+
+def main() -> None:
+    """Fly until Ctrl-C."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    options = parse()
+    vehicle = Path(options.vehicle) if options.vehicle else None
+    scenario = Scenario(options.disturbance, vehicle=None if vehicle is None else str(vehicle))
+    node = open_node(options.backend, ("geometry_msgs", "nav_msgs", "std_msgs"))
+    try:
+        peer = BetaflightPeer(scenario, np.array(options.place), node, options.topic, poses=not options.odometry)
+    except PlantError as error:
+        sys.exit(str(error))
+    print("the pilot hovers; MSP at tcp:127.0.0.1:5761; Enter turns the switch of MSP OVERRIDE", flush=True)
+    try:
+        fly(peer)
+    except KeyboardInterrupt:
+        pass
+    except PlantError as error:
+        sys.exit(str(error))
+    finally:
+        print(f"height {peer.height:.2f} m", flush=True)
+        peer.close()
+        node.close()
+
+
+def fly(peer: BetaflightPeer) -> None:
+    """Step the pilot until Ctrl-C; each line of the input turns the switch."""
+    be_punctual(25, os.sched_getaffinity(0))
+    due, inputs = time.monotonic(), [sys.stdin.fileno()]
+    while True:
+        due = max(due + DT, time.monotonic())
+        peer.step()
+        ready = select.select(inputs, [], [], max(0.0, due - time.monotonic()))[0]
+        if ready and not os.read(sys.stdin.fileno(), 64):
+            inputs = []
+        elif ready:
+            peer.override = not peer.override
+            print(f"MSP OVERRIDE {'on' if peer.override else 'off'}", flush=True)
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+if __name__ == "__main__":
+    main()
