@@ -119,11 +119,42 @@ def test_steps_back_are_in_order_and_last_longer_each_time(flying):
         assert int(memory.cause) == Cause.ERROR
         waits.append(float(memory.wait))
     np.testing.assert_allclose(waits, [HOLD, 2 * HOLD, 4 * HOLD], atol=0.1)
-    memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
+    memory = judge_excess(monitor, memory, excess=0.9 * MARGIN, ticks=STRIKES)
     assert int(memory.stage) == Stage.BASE
     ready = dataclasses.replace(memory, wait=jnp.zeros_like(memory.wait))
     back = judge_excess(monitor, ready, excess=0.0)
     assert (int(back.stage), int(back.cause)) == (Stage.SLOW, Cause.RECOVERY)
+
+
+def step_back_to_base(monitor, excess):
+    memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
+    memory = judge_excess(monitor, memory, excess=excess, ticks=3 * STRIKES)
+    assert int(memory.stage) == Stage.BASE
+    return memory
+
+
+def test_an_error_that_the_base_policy_shares_is_tolerated(flying):
+    """The state estimate of an autopilot may wander by centimetres, under every policy."""
+    _, _, monitor = flying
+    memory = judge_excess(monitor, step_back_to_base(monitor, 0.06), excess=0.05, ticks=STRIKES)
+    assert (int(memory.stage), int(memory.cause)) == (Stage.ADAPTED, Cause.NO_GAIN)
+    memory = judge_excess(monitor, memory, excess=0.1, ticks=2 * STRIKES)
+    assert int(memory.stage) == Stage.ADAPTED
+    memory = judge_excess(monitor, memory, excess=0.2, ticks=STRIKES)
+    assert int(memory.stage) == Stage.OBSERVED
+
+
+def test_a_base_policy_that_flies_better_is_not_left(flying):
+    _, _, monitor = flying
+    memory = judge_excess(monitor, step_back_to_base(monitor, 0.2), excess=0.09, ticks=2 * STRIKES)
+    assert int(memory.stage) == Stage.BASE
+
+
+def test_an_oscillation_is_never_tolerated(flying):
+    _, _, monitor = flying
+    memory = step_back_to_base(monitor, 0.06)
+    memory = dataclasses.replace(memory, best=jnp.array(int(Stage.SLOW)))
+    assert int(judge_excess(monitor, memory, excess=0.06, ticks=2 * STRIKES).stage) == Stage.BASE
 
 
 def test_fewer_bad_intervals_than_needed_change_nothing(flying):

@@ -25,6 +25,7 @@ class Cause(IntEnum):
     RECOVERY = 3
     SWINGS = 4
     CALM = 5
+    NO_GAIN = 6
 
 
 PARTS = {
@@ -40,6 +41,7 @@ GROUNDS = {
     Cause.OSCILLATION: "the estimated disturbance oscillates by itself, as with late or wrongly scaled measurements",
     Cause.RECOVERY: "the error has been as small as predicted for the base policy",
     Cause.SWINGS: "the vehicle swings back and forth by itself, as with a wrong estimate of its delay or lag",
+    Cause.NO_GAIN: "the error is as large under the base policy alone, as with a state estimate that wanders",
     Cause.CALM: "the vehicle has not swung by itself for a while",
 }
 

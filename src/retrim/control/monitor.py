@@ -11,7 +11,9 @@ disturbance observer. The monitor uses them in stages:
 The monitor steps back after one of two tests. (1) A *twin*, a simulated vehicle, predicts the flight of the base
 policy, in the nominal model with the mean of the estimated disturbance. If the vehicle's error exceeds that of the twin
 in three consecutive intervals, or by a large amount in one, the flight steps back by one stage. The flight returns
-after a waiting time, which doubles with each step back. (2) An estimate that swings back and forth by itself
+after a waiting time, which doubles with each step back. If the base policy alone exceeds the twin's error as well, its
+parts were not the cause, for example because the state estimate of an autopilot wanders. The flight then uses all of
+its parts again, and tolerates this error. (2) An estimate that swings back and forth by itself
 (:mod:`retrim.control.swings`) shows that the observer drives the vehicle, because measurements are later than declared
 or wrongly scaled. Such a fault persists throughout the flight, so the base policy takes over at once. Later, the base
 policy flies with the slow mean. After a second oscillation, it flies alone until the end of the flight.
@@ -39,6 +41,7 @@ from .swings import Swings
 INTERVAL = 1.0  # [s], interval over which errors are averaged
 MARGIN, FAR = 0.03, 0.7  # [m], limits of the error beyond that of the twin: in consecutive intervals, and in one
 STRIKES = 3  # consecutive intervals; a vehicle recovers from the largest kick of the gauntlet within two
+SAME, TOLERANCE = 0.5, 2.0  # ratios to an excess error: from where on stepping back is no gain, and the next margin
 LOST = 3.0  # [m]; a twin with a larger error restarts at the vehicle
 SWINGS = 8.0  # the largest kick of the gauntlet reaches 6.7; measurements 60 ms late drive the estimate beyond 8
 CALM = 2.0  # swings up to which the estimate has its full weight
@@ -86,6 +89,10 @@ class MonitorState(eqx.Module):
     """Time until the flight may return to the previous stage [s]."""
     hold: Float[Array, ""]
     """Duration of the next step back [s]."""
+    margin: Float[Array, ""]
+    """Largest excess error that is tolerated [m]."""
+    loss: Float[Array, ""]
+    """Excess error because of which the flight left the first stage [m]."""
 
 
 class Monitor(AbstractController[MonitorState]):
@@ -116,7 +123,10 @@ class Monitor(AbstractController[MonitorState]):
         twin = Twin(x, self._inner.init(x), zero, never, self._at_hover(x))
         flight, hold = self.frame.init(x), jnp.full_like(zero, HOLD)
         still = jnp.zeros_like(x.p)
-        return MonitorState(flight, policy, never, never, never, Swings.none(still), still, twin, never, zero, hold)
+        margin = jnp.full_like(zero, MARGIN)
+        return MonitorState(
+            flight, policy, never, never, never, Swings.none(still), still, twin, never, zero, hold, margin, zero
+        )
 
     def __call__(self, memory: MonitorState, t: Float[Array, ""], x: State) -> tuple[Command, MonitorState]:
         """Return the command for the present stage, and test the stage."""
@@ -183,16 +193,22 @@ class Monitor(AbstractController[MonitorState]):
         twin = self._step(s, t, x, jnp.minimum(known / STIFFNESS, ALLOWANCE))
         over = twin.ticks >= round(INTERVAL / dt)
         excess = twin.excess / twin.ticks
-        worse = over & (excess > MARGIN)
+        worse = over & (excess > s.margin)
         strikes = jnp.where(over, jnp.where(worse, s.strikes + 1, 0), s.strikes)
         strikes = jnp.where(over & (excess > FAR), STRIKES, strikes)
         fails = (strikes >= STRIKES) & (s.stage < Stage.BASE)
         swung = swings.size > SWINGS
         wait = jnp.maximum(s.wait - dt, 0.0)
         returns = over & ~worse & ~fails & (wait <= 0.0) & (s.stage > s.best)
+        # Never after an oscillation, whose cause lasts throughout the flight.
+        shared = (excess > SAME * s.loss) & (excess < 0.5 * FAR)
+        no_gain = over & (strikes >= STRIKES) & (s.stage == Stage.BASE) & (s.best == Stage.ADAPTED) & shared
+        loss = jnp.where(fails & (s.stage == Stage.ADAPTED), excess, s.loss)
         stage = s.stage + fails.astype(s.stage.dtype) - returns.astype(s.stage.dtype)
-        changes_stage = fails | returns
+        stage = jnp.where(no_gain, Stage.ADAPTED, stage)
+        changes_stage = fails | returns | no_gain
         cause = jnp.where(fails, Cause.ERROR, jnp.where(returns, Cause.RECOVERY, s.cause))
+        cause = jnp.where(no_gain, Cause.NO_GAIN, cause)
         cause = jnp.where(swung & (s.stage < Stage.BASE), Cause.OSCILLATION, cause)
         best = jnp.where(s.stage < Stage.SLOW, Stage.SLOW, Stage.BASE)
         calm = Swings.none(d_hat)
@@ -210,6 +226,8 @@ class Monitor(AbstractController[MonitorState]):
             strikes=jnp.where(changes_stage | swung, 0, strikes),
             wait=jnp.where(changes_stage | swung, s.hold, wait),
             hold=jnp.where(fails, 2.0 * s.hold, s.hold),
+            margin=jnp.where(no_gain, jnp.minimum(TOLERANCE * jnp.maximum(excess, s.loss), 0.5 * FAR), s.margin),
+            loss=loss,
         )
 
     def _step(self, s: MonitorState, t: Float[Array, ""], x: State, allowance: Float[Array, ""]) -> Twin:
