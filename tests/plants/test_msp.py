@@ -1,5 +1,6 @@
 """MSP and a board's settings: packets in a damaged stream, modes, sticks for rates, and the hand-over by a switch."""
 
+import itertools
 import socket
 import struct
 import time
@@ -268,7 +269,7 @@ def make(monkeypatch):
         monkeypatch.setattr(msp_plant, "open_endpoint", lambda address: board)
         monkeypatch.setattr(msp_plant, "connect_link", lambda where, kind: states)
         monkeypatch.setattr(msp_plant, "await_states", lambda link, until, keep_on: None)
-        monkeypatch.setattr(msp_plant, "HOVER_S", 0.3)
+        monkeypatch.setattr(msp_plant, "HOVER_S", 0.8)
         limit = np.array([30.0, 10.0, 10.0, 4.0])
         low = np.array([0.0, *-limit[1:]])
         plant = MspPlant("tcp:127.0.0.1:1,pose=/p", 0.02, low, limit, 40.0, vehicle())
@@ -281,7 +282,7 @@ def make(monkeypatch):
         board.far.close()
 
 
-def hand_over(plant, board, after=1.8):
+def hand_over(plant, board, after=2.3):
     """Take off, with a pilot who turns the switch after some time."""
     began = time.monotonic()
 
@@ -383,6 +384,48 @@ def test_states_that_stop_end_the_flight(make):
     states.is_seen = False
     with pytest.raises(PlantError, match="no state has come for 1 s"):
         plant.read()
+
+
+def test_a_lost_answer_does_not_stop_the_requests(make):
+    plant, board, _ = make()
+    plant.connect()
+    lost = []
+
+    def drop(data, to, send=board.send):
+        send(data, to)
+        if data[4] == msp.SET_RAW_RC and len(lost) < 5:
+            lost.append(data)
+            board.inbox = b""
+
+    board.send = drop
+    plant.wait(time.monotonic() + 1.5)
+    assert len(lost) == 5
+    assert len(plant.link.throttles) > 3
+    assert plant.link.lag < 0.1
+
+
+def test_a_board_that_reads_late_ends_the_flight(make):
+    """Commands would wait in its buffer, and act later and later."""
+    plant, board, _ = make()
+    hand_over(plant, board, after=2.4)
+    late, count = [], itertools.count()
+
+    def queue(data, to, send=board.send):
+        late.append(data)
+        if next(count) % 3:
+            send(late.pop(0), to)
+
+    board.send = queue
+    with pytest.raises(PlantError, match="set serial_update_rate_hz = 500"):
+        fly_for(plant, 4.0)
+
+
+def fly_for(plant, seconds):
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        plant.read()
+        plant.transmit(np.array([9.81, 0.0, 0.0, 0.0]))
+        plant.wait(time.monotonic() + 0.02)
 
 
 def test_the_link_counts_damaged_packets():

@@ -38,6 +38,7 @@ ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 MASK = 0b1001111  # four sticks, and the channel of ANGLE
 SETTINGS = [
     f"set msp_override_channels_mask = {MASK}",
+    "set serial_update_rate_hz = 500",  # a board reads one packet in each run of its serial task
     "aux 1 50 1 1700 2100 0 0",  # MSP OVERRIDE on AUX2
     "aux 2 1 2 1700 2100 0 0",  # ANGLE on AUX3, which only the companion turns
 ]

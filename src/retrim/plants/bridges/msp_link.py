@@ -17,7 +17,8 @@ from .ros2_link import Ros2Link
 from .vehicle_state import Reading
 
 ANSWERS_S, AGAIN_S = 6.0, 0.3  # [s], limit for the answers about the settings; time between two requests
-ASK_EVERY_S = 0.04  # [s] between two requests for the board's modes and channels
+ASK_EVERY_S = 0.05  # [s] between two requests, alternately for the board's modes and for its channels
+MOST_PENDING, ASK_AT_LEAST_S = 2, 0.25  # packets without an answer that postpone a request, and by how long [s]
 COUNTED = 50  # throttles and motor commands that are kept
 ECHOES, ECHO_US = 25, 3  # last commands that an answer may echo, and the largest difference [us]
 
@@ -78,7 +79,8 @@ class MspLink:
         self._parser = msp.Parser()
         self._faults: set[str] = set()
         self._commands: deque[list[int]] = deque(maxlen=ECHOES)
-        self._asked = 0.0
+        self._pending: deque[tuple[int, float]] = deque()
+        self._asked, self._next = 0.0, msp.STATUS_EX
 
     @property
     def reading(self) -> Reading | None:
@@ -89,6 +91,15 @@ class MspLink:
     def last_message(self) -> float:
         """Time of the last state, on the monotonic clock [s]."""
         return self.states.last_message
+
+    @property
+    def lag(self) -> float:
+        """Age of the oldest packet without an answer [s].
+
+        A board reads one packet in each run of its serial task, 100 times a second by default. More packets wait in
+        its buffer, so that commands would become later and later.
+        """
+        return time.monotonic() - self._pending[0][1] if self._pending else 0.0
 
     @property
     def notes(self) -> list[str]:
@@ -106,7 +117,7 @@ class MspLink:
         def ask() -> None:
             for code in NEEDED:
                 if code not in self.answers:
-                    self.send(msp.encode(code))
+                    self.send(code)
 
         is_known = insisting(ask, lambda: all(code in self.answers for code in NEEDED), AGAIN_S)
         if not wait_until(is_known, ANSWERS_S, keep_on, self.pump):
@@ -133,7 +144,7 @@ class MspLink:
     def send_channels(self, channels: list[int]) -> None:
         """Send receiver channels [us]."""
         self._commands.append(channels)
-        self.send(msp.encode(msp.SET_RAW_RC, msp.sticks_payload(channels)))
+        self.send(msp.SET_RAW_RC, msp.sticks_payload(channels))
 
     def mirror(self) -> None:
         """Send the pilot's own sticks, so that a switch that is turned too early changes nothing."""
@@ -155,9 +166,10 @@ class MspLink:
         sticks = np.array(self.channels[:4])
         return any(np.abs(sticks - row).max() <= ECHO_US for row in np.array(rows).reshape(-1, 4))
 
-    def send(self, data: bytes) -> None:
-        """Send bytes to the board."""
-        self.endpoint.send(data, "line")
+    def send(self, code: int, payload: bytes = b"") -> None:
+        """Send a packet to the board, which answers each one."""
+        self._pending.append((code, time.monotonic()))
+        self.endpoint.send(msp.encode(code, payload), "line")
 
     def pump(self, until: float) -> None:
         """Exchange messages with the board until an instant on the monotonic clock [s]."""
@@ -169,13 +181,16 @@ class MspLink:
         self.states.close()
 
     def _ask(self, now: float) -> None:
-        if self.board is not None and now - self._asked > ASK_EVERY_S:
+        pause = ASK_EVERY_S if len(self._pending) < MOST_PENDING else ASK_AT_LEAST_S
+        if self.board is not None and now - self._asked > pause:
             self._asked = now
-            self.send(msp.encode(msp.STATUS_EX) + msp.encode(msp.RC))
+            self.send(self._next)
+            self._next = msp.RC if self._next == msp.STATUS_EX else msp.STATUS_EX
 
     def _take(self, data: bytes) -> None:
         for packet in self._parser.feed(data):
             self.last_answer = time.monotonic()
+            self._settle(packet.code)
             if packet.refused:
                 self.refusals.add(packet.code)
                 continue
@@ -184,6 +199,12 @@ class MspLink:
                 self._read(packet)
             except MessageError as error:
                 self._faults.add(str(error))
+
+    def _settle(self, code: int) -> None:
+        """Forget the packets up to the one that is answered; answers come in order, and some are lost."""
+        if any(each == code for each, _ in self._pending):
+            while self._pending.popleft()[0] != code:
+                pass
 
     def _read(self, packet: msp.Packet) -> None:
         if self.board is None:

@@ -33,6 +33,7 @@ ADDRESS = re.compile(
 HOVER_S = 2.0  # [s] over which the pilot's throttle at hover is averaged
 ECHO_S = 0.6  # [s], limit for the board to follow our sticks
 MARK = 0.15  # [rad/s], yaw rate by which our sticks differ from those of a pilot who hovers
+LATE_S = 0.3  # [s], age of a command that the board has not answered
 SILENT_S = 0.5  # [s] without an answer of the board
 SINK = 0.93  # thrust while the guardian lets the vehicle sink, as a ratio to the hover
 SINK_S, OFF_S, REPEAT_S = 4.0, 2.0, 0.04  # [s]: durations of the guardian's phases, and time between two packets
@@ -96,7 +97,7 @@ class MspPlant(PilotedPlant[MspLink]):
         self._limits = Limits(-fence, fence, low, high)
         self._curve: ThrustCurve | None = None
         self._guardian: Guardian | None = None
-        self._place, self._heading, self._is_engaged = np.zeros(3), 0.0, False
+        self._place, self._is_engaged, self._sent = np.zeros(3), False, -np.inf
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Read the board's settings, and wait for states."""
@@ -177,6 +178,10 @@ class MspPlant(PilotedPlant[MspLink]):
         """
         link = self.link
         link.pump(0.0)
+        if link.lag > LATE_S and time.monotonic() - link.last_answer < 0.5 * LATE_S:
+            raise PlantError(
+                f"the board reads commands {LATE_S:g} s late; set serial_update_rate_hz = 500, or use a faster line"
+            )
         if self._is_engaged:
             if time.monotonic() - link.last_answer > SILENT_S:
                 raise PlantError(f"the board has been silent for {SILENT_S:g} s; it holds the last command")
@@ -198,7 +203,7 @@ class MspPlant(PilotedPlant[MspLink]):
         """Exchange messages with the board."""
         link = self.link
         while True:
-            if not self._is_engaged and self.curve.hover is None:
+            if not self._is_engaged and self.curve.hover is None and self._is_due():
                 link.mirror()
             step = min(until, time.monotonic() + self.dt)
             link.pump(step)
@@ -238,7 +243,16 @@ class MspPlant(PilotedPlant[MspLink]):
     def _hover(self) -> GeometricHover:
         return GeometricHover(self._limits, self.dt)
 
+    def _is_due(self) -> bool:
+        """Return whether a control period has passed since the last command."""
+        now = time.monotonic()
+        is_due = now - self._sent > 0.9 * self.dt
+        self._sent = now if is_due else self._sent
+        return is_due
+
     def _fly_to_place(self, hover: GeometricHover, yaw_rate: float = 0.0) -> None:
+        if not self._is_due():
+            return
         x = self.reading().at(time.monotonic()).extrapolate(STANDARD_GRAVITY)
         u = hover.command(np.concatenate([x.p, x.R.ravel(), x.v]), self._place)
         self.send(u + np.array([0.0, 0.0, 0.0, yaw_rate]))
