@@ -319,6 +319,23 @@ def test_hover_throttle_is_that_of_the_pilot_and_the_switch_hands_over(make):
     assert board.sent[0] > 1500
 
 
+def test_a_switch_that_is_on_too_early_is_waited_for(make):
+    """The board has no valid commands of ours before the pilot has hovered."""
+    plant, board, _ = make()
+    board.modes.add(msp.OVERRIDE)
+    began = time.monotonic()
+
+    def turn():
+        t = time.monotonic() - began
+        (board.modes.add if t > 6.5 else board.modes.discard if t > 2.5 else board.modes.add)(msp.OVERRIDE)
+        return True
+
+    plant.connect()
+    plant.take_off(np.array([0.0, 0.0, 1.0]), 0.0, turn)
+    assert time.monotonic() - began > 6.5
+    assert plant.curve.hover == pytest.approx((1335 - 1050) / 950)
+
+
 def test_the_pilot_has_the_vehicle_as_soon_as_the_switch_is_off(make):
     plant, board, _ = make()
     hand_over(plant, board)

@@ -132,7 +132,7 @@ class Supervisor:
         self.bus.publish("order", pack_note("order", order="take off"))
         while self.bus.latest("airborne") is None:
             self._check_alive()
-            yield "the vehicle, which takes off", time.monotonic() - began
+            yield self.spec.scenario.entry.awaits, time.monotonic() - began
             time.sleep(0.1)
 
     def land(self) -> None:

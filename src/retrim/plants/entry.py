@@ -65,6 +65,8 @@ class PlantEntry:
     :class:`~retrim.plants.bridges.vehicle_plant.VehiclePlant`."""
     has_world: bool = False
     """Whether retrim simulates the world around the vehicle, so disturbances can be applied."""
+    awaits: str = "the vehicle, which takes off"
+    """Subject of the message while a vehicle is not at the start yet."""
     check_address: Callable[[str], object] | None = None
     """Function that raises ConfigError if the address after a vehicle's name is invalid; None for no check."""
     needs: Callable[[], object] | None = None

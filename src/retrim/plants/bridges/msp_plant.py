@@ -118,14 +118,19 @@ class MspPlant(PilotedPlant[MspLink]):
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Wait until the pilot hovers at the start; learn the throttle there; wait for the pilot's switch."""
         link = self.link
-        super().take_off(p, yaw, keep_on)
+        began = time.monotonic()
+        while self.curve.hover is None:
+            super().take_off(p, yaw, keep_on)
+            link.throttles.clear()  # they are the pilot's, since none is recorded under MSP OVERRIDE
+            self.until(lambda: False, HOVER_S, keep_on)
+            if link.has_mode(msp.ARM) and not link.has_mode(msp.OVERRIDE):
+                self.curve.learn(list(link.throttles))
+            elif time.monotonic() - began > GO_S:
+                raise PlantError(
+                    f"{self.address}: for {GO_S:g} s nobody has hovered at the start with MSP OVERRIDE off"
+                )
         x = self.reading()
         self._place = x.p.copy() if p is None else np.asarray(p, dtype=float)
-        if not link.has_mode(msp.ARM) or link.has_mode(msp.OVERRIDE):
-            raise PlantError(f"{self.address}: fly to the start with MSP OVERRIDE off; the hand-over needs its switch")
-        link.throttles.clear()
-        self.until(lambda: False, HOVER_S, keep_on)
-        self.curve.learn(list(link.throttles))
         hover = self._hover()
 
         def is_ours() -> bool:
@@ -289,6 +294,7 @@ entry = PlantEntry(
     _make,
     "a Betaflight board with MSP override, and its state from motion capture or odometry over ROS 2",
     is_vehicle=True,
+    awaits="the pilot, who hovers at the start and then switches MSP OVERRIDE on",
     check_address=msp_address_of,
     needs=_check_installed,
 )
