@@ -2,7 +2,8 @@
 
 ``python -m retrim.testing.betaflight_peer`` starts the board, whose MSP port is ``tcp:127.0.0.1:5761``. The pilot
 takes off and hovers. Motion capture publishes the pose over ROS 2 (``/mocap/quad``). Enter turns the pilot's switch of
-the mode MSP OVERRIDE on or off; Ctrl-C ends the flight.
+the mode MSP OVERRIDE on or off; Ctrl-C ends the flight. With ``--log FILE``, the pilot flies by hand for half a minute,
+with quick turns and changes of the throttle, and the board's Blackbox is written to the file.
 """
 
 import argparse
@@ -42,7 +43,11 @@ SETTINGS = [
     "aux 1 50 1 1700 2100 0 0",  # MSP OVERRIDE on AUX2
     "aux 2 1 2 1700 2100 0 0",  # ANGLE on AUX3, which only the companion turns
 ]
-GROUND = 0.03  # [m]
+LOGS = ["set blackbox_device = VIRTUAL", "set blackbox_sample_rate = 1/8"]
+HIGH_ABOVE = (0.0, 0.0, 50.0)  # [m], where the pilot flies by hand
+TURNS, TURN_S = np.array([1.5, 1.5, 1.0]), 0.1  # [rad/s], [s]: random rates and their memory
+PUSHES, PUSH_S = 2.0, 0.4  # [m/s^2], [s]: random thrusts
+CLOSES_S = 2.0  # [s] that the board needs for the end of its log
 
 
 class BetaflightPeer:
@@ -67,7 +72,8 @@ class BetaflightPeer:
         model = BemQuadrotor.of(vehicle, 0.02, thrust_error=scenario.thrust_error)
         low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
         steps = math.ceil(math.degrees(1.05 * float(np.abs(high[1:]).max())) / 10.0)
-        self._firmware = Firmware(find_firmware(), steps, SETTINGS)
+        self._firmware = Firmware(find_firmware(), steps, [*SETTINGS, *LOGS])
+        self._limits = low, high
         self._esc, self._thrust_map, self._mass = vehicle.esc, float(model.loop.thrust_map), float(vehicle.mass)
         self.world = World(model, scenario.make_disturbance("small"), math.radians(10.0 * steps))
         fence = np.full(3, 1e3)
@@ -90,6 +96,35 @@ class BetaflightPeer:
         self.world.tell(self._throttle(float(u[0])), u[1:], switches=self._switches)
         if self._publish is not None and self._kind is not None:
             self._publish(self._kind.encode(self._message(x.p, x.R, x.v, x.omega)))
+
+    def fly_by_hand(self, seconds: float, seed: int = 0) -> None:
+        """Fly with random rates and thrusts around a place, as a pilot excites a vehicle for a log."""
+        rng, turn, push = np.random.default_rng(seed), np.zeros(3), 0.0
+        turn_decay, push_decay = math.exp(-DT / TURN_S), math.exp(-DT / PUSH_S)
+        began = due = time.monotonic()
+        while due - began < seconds:
+            x = self.world.state()
+            turn = turn_decay * turn + math.sqrt(1.0 - turn_decay**2) * TURNS * rng.normal(size=3)
+            push = push_decay * push + math.sqrt(1.0 - push_decay**2) * PUSHES * rng.normal()
+            a = np.array([0.0, 0.0, STANDARD_GRAVITY]) - (x.p - self._place) - 1.5 * x.v
+            level = 4.0 * x.R.T @ np.cross(x.R[:, 2], a / np.linalg.norm(a)) * np.array([1.0, 1.0, 0.0])
+            u = np.clip(np.array([a @ x.R[:, 2] + push, *(turn + level)]), *self._limits)
+            self.world.tell(self._throttle(float(u[0])), u[1:], switches=self._switches)
+            due = max(due + DT, time.monotonic())
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def write_log(self, path: Path) -> None:
+        """Disarm, and write the board's Blackbox to a file.
+
+        Raises:
+            PlantError: The board has written no log.
+        """
+        self.world.tell(0.0, np.zeros(3), armed=False)
+        time.sleep(CLOSES_S)
+        logs = sorted(self._firmware.folder.glob("LOG*"))
+        if not logs:
+            raise PlantError("the board has written no log")
+        path.write_bytes(logs[-1].read_bytes())
 
     @property
     def height(self) -> float:
@@ -151,6 +186,8 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--place", type=float, nargs=3, default=(0.0, 0.0, 1.0), help="where the pilot hovers [m]")
     parser.add_argument("--topic", default="/mocap/quad", help="topic of the state")
     parser.add_argument("--odometry", action="store_true", help="odometry in place of poses")
+    parser.add_argument("--log", default="", help="fly by hand, and write the board's Blackbox to this file")
+    parser.add_argument("--seconds", type=float, default=30.0, help="length of the flight by hand")
     parser.add_argument("--backend", default="", help="rclpy, cyclonedds or zenoh; by default, what is installed")
     return parser.parse_args(words)
 
@@ -161,6 +198,9 @@ def main() -> None:
     options = parse()
     vehicle = Path(options.vehicle) if options.vehicle else None
     scenario = Scenario(options.disturbance, vehicle=None if vehicle is None else str(vehicle))
+    if options.log:
+        write_manual_log(scenario, options)
+        return
     node = open_node(options.backend, ("geometry_msgs", "nav_msgs", "std_msgs"))
     try:
         peer = BetaflightPeer(scenario, np.array(options.place), node, options.topic, poses=not options.odometry)
@@ -177,6 +217,21 @@ def main() -> None:
         print(f"height {peer.height:.2f} m", flush=True)
         peer.close()
         node.close()
+
+
+def write_manual_log(scenario: Scenario, options: argparse.Namespace) -> None:
+    """Fly by hand, and write the log."""
+    peer = None
+    try:
+        peer = BetaflightPeer(scenario, np.array(HIGH_ABOVE), None, "")
+        peer.fly_by_hand(options.seconds)
+        peer.write_log(Path(options.log))
+    except (PlantError, OSError) as error:
+        sys.exit(str(error))
+    finally:
+        if peer is not None:
+            peer.close()
+    print(f"{options.log}: {options.seconds:g} s of flight", flush=True)
 
 
 def fly(peer: BetaflightPeer) -> None:

@@ -79,6 +79,11 @@ class Firmware:
             raise
 
     @property
+    def folder(self) -> Path:
+        """Folder of the board's files, such as its logs."""
+        return Path(self._folder.name)
+
+    @property
     def runs(self) -> bool:
         """Whether the process is alive."""
         return self._process is not None and self._process.poll() is None
