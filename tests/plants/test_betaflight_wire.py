@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from retrim import ConfigError, PlantError, Scenario
 from retrim.errors import MessageError
@@ -107,3 +108,10 @@ def test_before_it_flies_it_says_so():
     with pytest.raises(PlantError, match="call connect or reset first"):
         plant.read()
     plant.stop()
+
+
+def test_attitudes_are_unit_quaternions_of_the_rotation():
+    for rotation in Rotation.random(20, random_state=0):
+        q = struct.unpack("<18d", state_packet(np.zeros(3), R=rotation.as_matrix()))[7:11]
+        assert np.linalg.norm(q) == pytest.approx(1.0, abs=1e-9)
+        np.testing.assert_allclose(np.roll(rotation.as_quat(canonical=True), 1), q, atol=1e-6)

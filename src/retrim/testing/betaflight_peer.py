@@ -34,6 +34,7 @@ from ..ros2.message_type import message_type
 from ..ros2.node import SENSOR, Ros2Node
 
 DT = 0.01  # [s]
+HOVER = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
 LISTENS_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 MASK = 0b1001111  # four sticks, and the channel of ANGLE
@@ -90,9 +91,11 @@ class BetaflightPeer:
         if not self._firmware.runs:
             raise PlantError("the firmware has ended")
         x = self.world.state()
-        u = self._pilot.command(np.concatenate([x.p, x.R.ravel(), x.v]), self._place)
+        u = HOVER  # the board ignores the pilot's sticks under MSP OVERRIDE
         if self.override:
             self._pilot.integral[:] = 0.0
+        else:
+            u = self._pilot.command(np.concatenate([x.p, x.R.ravel(), x.v]), self._place)
         self.world.tell(self._throttle(float(u[0])), u[1:], switches=self._switches)
         if self._publish is not None and self._kind is not None:
             self._publish(self._kind.encode(self._message(x.p, x.R, x.v, x.omega)))
@@ -127,9 +130,11 @@ class BetaflightPeer:
         path.write_bytes(logs[-1].read_bytes())
 
     @property
-    def height(self) -> float:
-        """Height of the vehicle [m]."""
-        return float(self.world.state().p[2])
+    def position(self) -> str:
+        """Height and tilt of the vehicle."""
+        x = self.world.state()
+        tilt = math.degrees(math.acos(float(np.clip(x.R[2, 2], -1.0, 1.0))))
+        return f"height {x.p[2]:.2f} m, tilt {tilt:.1f} deg"
 
     def close(self) -> None:
         """End the world and the board."""
@@ -214,7 +219,7 @@ def main() -> None:
     except PlantError as error:
         sys.exit(str(error))
     finally:
-        print(f"height {peer.height:.2f} m", flush=True)
+        print(peer.position, flush=True)
         peer.close()
         node.close()
 

@@ -35,8 +35,8 @@ def fly(plan: PlantPlan) -> None:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
             if not isinstance(plant, VehiclePlant):
                 raise PlantError(f"plant {plan.scenario.plant!r} is no VehiclePlant")
+            refusals = be_punctual(plan.priority, set(plan.cores))  # the threads of the link inherit the priority
             plant.connect(is_active)
-            refusals = be_punctual(plan.priority, set(plan.cores))
             bus.publish("ready.plant", pack_note("ready", refused=refusals, stands=True))
             while last_note(bus, "order").get("order") != "take off":
                 if not is_active():

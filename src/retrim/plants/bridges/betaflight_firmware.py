@@ -20,6 +20,10 @@ from .betaflight_wire import CLI, settings
 
 VARIABLE = "RETRIM_BETAFLIGHT"
 STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s], time limits
+TAKEN, AGAIN_S = (
+    "bind port",
+    0.5,
+)  # beginning of the program's complaint about a port in use; [s] until the next attempt
 PRIORITY = 40  # above the processes for control, learning and display
 LISTENING = "0A"  # state of a socket in the kernel's tables
 SETTLES_S = 0.5  # [s] from the start until its command line listens
@@ -98,19 +102,27 @@ class Firmware:
 
     def _start(self) -> int:
         """Start the program, and return its process id once it listens."""
-        log = Path(self._folder.name, "board.log").open("ab")  # noqa: SIM115 the process uses it from now on
+        until = time.monotonic() + STARTS_S
+        process = self._launch()
+        while not _listens():
+            has_ended = process.poll() is not None
+            if has_ended and TAKEN in self._output() and time.monotonic() < until:
+                time.sleep(AGAIN_S)  # the system has not freed the port of the board before the restart
+                process = self._launch()
+            elif has_ended or time.monotonic() > until:
+                raise PlantError(f"{self._program}: does not start; it said: {self._output()}")
+            time.sleep(0.02)
+        time.sleep(SETTLES_S)
+        return process.pid
+
+    def _launch(self) -> "subprocess.Popen[bytes]":
+        log = Path(self._folder.name, "board.log").open("wb")  # noqa: SIM115 the process uses it from now on
         with log:
             self._process = subprocess.Popen(
                 [sys.executable, "-S", "-E", "-c", TIED, str(self._program)], cwd=self._folder.name,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             )  # fmt: skip
-        until = time.monotonic() + STARTS_S
-        while not _listens():
-            if self._process.poll() is not None or time.monotonic() > until:
-                raise PlantError(f"{self._program}: does not start; it said: {self._output()}")
-            time.sleep(0.02)
-        time.sleep(SETTLES_S)
-        return self._process.pid
+        return self._process
 
     def _configure(self, lines: list[str]) -> None:
         with socket.create_connection(("127.0.0.1", CLI), timeout=ANSWERS_S) as line:

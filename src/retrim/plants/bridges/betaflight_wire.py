@@ -1,5 +1,6 @@
 """UDP packets to and from Betaflight's simulated board (SITL, 4.6), little endian."""
 
+import math
 import struct
 from collections.abc import Sequence
 
@@ -31,9 +32,9 @@ def state_packet(omega: np.ndarray, specific_force: np.ndarray = REST, R: np.nda
         specific_force: Specific force, forward-left-up [m/s^2], which the board writes to its Blackbox.
         R: Attitude, body to world, by which the board levels the vehicle in ANGLE mode.
     """
-    from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
-
-    q = np.roll(Rotation.from_matrix(R).as_quat(canonical=True), 1)
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    w = math.sqrt(max(1e-6, 1.0 + a + e + i))  # twice the first number; exact up to half a turn
+    q = (0.5 * w, 0.5 * (h - f) / w, 0.5 * (c - g) / w, 0.5 * (d - b) / w)
     return _STATE.pack(1.0, *(GYRO * omega), *-specific_force, *q, *(0.0,) * 6, 101325.0)
 
 
