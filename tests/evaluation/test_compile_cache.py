@@ -1,5 +1,6 @@
 """Programs are kept for other processes, and given back before a process has too many memory maps."""
 
+import os
 import sys
 from types import SimpleNamespace
 
@@ -33,22 +34,47 @@ def test_a_system_without_the_list_keeps_them(monkeypatch, tmp_path):
     assert not compile_cache.release_programs(0)
 
 
+@pytest.fixture
+def config(monkeypatch):
+    """The values that a fresh JAX receives."""
+    values = {}
+    fresh = SimpleNamespace(values={"jax_compilation_cache_dir": None}, update=values.__setitem__)
+    monkeypatch.setattr(compile_cache, "jax", SimpleNamespace(config=fresh, __version__="1.2"))
+    monkeypatch.delenv("RETRIM_COMPILE_CACHE", raising=False)
+    return values
+
+
+def test_a_folder_that_cannot_be_written_is_only_read(config, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(compile_cache.os, "access", lambda path, mode: mode != os.W_OK)
+    assert compile_cache.enable_compile_cache() == tmp_path / "retrim" / "jax-1.2"
+    assert config["jax_persistent_cache_min_compile_time_secs"] > 1e9
+
+
+def test_a_user_without_a_home_compiles_each_time(config, monkeypatch):
+    def find_no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(compile_cache.Path, "home", find_no_home)
+    with pytest.warns(UserWarning, match="no compile cache: Could not"):
+        assert compile_cache.enable_compile_cache() is None
+    assert not config
+
+
 @pytest.mark.parametrize("off", ["", "0"])
-def test_programs_are_kept_in_the_user_s_cache_unless_it_is_off(off, tmp_path, monkeypatch):
+def test_programs_are_kept_in_the_user_s_cache_unless_it_is_off(off, config, tmp_path, monkeypatch):
     """And a folder that cannot be made is a warning."""
-    message = {}
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("RETRIM_COMPILE_CACHE", off)
-    config = SimpleNamespace(values={"jax_compilation_cache_dir": None}, update=message.__setitem__)
-    monkeypatch.setattr(compile_cache, "jax", SimpleNamespace(config=config, __version__="1.2"))
     result = compile_cache.enable_compile_cache()
     if off:
-        assert (result, message) == (None, {})
+        assert (result, config) == (None, {})
         return
     assert result == tmp_path / "retrim" / "jax-1.2"
     assert result.is_dir()
-    assert message["jax_compilation_cache_dir"] == str(result)
-    assert message["jax_persistent_cache_min_compile_time_secs"] == 0.0
+    assert config["jax_compilation_cache_dir"] == str(result)
+    assert config["jax_persistent_cache_min_compile_time_secs"] == 0.0
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with pytest.warns(UserWarning, match="no compile cache"):

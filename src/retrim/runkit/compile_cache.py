@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 import warnings
 from pathlib import Path
 
@@ -33,22 +34,24 @@ def enable_compile_cache() -> Path | None:
     """Keep compiled programs in the user's cache folder, unless JAX already has a cache folder.
 
     Each version of jax has its own folder. ``RETRIM_COMPILE_CACHE=0`` switches the cache off. A cache error does not
-    stop a program; the program is compiled again.
+    stop a program; the program is compiled again. A folder that cannot be written is only read.
 
     Returns:
         The folder; None if there is no cache.
     """
     if jax.config.values["jax_compilation_cache_dir"] or os.environ.get("RETRIM_COMPILE_CACHE") == "0":
         return None
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = home / "retrim" / f"jax-{jax.__version__}"
     try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = home / "retrim" / f"jax-{jax.__version__}"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # RuntimeError: neither HOME nor an entry of the user exists
         warnings.warn(f"no compile cache: {error}", stacklevel=2)
         return None
+    # JAX warns of each program that it fails to write; no program takes so long to compile that it writes this one.
+    shortest = 0.0 if os.access(folder, os.W_OK) else sys.float_info.max
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     jax.config.update("jax_raise_persistent_cache_errors", False)
     return folder
