@@ -30,6 +30,7 @@ def test_an_example_runs(path, capsys, monkeypatch, tmp_path):
 
 def test_every_file_of_the_folder_is_an_example_or_belongs_to_one_or_to_a_page():
     assert [path.stem[:2] for path in EXAMPLES] == [f"0{i}" for i in range(1, 6)]
-    pages = (FOLDER.parent / "docs/how-to").glob("*.md")
+    docs = FOLDER.parent / "docs"
+    pages = [*docs.glob("*.md"), *docs.glob("how-to/*.md")]
     text = "".join(path.read_text() for path in (*EXAMPLES, *pages))
     assert all(path.name in text for path in set(FOLDER.iterdir()) - set(EXAMPLES) if path.is_file())
