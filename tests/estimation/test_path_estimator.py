@@ -1,6 +1,7 @@
 """The posterior of the command path is exact, covers what it says, and counts only what belongs to it."""
 
 import dataclasses
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -17,29 +18,43 @@ from retrim.estimation.command_path.history import CommandHistory
 from retrim.estimation.command_path.response import mean_step_response, ringing_of
 from retrim.physics.state import Command, State
 
-ESTIMATOR = PathEstimator.of(DT)
+PIECE = 50  # ticks of one call of the program, which flights of any length share
+TRACES: list[int] = []
+
+
+@cache
+def estimator():
+    return PathEstimator.of(DT)
 
 
 @eqx.filter_jit
-def estimates(rows, age, inertial):
-    """Return the state at the end, and the estimates of all ticks."""
+def estimates(estimator, s, rows, age, every, inertial):
+    """Return the state after ``PIECE`` ticks, and the estimate after each, which is new in one of ``every`` ticks."""
+    TRACES.append(1)
 
     def tick(s, row):
-        t, p, R, v, omega, a, u = row
-        s = ESTIMATOR.update(s, t, State(p, R, v), omega if inertial else None, a if inertial else None, age)
-        return ESTIMATOR.issued(s, Command.of(u)), s.estimate
+        k, t, p, R, v, omega, a, u = row
+        s = estimator.measured(s, t, State(p, R, v), omega if inertial else None, a if inertial else None, age)
+        s = jax.lax.cond((k + 1) % every == 0, lambda s: estimator.estimate_path(s), lambda s: s, s)
+        return estimator.issued(s, Command.of(u)), s.estimate
 
-    return jax.lax.scan(tick, ESTIMATOR.init(State(*(row[0] for row in rows[1:4]))), rows)
+    return jax.lax.scan(tick, s, rows)
 
 
-def estimate(flights, i=0, *, inertial=True, start=0.0, ticks=None, **changes):
+def estimate(flights, i=0, *, inertial=True, start=0.0, every=1, **changes):
     """Return the estimates of flight ``i`` as NumPy arrays over time."""
-    choice = {
-        name: np.array(getattr(flights, name)[i][:ticks]) for name in ("p", "R", "v", "omega", "a", "u")
-    } | changes
-    t = start + DT * np.arange(len(choice["u"]))
-    rows = tuple(jnp.asarray(x, jnp.float32) for x in (t, *choice.values()))
-    return jax.tree.map(np.asarray, estimates(rows, jnp.float32(flights.age), inertial)[1])
+    choice = {name: np.array(getattr(flights, name)[i]) for name in ("p", "R", "v", "omega", "a", "u")} | changes
+    n = len(choice["u"])
+    t, k = start + DT * np.arange(n), np.arange(n)
+    padding = -n % PIECE  # ticks at the end that are computed and not returned
+    rows = [np.concatenate([x, np.repeat(x[-1:], padding, axis=0)]) for x in (t, *choice.values())]
+    rows = (np.append(k, np.zeros(padding, int)), *(x.astype(np.float32) for x in rows))
+    s, parts = estimator().init(State(*(jnp.asarray(row[0]) for row in rows[2:5]))), []
+    for first in range(0, n, PIECE):
+        part = tuple(jnp.asarray(x[first : first + PIECE]) for x in rows)
+        s, result = estimates(estimator(), s, part, jnp.float32(flights.age), jnp.array(every), inertial)
+        parts.append(result)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:n], *parts)
 
 
 def one_vehicle(**changes):
@@ -70,33 +85,42 @@ def test_a_step_response_solves_its_differential_equation(lag, damping, width):
     np.testing.assert_allclose(result, expected, atol=2e-3 if damping > 5 else 5e-4)
 
 
+# One program each, instead of one for each operation.
+channel_before = jax.jit(posterior.channel_before, static_argnums=(0, 2))
+log_likelihood = jax.jit(posterior.log_likelihood, static_argnums=3)
+path_posterior = jax.jit(lambda channel, prior: posterior.path_posterior(channel, prior, None, DT))
+predicted = jax.jit(lambda channel, prior: channel.predicted_by(path_posterior(channel, prior)))
+responses = jax.jit(lambda cells, hover: posterior.responses(cells, jnp.zeros(()), jnp.zeros(()), hover, DT))
+yaw_features = jax.jit(lambda history: history.features(DT)[3:])
+issued = jax.jit(CommandHistory.issued)
+
+
+@jax.jit
+def measured(channel, features, value, kinds):
+    zero = jnp.zeros(())
+    sample = Sample(value[None], jnp.zeros((1, 0)), jnp.array(True), kinds, zero, zero)
+    return channel.measured(features, sample, jnp.ones(()), DT, may_jump=True)
+
+
 def _linear_channel(kind, kinds, sigma, n=60):
     """Return a channel with the sums of a linear vehicle, and what went into them."""
-    rng, prior = np.random.default_rng(3), dataclasses.replace(ESTIMATOR.yaw, cells=(11, 11, 7))
-    channel, history = posterior.channel_before(1, prior, DT), CommandHistory.at_hover(DT)
+    rng, prior = np.random.default_rng(3), dataclasses.replace(estimator().yaw, cells=(11, 11, 7))
+    channel, history = channel_before(1, prior, DT), CommandHistory.at_hover(DT)
     cell = jnp.array([[0.03, np.log(0.07), ringing_of(0.8)]])
-    h = np.asarray(posterior.responses(cell, jnp.zeros(()), jnp.zeros(()), prior.hover, DT))[0]
+    h = np.asarray(responses(cell, prior.hover))[0]
     rows, values, e_old = [], [], rng.normal()
     for k in range(n):
-        features = np.append(np.asarray(history.features(DT))[3], 0.0)
+        features = np.append(np.asarray(yaw_features(history)), 0.0)
         e = rng.normal()
         value = 1.1 * features @ h + 0.2 + sigma * (e - kinds[kind][0] * e_old)
         e_old = e
         rows.append(features)
         values.append(value)
-        sample = Sample(
-            jnp.array([value], float),
-            jnp.zeros((1, 0)),
-            jnp.array(True),
-            jnp.array(kinds),
-            jnp.zeros(()),
-            jnp.zeros(()),
-        )
-        channel = channel.measured(jnp.array(features, float)[None], sample, jnp.ones(()), DT, may_jump=True)
+        channel = measured(channel, jnp.array(features[None]), jnp.array(value), jnp.array(kinds))
         if k % 10 == 9:
-            channel = channel.predicted_by(posterior.path_posterior(channel, prior, None, DT))
+            channel = predicted(channel, prior)
         u = np.array([0.0, 0.0, 0.0, rng.choice([-1.0, 1.0])])
-        history = history.issued(jnp.array(u, float))
+        history = issued(history, jnp.array(u))
     return channel, prior, np.array(rows), np.array(values)
 
 
@@ -105,7 +129,7 @@ def _brute_force(cells, kind, channel, prior, rows, values):
     n, (mu, wander) = len(values), kind
     step = np.minimum.outer(np.arange(n), np.arange(n))
     dense = noise.DIFFUSE + wander * step + (1.0 + mu**2) * np.eye(n) - mu * (np.eye(n, k=1) + np.eye(n, k=-1))
-    h = np.asarray(posterior.responses(cells, jnp.zeros(()), jnp.zeros(()), prior.hover, DT), float)
+    h = np.asarray(responses(cells, prior.hover))
     y = rows @ h.T
     left = values[:, None] - float(prior.gain) * y
     loading = y * float(prior.gain_spread) / float(channel.noise)
@@ -121,7 +145,7 @@ def _brute_force(cells, kind, channel, prior, rows, values):
 @pytest.mark.parametrize(("kinds", "kind", "sigma"), [(noise.DIRECT, 0, 0.05), (noise.DIFFERENCE, 0, 0.1)])
 def test_it_is_the_exact_posterior_of_a_linear_vehicle(kinds, kind, sigma):
     channel, prior, rows, values = _linear_channel(kind, kinds, sigma)
-    result = posterior.path_posterior(channel, prior, None, DT)
+    result = path_posterior(channel, prior)
     choice = kinds[int(result.kind)]
     axes = np.linspace(0.0, 0.06, 49), np.log(np.geomspace(0.04, 0.14, 49)), np.linspace(0.01, 0.85, 29)
     grid = np.meshgrid(*axes, indexing="ij")
@@ -139,17 +163,20 @@ def test_it_is_the_exact_posterior_of_a_linear_vehicle(kinds, kind, sigma):
         assert 0.75 < spread / deviation < 1.3
     likely = np.asarray(result.cells)[np.argsort(-np.asarray(result.weight))[:50]]
     again = _brute_force(jnp.array(likely, float), choice, channel, prior, rows, values)
-    here = np.asarray(posterior.log_likelihood(channel, prior, jnp.array(likely), DT))[int(result.kind)]
+    here = np.asarray(log_likelihood(channel, prior, jnp.array(likely), DT))[int(result.kind)]
     np.testing.assert_allclose(here - here[0], again - again[0], atol=0.1)
 
 
 @pytest.fixture(scope="module")
 def many():
-    """Fifty random vehicles, excited for a second, with the sensors ``onboard``."""
+    """Fifty random vehicles, excited for a second, with the sensors ``onboard``.
+
+    As beside a live flight, every fifth tick has a new estimate.
+    """
     rng = np.random.default_rng(20)
     vehicles = random_vehicles(rng, 50)
     flights = fly(rng, vehicles, LEVELS["onboard"], 1.0, doublets)
-    return vehicles, [estimate(flights, i) for i in range(50)]
+    return vehicles, [estimate(flights, i, every=5) for i in range(50)]
 
 
 def test_fifty_vehicles_are_identified_within_a_second(many):
@@ -184,28 +211,12 @@ def test_roll_and_pitch_may_change_places_and_clocks_may_start_anywhere():
 
 
 def test_nothing_is_compiled_for_other_values():
-    traces = []
-
-    @jax.jit
-    def update(s, t, x, omega, a, age, u):
-        traces.append(1)
-        return ESTIMATOR.issued(ESTIMATOR.update(s, t, x, omega, a, age), u)
-
-    for delay in (0.01, 0.053):
-        flights = fly(np.random.default_rng(2), one_vehicle(delay=delay), LEVELS["rough"], 0.2, doublets)
-        p, R, v, omega, a, u = (jnp.asarray(x[0], jnp.float32) for x in flights[:6])
-        s = ESTIMATOR.init(State(p[0], R[0], v[0]))
-        for k in range(10):
-            s = update(
-                s,
-                jnp.float32(k * DT),
-                State(p[k], R[k], v[k]),
-                omega[k],
-                a[k],
-                jnp.float32(flights.age),
-                Command.of(u[k]),
-            )
-    assert len(traces) == 1
+    """Neither of vehicles, sensors and times, nor of the memory after some ticks."""
+    estimate(fly(np.random.default_rng(2), one_vehicle(delay=0.01), LEVELS["ideal"], 0.2, doublets))
+    program = len(TRACES)
+    assert program > 0
+    estimate(fly(np.random.default_rng(3), one_vehicle(delay=0.053), LEVELS["rough"], 1.2, doublets), start=5.0)
+    assert len(TRACES) == program
 
 
 @pytest.mark.parametrize("inertial", [True, False])
@@ -244,7 +255,7 @@ def test_it_follows_a_change_of_the_vehicle():
 
     before, after = one_vehicle(rate_lag=0.04), one_vehicle(rate_lag=0.1)
     flights = fly(np.random.default_rng(6), before, LEVELS["onboard"], 7.0, excite, after, 2.0)
-    result = estimate(flights)
+    result = estimate(flights, every=5)
     assert result.rate_lag.mean[95] == pytest.approx(0.04, rel=0.1)
     assert result.rate_lag.mean[-1] == pytest.approx(0.1, rel=0.2)
 
@@ -261,7 +272,7 @@ def test_the_line_that_reports_it():
 
 
 def test_excitation_is_bounded_returns_and_stops():
-    excitation, s = Excitation.of(), ESTIMATOR.init(State.at(jnp.zeros(3)))
+    excitation, s = Excitation.of(), estimator().init(State.at(jnp.zeros(3)))
     times = jnp.arange(0.0, 0.48, 0.004)
     c = jax.vmap(lambda t: excitation(t, s.estimate).c)(times)
     v = np.cumsum(c) * 0.004

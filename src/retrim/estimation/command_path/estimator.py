@@ -6,6 +6,7 @@ Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimat
 """
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from ...physics.state import STANDARD_GRAVITY, Command, State
 from ..consistency import ACCELERATION, RATE, Consistency
 from ..latency import follows
 from .channel import Channel, Sample
-from .estimate import Estimate, PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
+from .estimate import PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
 from .history import CommandHistory
 from .noise import DIFFERENCE, DIRECT
 from .posterior import channel_before, path_posterior
@@ -83,6 +84,8 @@ class PathEstimator(eqx.Module):
     thrust: Prior
     memory: Float[Array, ""]
     """Time after which the weight of a measurement is 1/e of that of the newest [s]."""
+    start: tuple[Channels, PathEstimate]
+    """Sums and estimate before the first measurement; a program that contains a flight does not compute them."""
     dt: float = eqx.field(static=True)
     """Control tick [s]."""
 
@@ -108,24 +111,14 @@ class PathEstimator(eqx.Module):
         thrust = Prior(
             one, 0.3 * one, 0.04 * one, 0.8 * one, other, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
         )
-        return cls(rates, yaw, thrust, memory * one, dt)
+        return cls(rates, yaw, thrust, memory * one, _start(rates, yaw, thrust, dt), dt)
 
     def init(self, x: State) -> PathState:
         """Return the memory of a vehicle that has hovered until now and is measured at ``x``."""
-        channels = Channels(
-            channel_before(2, self.rates, self.dt),
-            channel_before(1, self.yaw, self.dt),
-            channel_before(1, self.thrust, self.dt),
-            channel_before(1, self.thrust, self.dt),
-        )
         x = jax.tree.map(lambda leaf: leaf.astype(self.memory.dtype), x)
-        zero = jnp.zeros(())
-        unknown = Estimate(zero, zero, zero, zero, jnp.array(False))
-        estimate = PathEstimate(*(unknown,) * 8)
-        start = Consistency.start(x)
-        return self.estimate_path(
-            PathState(CommandHistory.at_hover(self.dt), x, zero - jnp.inf, zero, start, channels, estimate)
-        )
+        zero, (channels, estimate) = jnp.zeros(()), self.start
+        consistency = Consistency.start(x)
+        return PathState(CommandHistory.at_hover(self.dt), x, zero - jnp.inf, zero, consistency, channels, estimate)
 
     def update(
         self,
@@ -203,32 +196,9 @@ class PathEstimator(eqx.Module):
         return PathState(history, x, t, s.elapsed + dt, consistency, channels, s.estimate)
 
     def estimate_path(self, s: PathState) -> PathState:
-        """Return the memory with a new estimate.
-
-        The rates determine the delay for all channels, and the accelerations provide a prior for the velocities.
-        """
-        channels = s.channels
-        rates = path_posterior(channels.rates, self.rates, None, self.dt)
-        yaw = path_posterior(channels.yaw, self.yaw, delay_belief(rates, self.yaw), self.dt)
-        force = path_posterior(channels.force, self.thrust, delay_belief(rates, self.thrust), self.dt)
-        thrust = path_posterior(channels.thrust, self.thrust, full_belief(force), self.dt)
-        estimate = PathEstimate(
-            delay_estimate(rates),
-            lag_estimate(rates, self.rates.lag_spread),
-            damping_estimate(rates),
-            gain_estimate(rates, self.rates.gain_spread),
-            lag_estimate(yaw, self.yaw.lag_spread),
-            gain_estimate(yaw, self.yaw.gain_spread),
-            lag_estimate(thrust, self.thrust.lag_spread),
-            gain_estimate(thrust, self.thrust.gain_spread),
-        )
-        result = Channels(
-            channels.rates.predicted_by(rates),
-            channels.yaw.predicted_by(yaw),
-            channels.thrust.predicted_by(thrust),
-            channels.force.predicted_by(force),
-        )
-        return dataclasses.replace(s, channels=result, estimate=estimate)
+        """Return the memory with a new estimate."""
+        channels, estimate = _estimate(s.channels, self.rates, self.yaw, self.thrust, self.dt)
+        return dataclasses.replace(s, channels=channels, estimate=estimate)
 
     def issued(self, s: PathState, u: Command) -> PathState:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""
@@ -237,6 +207,46 @@ class PathEstimator(eqx.Module):
     def accepted(self, s: PathState, u: Command) -> PathState:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
         return dataclasses.replace(s, history=s.history.replaced(_from_hover(u)))
+
+
+@partial(jax.jit, static_argnames="dt")
+def _start(rates: Prior, yaw: Prior, thrust: Prior, dt: float) -> tuple[Channels, PathEstimate]:
+    """Return the sums and the estimate before the first measurement."""
+    channels = Channels(
+        channel_before(2, rates, dt),
+        channel_before(1, yaw, dt),
+        channel_before(1, thrust, dt),
+        channel_before(1, thrust, dt),
+    )
+    return _estimate(channels, rates, yaw, thrust, dt)
+
+
+def _estimate(channels: Channels, rates: Prior, yaw: Prior, thrust: Prior, dt: float) -> tuple[Channels, PathEstimate]:
+    """Return the sums relative to a new prediction, and the estimate.
+
+    The rates determine the delay for all channels, and the accelerations provide a prior for the velocities.
+    """
+    of_rates = path_posterior(channels.rates, rates, None, dt)
+    of_yaw = path_posterior(channels.yaw, yaw, delay_belief(of_rates, yaw), dt)
+    of_force = path_posterior(channels.force, thrust, delay_belief(of_rates, thrust), dt)
+    of_thrust = path_posterior(channels.thrust, thrust, full_belief(of_force), dt)
+    estimate = PathEstimate(
+        delay_estimate(of_rates),
+        lag_estimate(of_rates, rates.lag_spread),
+        damping_estimate(of_rates),
+        gain_estimate(of_rates, rates.gain_spread),
+        lag_estimate(of_yaw, yaw.lag_spread),
+        gain_estimate(of_yaw, yaw.gain_spread),
+        lag_estimate(of_thrust, thrust.lag_spread),
+        gain_estimate(of_thrust, thrust.gain_spread),
+    )
+    result = Channels(
+        channels.rates.predicted_by(of_rates),
+        channels.yaw.predicted_by(of_yaw),
+        channels.thrust.predicted_by(of_thrust),
+        channels.force.predicted_by(of_force),
+    )
+    return result, estimate
 
 
 def _from_hover(u: Command) -> Float[Array, "4"]:
