@@ -21,10 +21,14 @@ os.environ["XLA_FLAGS"] = " ".join(
     )
 )
 
-import retrim  # noqa: F401  (before jax: it quiets the log of the compile cache)  # isort: skip
-import jax
-import pytest
-from hypothesis import settings
+from shape_checks import keep_checks  # isort: skip
+
+keep_checks()  # before the functions that it is about are defined
+
+import retrim  # noqa: E402, F401  (before jax: it quiets the log of the compile cache)  # isort: skip
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

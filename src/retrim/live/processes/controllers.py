@@ -102,8 +102,8 @@ def vehicle_half(setup: Setup, controller: AbstractController[Any]) -> dict[str,
         raise ConfigError(
             "family.excitation: a live flight does not excite its vehicle; remove the key or set it to false"
         )
-    first = PathEstimator.of(setup.preset.dt).init(State.at(setup.flight_task.home()))
-    return {VEHICLE: vehicle_estimate(family, first.estimate)}
+    _, estimate = PathEstimator.of(setup.preset.dt).start
+    return {VEHICLE: vehicle_estimate(family, estimate)}
 
 
 def _source(setup: Setup, controller: Any, prediction: Any, parameters: dict[str, Any]) -> ControllerSource:

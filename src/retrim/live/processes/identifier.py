@@ -120,7 +120,7 @@ class IdentifierLoop:
         dtype = np.dtype(np.float32)
         t, age = (jnp.asarray(value, dtype) for value in (row[1], row[2]))
         x, u = state_of(row[MEASURED], dtype), Command.of(jnp.asarray(row[COMMAND], dtype))
-        state = self._estimator.init(x) if self._state is None else self._state
+        state = _start(self._estimator, x) if self._state is None else self._state
         self._state = _measure(self._estimator, state, t, x, age, u)
         self._t, self._row_count = float(row[1]), self._row_count + 1
         if self._row_count % PIECE == 0:
@@ -138,6 +138,11 @@ class IdentifierLoop:
         if len(self._reports) < len(REPORTS) and t >= REPORTS[len(self._reports)]:
             self._reports.append((t, VehicleReport(self._state.estimate, self._declared).note()))
             self.bus.publish("identified", pack_note("identified", reports=self._reports))
+
+
+@eqx.filter_jit
+def _start(estimator: PathEstimator, x: State) -> EstimatorState:
+    return estimator.init(x)
 
 
 @eqx.filter_jit
