@@ -40,14 +40,15 @@ def mean_response(age: np.ndarray, dt: float, path: Path) -> np.ndarray:
     if abs(slow - fast) < SHARED:
         slow, fast = slow + SHARED, fast - SHARED
     fast = fast if abs(fast) > SHARED else complex(SHARED)
-
-    def ramp(t: np.ndarray) -> np.ndarray:
-        after = np.maximum(t, 0.0)
-        ends = slow**2 * np.exp(-after / slow) - fast**2 * np.exp(-after / fast)
-        return np.asarray(after - (slow + fast).real + (ends / (slow - fast)).real)
-
     t = age - path.delay
-    return np.asarray((ramp(t) - ramp(t - dt)) / dt)
+    return np.asarray((_ramp(t, slow, fast) - _ramp(t - dt, slow, fast)) / dt)
+
+
+def _ramp(t: np.ndarray, slow: complex, fast: complex) -> np.ndarray:
+    """Return the integral of the step response with two time constants [s]."""
+    after = np.maximum(t, 0.0)
+    ends = slow**2 * np.exp(-after / slow) - fast**2 * np.exp(-after / fast)
+    return np.asarray(after - (slow + fast).real + (ends / (slow - fast)).real)
 
 
 def respond(command: np.ndarray, dt: float, path: Path) -> np.ndarray:

@@ -51,12 +51,15 @@ def _transport(z: np.ndarray, x: np.ndarray) -> np.ndarray:
     result = np.empty_like(z)
     x = x - z[0] * (z[0] @ x)
     result[0] = x / np.linalg.norm(x)
-    for k in range(1, len(z)):
-        axis = np.cross(z[k - 1], z[k])
-        x = result[k - 1]
-        x = x + np.cross(axis, x) + np.cross(axis, np.cross(axis, x)) / (1.0 + z[k - 1] @ z[k])
+    axis, zero = np.cross(z[:-1], z[1:]), np.zeros(len(z) - 1)
+    cross = np.stack(
+        [zero, -axis[:, 2], axis[:, 1], axis[:, 2], zero, -axis[:, 0], -axis[:, 1], axis[:, 0], zero], axis=1
+    ).reshape(-1, 3, 3)
+    turns = np.eye(3) + cross + cross @ cross / (1.0 + np.sum(z[:-1] * z[1:], axis=1))[:, None, None]
+    for k, turn in enumerate(turns, start=1):
+        x = turn @ result[k - 1]
         x = x - z[k] * (z[k] @ x)
-        result[k] = x / np.linalg.norm(x)
+        result[k] = x / np.sqrt(x @ x)
     return result
 
 

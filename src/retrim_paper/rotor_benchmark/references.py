@@ -8,8 +8,9 @@ Each function takes no arguments, so that it can be registered by name as a refe
 """
 
 import math
-from functools import partial
+from functools import cache, partial
 
+import jax
 import numpy as np
 
 from retrim.tasks.free_heading import with_free_heading
@@ -24,11 +25,19 @@ RAMP = 5.0  # [s], duration of the smooth start, so that every flight is on its 
 
 def circle_at_mean(speed: float) -> Reference:
     """Return the circle at a constant speed [m/s]."""
-    return with_free_heading(circle(RADIUS, 2.0 * math.pi * RADIUS / speed, ramp=RAMP))
+    return _sampled("circle", speed, jax.config.values["jax_enable_x64"])
 
 
 def lemniscate_at_mean(speed: float) -> Reference:
     """Return the lemniscate x = r cos(phi), y = r sin(phi) cos(phi) with a mean speed [m/s]; phi turns uniformly."""
+    return _sampled("lemniscate", speed, jax.config.values["jax_enable_x64"])
+
+
+@cache
+def _sampled(shape: str, speed: float, x64: bool) -> Reference:
+    """Return a trajectory, sampled once per process and precision: every cell trains on all ten."""
+    if shape == "circle":
+        return with_free_heading(circle(RADIUS, 2.0 * math.pi * RADIUS / speed, ramp=RAMP))
     phi = np.linspace(0.0, 2.0 * math.pi, 20_001)
     length = float(np.trapezoid(RADIUS * np.hypot(np.sin(phi), np.cos(2.0 * phi)), phi))
     return with_free_heading(figure8(2.0 * RADIUS, RADIUS, length / speed, ramp=RAMP))

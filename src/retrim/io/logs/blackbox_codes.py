@@ -101,19 +101,14 @@ def _four(data: bytes, at: int, count: int) -> tuple[tuple[int, ...], int]:
     """Return four numbers of 0, 4, 8 or 16 bits, without gaps between their half bytes."""
     tag, values = data[at], []
     half = 2 * (at + 1)  # offset in half bytes
-
-    def take(size: int) -> int:
-        nonlocal half
+    for shift in (0, 2, 4, 6):
+        size = (0, 1, 2, 4)[tag >> shift & 3]
         value = 0
         for _ in range(size):
             byte = data[half >> 1]
             value = value << 4 | (byte & 15 if half & 1 else byte >> 4)
             half += 1
-        return _extend(value, 4 * size)
-
-    for shift in (0, 2, 4, 6):
-        size = (0, 1, 2, 4)[tag >> shift & 3]
-        values.append(take(size) if size else 0)
+        values.append(_extend(value, 4 * size) if size else 0)
     return tuple(values), (half + 1) >> 1
 
 
