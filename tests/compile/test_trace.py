@@ -180,7 +180,9 @@ def test_a_preset_flies_the_same_commands(preset, reference):
         memory, t, x = inputs
         return setup.controller(eqx.combine(parameters, fixed))(memory, t, x)
 
-    memory = setup.controller(state).init(State.at(jnp.array([0.0, 0.0, 1.0])))
+    memory = eqx.filter_jit(lambda state, x: setup.controller(state).init(x))(
+        state, State.at(jnp.array([0.0, 0.0, 1.0]))
+    )
     program = NumpyProgram(numpy_program(decide, parameters, (memory, jnp.array(0.0), State.at(jnp.zeros(3)))))
     preparation, memory_before, jitted = program.prepare(leaves(parameters)), leaves(memory), jax.jit(decide)
     for i in range(25):

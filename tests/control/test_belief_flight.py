@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax, random
+from jaxtyping import Array, Float
 
 from retrim.config import Setup, changed, load
 from retrim.config.families import prior_belief
@@ -69,17 +70,22 @@ class Still(AbstractController[None]):
         return Command(jnp.asarray(9.81, t.dtype), jnp.zeros(3, t.dtype)), None
 
 
+class Lift(eqx.Module):
+    """A lift from 2 s on; a leaf, so that flights with another one are the same program."""
+
+    size: Float[Array, ""]
+
+    def __call__(self, t, x):
+        push = jnp.where(t >= 2.0, self.size, 0.0) * jnp.array([0.0, 0.0, 1.0], x.p.dtype)
+        return dataclasses.replace(ExternalEffects.calm(x.p.dtype), push=push.astype(x.p.dtype))
+
+
 def simulation(delay, lag, *, damping=1.0, gain=1.0, lift=0.0):
     """Return a vehicle that is lifted by ``lift`` [m/s^2] from 2 s on."""
     limits = (small().command_min, small().command_max)
     response = ActuatorResponse.of(0.03, lag, inverse_damping=1.0 / damping, thrust_gain=gain)
-
-    def lift_by(t, x):
-        push = jnp.where(t >= 2.0, lift, 0.0) * jnp.array([0.0, 0.0, 1.0], x.p.dtype)
-        return dataclasses.replace(ExternalEffects.calm(x.p.dtype), push=push.astype(x.p.dtype))
-
     model = SecondOrderQuadrotor(response, jnp.array(1.0), jnp.array(0.3), limits, DT)
-    return Simulation(model, lift_by, None, random.key(0), jnp.array(delay))
+    return Simulation(model, Lift(jnp.array(lift)), None, random.key(0), jnp.array(delay))
 
 
 @eqx.filter_jit
@@ -117,7 +123,7 @@ def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
 def test_excitation_identifies_a_vehicle_that_stands_still():
     """Without the doublets, delay and lag are not excited."""
     flights, at = {}, 50  # 1 s
-    for name, excitation in {"still": None, "excited": Excitation.of()}.items():
+    for name, excitation in {"still": Excitation.of(longest=0.0), "excited": Excitation.of()}.items():
         controller = IdentifiedFlight(
             Still(), PathEstimator.of(DT), family(), PathBelief.unknown(), excitation=excitation
         )

@@ -1,5 +1,7 @@
 """The largest pace: at its factors, commands reach the limits of the vehicle and do not exceed them."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,21 +10,27 @@ from jax import lax
 
 from retrim.config.loading import load
 from retrim.config.pacing import pace_limits, training_tables
-from retrim.control.pace import STEP, PaceLimits, largest_factors, largest_growth, points_ahead
-from retrim.control.paced_flight import feasible_share, ideal_step, slow_pace
+from retrim.control import pace, paced_flight
+from retrim.control.pace import STEP, PaceLimits, largest_growth, points_ahead
+from retrim.control.paced_flight import ideal_step
 from retrim.physics import large, small
 from retrim.tasks.paced_reference import Clock, PacedReference, at_pace
 from retrim.tasks.shapes import circle, figure8, star
 
 UP = np.array([0.0, 0.0, 9.81])
+# One program each, instead of one for each operation.
+largest_factors = jax.jit(pace.largest_factors)
+feasible_share = jax.jit(paced_flight.feasible_share)
+slow_pace = jax.jit(paced_flight.slow_pace)
 
 
 def limits(thrust=30.0, rates=(8.0, 8.0, 4.0), lag=0.0, corner=0.05):
     return PaceLimits(jnp.array(thrust), jnp.array(rates), jnp.full(3, lag), jnp.array(corner), jnp.array(10.0))
 
 
+@jax.jit
 def points_of(reference, pace=1.0, phase=4.0):
-    clock = Clock(jnp.array(0.0), jnp.array(phase), jnp.array(pace), jnp.array(0.0))
+    clock = Clock(jnp.array(0.0), jnp.asarray(phase, float), jnp.asarray(pace, float), jnp.array(0.0))
     return points_ahead(reference, clock)[1]
 
 
@@ -44,17 +52,18 @@ def test_thrust_at_the_factor_is_the_limit(push, thrust, pace):
     np.testing.assert_allclose(needed, thrust, rtol=1e-6)
 
 
+@jax.jit
+def factors_along(reference, bounds, share):
+    phases = jnp.arange(0.0, 3.0, STEP) + 4.0
+    points = jax.vmap(lambda phase: at_pace(reference(phase), share, jnp.zeros(())))(phases)
+    return largest_factors(points, bounds, still(points), STEP / share)
+
+
 def test_factors_are_inverse_to_the_pace():
     """The same path at twice the pace has half the factors for thrust, and for a corner."""
     for bounds in (limits(20.0, (1e6,) * 3, corner=1e9), limits(1e6, (1e6,) * 3)):
         reference = star() if float(bounds.thrust) > 1e5 else figure8()
-        phases = jnp.arange(0.0, 3.0, STEP) + 4.0
-
-        def at(pace, reference=reference, phases=phases):
-            points = jax.vmap(lambda phase: at_pace(reference(phase), pace, jnp.zeros(())))(phases)
-            return largest_factors(points, bounds, still(points), STEP / pace)  # noqa: B023
-
-        slow, fast = at(jnp.array(0.5)), at(jnp.array(1.0))
+        slow, fast = (factors_along(reference, bounds, jnp.array(share)) for share in (0.5, 1.0))
         np.testing.assert_allclose(slow.min() / fast.min(), 2.0, rtol=1e-2)
 
 
@@ -63,7 +72,7 @@ def test_a_corner_is_cut_by_the_permitted_distance():
     reference = star()
     bounds = limits(1e6, (1e6,) * 3)
     phases = jnp.arange(3.0, 9.0, STEP)
-    points = jax.vmap(reference)(phases)
+    points = jax.jit(jax.vmap(reference))(phases)
     factors = largest_factors(points, bounds, still(points))
     v = np.asarray(points.v)
     jump = np.linalg.norm(np.diff(v, axis=0), axis=1).max()
@@ -89,6 +98,15 @@ def test_growth_meets_the_first_limit_in_time():
     assert float(largest_growth(tau, factors, jnp.array(0.5))) < float(growth)
 
 
+@partial(jax.jit, static_argnames="dt")
+def ideal_flight(reference, bounds, dt):
+    def step(clock, _):
+        point = PacedReference(reference, clock)(clock.t)
+        return ideal_step(reference, bounds, clock, jnp.array(1.0), dt), (clock, point)
+
+    return lax.scan(step, Clock.at_pace(slow_pace(reference)), None, length=1500)[1]
+
+
 @pytest.mark.parametrize("make", [circle, figure8, star])
 @pytest.mark.parametrize("vehicle", [small, large])
 def test_an_ideal_flight_stays_within_the_limits(make, vehicle):
@@ -96,15 +114,7 @@ def test_an_ideal_flight_stays_within_the_limits(make, vehicle):
     reference, dt = make(), 0.02
     bounds = pace_limits(load("track/retrim"), vehicle())
 
-    @jax.jit
-    def fly():
-        def step(clock, _):
-            point = PacedReference(reference, clock)(clock.t)
-            return ideal_step(reference, bounds, clock, jnp.array(1.0), dt), (clock, point)
-
-        return lax.scan(step, Clock.at_pace(slow_pace(reference)), None, length=1500)[1]
-
-    clocks, points = jax.tree.map(np.asarray, fly())
+    clocks, points = jax.tree.map(np.asarray, ideal_flight(reference, bounds, dt))
     assert (np.diff(clocks.phase) > 0.0).all()
     assert float(clocks.pace.max()) > 1.5 * float(clocks.pace[0])
     full = vehicle()
@@ -125,7 +135,7 @@ def test_an_ideal_flight_stays_within_the_limits(make, vehicle):
 def test_the_first_lap_is_slow_and_its_share_is_known():
     reference, bounds = figure8(), pace_limits(load("track/retrim"), large())
     pace = slow_pace(reference)
-    points = jax.vmap(reference)(jnp.linspace(0.0, 8.0, 400))
+    points = jax.jit(jax.vmap(reference))(jnp.linspace(0.0, 8.0, 400))
     assert float(pace) * float(jnp.linalg.norm(points.v, axis=1).max()) <= 1.0 + 1e-6
     assert 0.0 < float(feasible_share(reference, bounds, pace)) < 0.3
     assert float(feasible_share(reference, bounds, 100.0 * pace)) == 1.0
