@@ -144,15 +144,15 @@ def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_
             listener.close()
 
 
-def test_a_crazyflie_whose_bridge_is_killed_falls(small, tmp_path):
-    """There is nothing on board that would hold it: after two seconds without a setpoint its motors stop."""
+def test_a_crazyflie_whose_bridge_is_killed_is_landed_by_its_guardian(small, tmp_path):
+    """Without a guardian, its motors would stop after two seconds without a setpoint, and it would lock itself."""
     with start_vehicle("crazyflie"):
         kill_in_flight("crazyflie", small, tmp_path)
         listener = CrazyflieLink(UdpEndpoint("127.0.0.1", 0), ("127.0.0.1", PORT))
         try:
             listener.start_logs(5.0, lambda: True)
             listener.pump(time.monotonic() + 3.5)
-            assert not listener.status.info & crtp.FLYING
+            assert not listener.status.info & (crtp.FLYING | crtp.LOCKED)
             assert abs(listener.reading.p[2]) < 0.1
         finally:
             listener.close()

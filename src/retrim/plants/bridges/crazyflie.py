@@ -11,6 +11,7 @@ from . import crtp
 from .crazyflie_link import CrazyflieLink
 from .endpoint import UdpEndpoint, address_of, address_towards
 from .frames import heading_of
+from .guardian import Guardian, Phase, SafeCommands
 from .linked_plant import LinkedPlant, ThrustScale
 from .polling import KeepOn, insisting
 from .vehicle_state import VehicleState
@@ -23,6 +24,7 @@ WANDERS = 0.1  # [m], largest change in the estimated position while it stands s
 SPEED, RISE_S = 0.5, 2.0  # [m/s] during the flight to the start; [s] of a take-off
 THRUST_S = 2.0  # [s] over which the thrust at hover is identified
 GROUND = 0.1  # [m] above its take-off height
+ORDER_EVERY_S, ORDERS_S = 0.05, 0.25  # [s]: the guardian repeats the order to land, since a radio loses packets
 WRONG = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crtp.CRASHED: "has crashed"}
 
 
@@ -50,6 +52,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             raise ConfigError(f"dt = {dt} s: a Crazyflie is commanded at 10 to 100 Hz")
         self.thrust = ThrustScale(*crtp.THRUST)
         self._flies, self._floor = False, 0.0
+        self._guardian: Guardian | None = None
 
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Connect, and wait until the Crazyflie has a position estimate and can be armed."""
@@ -76,6 +79,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Fly to a position using the Crazyflie's own commander, and identify the thrust command at hover."""
         link, x = self.link, self.reading()
+        self._release_guardian()  # from an earlier start
         if not self._is(crtp.FLYING):
             self._floor = float(x.p[2])
         place = x.p + np.array([0.0, 0.0, 1.0]) if p is None else np.asarray(p, dtype=float)
@@ -105,6 +109,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         link.thrusts.clear()
         self.hold(time.monotonic() + THRUST_S)
         self.thrust.learn(link.thrusts)
+        self._guardian = link.guard(landing_orders(self._floor, float(place[2]) - self._floor))
 
     def hold(self, until: float) -> None:
         """Hold the take-off position using the Crazyflie's commander."""
@@ -128,6 +133,8 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         """Send thrust and body rates."""
         thrust = round(self.thrust.command(float(u[0])))
         self.link.send(crtp.rates_setpoint(thrust, u[1:]))
+        if self._guardian is not None:
+            self._guardian.feed()
         return np.concatenate([[self.thrust.per_mass(float(thrust))], u[1:]])
 
     def wait(self, until: float) -> None:
@@ -137,6 +144,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
     def land(self) -> None:
         """Land the Crazyflie using its own commander, and disarm it; ignore a vehicle that no longer answers."""
         link, self._link = self._link, None
+        self._release_guardian()
         if link is None:
             return
         try:
@@ -167,6 +175,11 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             link.send(order)
             link.pump(time.monotonic() + 0.1)
 
+    def _release_guardian(self) -> None:
+        guardian, self._guardian = self._guardian, None
+        if guardian is not None:
+            guardian.release()
+
     def _is(self, bits: int) -> bool:
         """Return whether the Crazyflie's supervisor reports any of these bits."""
         status = self.link.status
@@ -188,6 +201,17 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
                 f"{self.address}: the Crazyflie stands, and its estimate wandered by {wanders:.2f} m in {STILL_S:g} s; "
                 f"is there a positioning system?"
             )
+
+
+def landing_orders(floor: float, height: float) -> SafeCommands:
+    """Return a guardian's packets: the setpoints have ended, and the Crazyflie's own commander lands it.
+
+    Args:
+        floor: Height at which it took off [m].
+        height: Height of the start above the floor [m]; the flight may be higher, so the landing takes twice as long.
+    """
+    landing = crtp.land(floor, max(RISE_S, 2.0 * height / SPEED))
+    return SafeCommands((Phase((crtp.relax().pack(), landing.pack()), ORDER_EVERY_S, ORDERS_S),))
 
 
 def check_address(address: str) -> str:

@@ -13,6 +13,7 @@ from . import crtp
 from .clock import ArrivalClock
 from .crtp import Packet
 from .endpoint import Endpoint, pump
+from .guardian import Guardian, SafeCommands
 from .polling import KeepOn, insisting, wait_until
 from .vehicle_state import Reading
 
@@ -62,6 +63,10 @@ class CrazyflieLink:
     def send(self, packet: Packet) -> None:
         """Send a packet; its arrival is not confirmed."""
         self._endpoint.send(packet.pack(), self._to)
+
+    def guard(self, commands: SafeCommands) -> Guardian:
+        """Start a guardian that sends from the same port to the same Crazyflie."""
+        return Guardian(commands, self._endpoint.fileno(), self._to)
 
     def ask(self, question: Packet, same: int, patience: float, keep_on: KeepOn) -> bytes:
         """Send a request repeatedly until the answer arrives, and return the answer.
