@@ -3,6 +3,7 @@
 This module does not decide which pilot flies; :mod:`.plant` does.
 """
 
+import io
 import time
 from collections.abc import Callable
 from typing import Any
@@ -10,48 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..plants.bridges.ros_states import RosStates
+from ..plants.bridges.target_guardian import RATES_IGNORED, TargetGuardian, level
+from .attitude_target import attitude_target
 from .node import join, system_module
 
 ODOMETRY, POSE, TARGET = "local_position/odom", "local_position/pose", "setpoint_raw/attitude"
 RATES_ONLY = 128  # type_mask of an AttitudeTarget: ignore the attitude
-ATTITUDE_TARGET = """std_msgs/Header header
-uint8 type_mask
-uint8 IGNORE_ROLL_RATE = 1
-uint8 IGNORE_PITCH_RATE = 2
-uint8 IGNORE_YAW_RATE = 4
-uint8 IGNORE_THRUST = 64
-uint8 IGNORE_ATTITUDE = 128
-geometry_msgs/Quaternion orientation
-geometry_msgs/Vector3 body_rate
-float32 thrust
-================================================================================
-MSG: std_msgs/Header
-uint32 seq
-time stamp
-string frame_id
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
-"""Fields of mavros_msgs/AttitudeTarget; nodes compare their checksum. Debian does not provide mavros."""
-
-
-def attitude_target() -> Any:
-    """Return the type mavros_msgs/AttitudeTarget.
-
-    Raises:
-        ConfigError: genpy is not installed.
-    """
-    message_class = system_module("genpy.dynamic").generate_dynamic("mavros_msgs/AttitudeTarget", ATTITUDE_TARGET)
-    return message_class["mavros_msgs/AttitudeTarget"]
 
 
 class RosLink(RosStates):
@@ -69,6 +34,7 @@ class RosLink(RosStates):
         """
         rospy = join(master)
         super().__init__()
+        self._words = master, f"{namespace}/{TARGET}"
         self._rospy, self._target = rospy, attitude_target()
         odometry, pose = system_module("nav_msgs.msg").Odometry, system_module("geometry_msgs.msg").PoseStamped
         self._ends = [
@@ -90,6 +56,24 @@ class RosLink(RosStates):
         target.type_mask, target.thrust, target.orientation.w = RATES_ONLY, float(thrust), 1.0
         target.body_rate.x, target.body_rate.y, target.body_rate.z = map(float, omega)
         self._publisher.publish(target)
+
+    def target_guardian(self) -> TargetGuardian:
+        """Start a guardian with a node of its own."""
+        return TargetGuardian("retrim.ros1.relay", self._words)
+
+    def level_target(self, thrust: float, yaw: float) -> bytes:
+        """Return a serialised AttitudeTarget.
+
+        Args:
+            thrust: Share of the motors' thrust, 0 to 1.
+            yaw: Heading of the level attitude [rad].
+        """
+        target, data = self._target(), io.BytesIO()
+        target.header.stamp = self._rospy.Time.from_sec(time.time())
+        target.type_mask, target.thrust = RATES_IGNORED, thrust
+        target.orientation.z, target.orientation.w = level(yaw)
+        target.serialize(data)
+        return data.getvalue()
 
     def close(self) -> None:
         """Unregister from the topics; the node exists until the process ends."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from ..config.scenario import Scenario
 from ..testing.peer_vehicle import PeerVehicle, fly_until_interrupt
-from .link import ODOMETRY, POSE, TARGET, attitude_target
+from .attitude_target import attitude_target
+from .link import ODOMETRY, POSE, TARGET
 from .node import join, system_module
 from .plant import NAMESPACE
 
@@ -24,7 +25,10 @@ FRESH_S = 0.3  # [s]: time for which a target is valid
 class RosPeer:
     """A vehicle and its autopilot; :meth:`step` advances both by 0.01 s."""
 
-    def __init__(self, master: str, scenario: Scenario, *, place: np.ndarray, yaw: float, poses: bool = False) -> None:
+    def __init__(
+        self, master: str, scenario: Scenario, *, place: np.ndarray, yaw: float, poses: bool = False,
+        fresh: float = FRESH_S,
+    ) -> None:  # fmt: skip
         """Build a vehicle that is about to take off.
 
         Args:
@@ -33,7 +37,10 @@ class RosPeer:
             place: Position at which the vehicle waits, world [m].
             yaw: Heading with which the vehicle waits [rad].
             poses: Whether the peer publishes poses instead of odometry.
+            fresh: Time for which a target is valid [s]; some stacks hold the last one for ever.
         """
+        self.fresh, self.cut = fresh, False
+        """Time for which a target is valid [s], and whether the network is cut in both directions."""
         rospy = join(master)
         self._rospy, self._poses = rospy, poses
         self._kind = system_module("geometry_msgs.msg").PoseStamped if poses else system_module("nav_msgs.msg").Odometry
@@ -43,23 +50,26 @@ class RosPeer:
         rospy.Subscriber(f"{NAMESPACE}/{TARGET}", attitude_target(), self._hear, queue_size=1, tcp_nodelay=True)
         self.vehicle = PeerVehicle(scenario, heading=0.0)
         self._place, self._yaw = place, yaw
-        self._last_command_time, self._u, self._by_rates = -math.inf, np.zeros(4), False
+        self._target: Any = None
+        self._last_command_time, self.by_rates = -math.inf, False
+        """Whether the vehicle follows targets."""
         self.vehicle.lift_off()
 
     def step(self) -> None:
         """Advance by a tick, and publish the state."""
-        fresh = time.monotonic() - self._last_command_time < FRESH_S
-        if self._by_rates and not fresh:
+        fresh = time.monotonic() - self._last_command_time < self.fresh
+        if self.by_rates and not fresh:
             self._place = self.vehicle.p.copy()
             self.vehicle.forget()
-        self._by_rates = fresh
-        self.vehicle.step(self._u if fresh else self.vehicle.towards(self._place, self._yaw))
-        self._say()
+        self.by_rates = fresh
+        vehicle = self.vehicle
+        vehicle.step(vehicle.by_target(self._target) if fresh else vehicle.towards(self._place, self._yaw))
+        if not self.cut:
+            self._say()
 
     def _hear(self, target: Any) -> None:
-        rate = target.body_rate
-        self._u = np.array([target.thrust * self.vehicle.thrust_max, rate.x, rate.y, rate.z])
-        self._last_command_time = time.monotonic()
+        if not self.cut:
+            self._target, self._last_command_time = target, time.monotonic()
 
     def _say(self) -> None:
         from scipy.spatial.transform import Rotation  # local, because this import takes as long as that of retrim

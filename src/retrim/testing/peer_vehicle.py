@@ -4,6 +4,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from ..plants.plant import as_numpy
 
 DT = 0.01  # [s]: tick
 GROUND = 0.05  # [m]: height below which a vehicle touches the ground
+ATTITUDE_IGNORED = 128  # in the type_mask of an AttitudeTarget
 
 
 class PeerVehicle:
@@ -42,7 +44,7 @@ class PeerVehicle:
         self._hover = GeometricHover(Limits(-fence, fence, low, high), DT)
         self.thrust_max = float(vehicle.thrust_max / vehicle.mass)
         """Maximum total thrust per mass [m/s^2]."""
-        self._place(0.0)
+        self._place(np.zeros(3))
         self._step_plant(np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0]))  # compile before the first real step
 
     @property
@@ -63,7 +65,20 @@ class PeerVehicle:
     def lift_off(self) -> None:
         """Start flying at the current position."""
         self.flies = True
-        self._place(GROUND)
+        self._place(np.array([*self.p[:2], GROUND]))
+
+    def hover(self, place: np.ndarray, v: np.ndarray | None = None) -> None:
+        """Put the vehicle in the air, level.
+
+        Args:
+            place: Position in the world frame [m].
+            v: Velocity in the world frame [m/s]; None for a vehicle at rest.
+        """
+        self.flies, self.omega = True, np.zeros(3)
+        self.x = _standing(place[0], place[1], frames.heading_of(self.R))
+        self.x[2], self.x[12:] = place[2], 0.0 if v is None else v
+        self.forget()
+        self._place(self.p, self.v)
 
     def step(self, u: np.ndarray) -> None:
         """Apply a command [c, omega] for one tick."""
@@ -85,6 +100,17 @@ class PeerVehicle:
         u[3] += np.clip(2.0 * math.atan2(math.sin(wrong), math.cos(wrong)), -1.0, 1.0)
         return u
 
+    def by_target(self, target: Any) -> np.ndarray:
+        """Return the command [c, omega] of an AttitudeTarget of mavros: body rates, or an attitude."""
+        from scipy.spatial.transform import Rotation  # local, because this import takes as long as that of retrim
+
+        c, rate, q = target.thrust * self.thrust_max, target.body_rate, target.orientation
+        if target.type_mask & ATTITUDE_IGNORED:
+            return np.array([c, rate.x, rate.y, rate.z])
+        wrong = self.R.T @ Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        turn = 0.5 * np.array([wrong[2, 1] - wrong[1, 2], wrong[0, 2] - wrong[2, 0], wrong[1, 0] - wrong[0, 1]])
+        return np.concatenate([[c], 6.0 * turn])
+
     def forget(self) -> None:
         """Reset the position controller's integral, which compensates the disturbance."""
         self._hover.integral[:] = 0.0
@@ -93,9 +119,9 @@ class PeerVehicle:
         """End the simulation."""
         self._plant.stop()
 
-    def _place(self, z: float) -> None:
-        p = np.array([*self.p[:2], z])
-        self._plant.reset(State(*(jnp.asarray(a, jnp.result_type(float)) for a in (p, self.R, np.zeros(3)))))
+    def _place(self, p: np.ndarray, v: np.ndarray | None = None) -> None:
+        v = np.zeros(3) if v is None else v
+        self._plant.reset(State(*(jnp.asarray(a, jnp.result_type(float)) for a in (p, self.R, v))))
 
     def _step_plant(self, u: np.ndarray) -> State:
         dtype = jnp.result_type(float)

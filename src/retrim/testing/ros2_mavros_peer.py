@@ -77,6 +77,8 @@ class Ros2Peer(abc.ABC):
         self.node, self.habits, self.release = node, habits, release
         self.vehicle = PeerVehicle(scenario, heading=heading)
         self._calls, self._tick, self.thrust = 0, 0, 0.0
+        self.cut = False
+        """Whether the network is cut in both directions."""
 
     def step(self) -> None:
         """Advance by a tick if one is due, and publish the state."""
@@ -107,12 +109,13 @@ class Ros2Peer(abc.ABC):
     def advertise(self, topic: str, name: str, qos: Qos) -> tuple[MessageType, Publish]:
         """Advertise a topic."""
         kind = message_type(name, self.release)
-        return kind, self.node.advertise(topic, kind, qos)
+        publish = self.node.advertise(topic, kind, qos)
+        return kind, lambda data: None if self.cut else publish(data)
 
     def subscribe(self, topic: str, name: str, take: Callable[[Any], None]) -> None:
         """Subscribe to a topic."""
         kind = message_type(name, self.release)
-        self.node.subscribe(topic, kind, SENSOR, lambda data: take(kind.decode(data)))
+        self.node.subscribe(topic, kind, SENSOR, lambda data: None if self.cut else take(kind.decode(data)))
 
     def engage(self) -> None:
         """Note the time of the first setpoint."""
@@ -124,7 +127,7 @@ class MavrosPeer(Ros2Peer):
 
     def __init__(
         self, node: Ros2Node, scenario: Scenario, habits: Habits, *, place: np.ndarray, yaw: float,
-        poses: bool = False, reports_thrust: bool = True, namespace: str = "/mavros",
+        poses: bool = False, reports_thrust: bool = True, namespace: str = "/mavros", fresh: float = FRESH_S,
     ) -> None:  # fmt: skip
         """Build a vehicle that is about to take off.
 
@@ -137,10 +140,15 @@ class MavrosPeer(Ros2Peer):
             poses: Whether the peer publishes poses instead of odometry.
             reports_thrust: Whether the peer publishes the autopilot's thrust.
             namespace: Prefix of the topics.
+            fresh: Time for which a target is valid [s]; some stacks hold the last one for ever.
         """
         super().__init__(node, scenario, habits)
+        self.fresh = fresh
+        """Time for which a target is valid [s]."""
         self._place, self._yaw, self._poses = place, yaw, poses
-        self._target_time, self._u, self._by_rates = -math.inf, np.zeros(4), False
+        self._target: Any = None
+        self._target_time, self.by_rates = -math.inf, False
+        """Whether the vehicle follows targets."""
         name = "pose" if poses else "odom"
         self._kind, self._publish = self.advertise(
             f"{namespace}/local_position/{name}", POSE if poses else ODOMETRY, SENSOR
@@ -153,12 +161,12 @@ class MavrosPeer(Ros2Peer):
 
     def advance(self) -> None:
         """Fly by targets, or hold the position."""
-        fresh = time.monotonic() - self._target_time < FRESH_S
-        if self._by_rates and not fresh:
+        fresh = time.monotonic() - self._target_time < self.fresh
+        if self.by_rates and not fresh:
             self._place = self.vehicle.p.copy()
             self.vehicle.forget()
-        self._by_rates = fresh
-        u = self._u if fresh else self.vehicle.towards(self._place, self._yaw)
+        self.by_rates = fresh
+        u = self.vehicle.by_target(self._target) if fresh else self.vehicle.towards(self._place, self._yaw)
         self.thrust = float(u[0]) / self.vehicle.thrust_max
         self.vehicle.step(u)
 
@@ -189,7 +197,5 @@ class MavrosPeer(Ros2Peer):
         self.habits.send(self._publish, self._kind.encode(message))
 
     def _hear(self, target: Any) -> None:
-        rate = target.body_rate
-        self._u = np.array([target.thrust * self.vehicle.thrust_max, rate.x, rate.y, rate.z])
-        self._target_time = time.monotonic()
+        self._target, self._target_time = target, time.monotonic()
         self.engage()

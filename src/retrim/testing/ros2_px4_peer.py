@@ -65,6 +65,11 @@ class Px4Peer(Ros2Peer):
         for topic, (name, take) in takes.items():
             self.subscribe(f"{namespace}/fmu/in/{topic}", f"{PX4}/{name}", take)
 
+    @property
+    def by_rates(self) -> bool:
+        """Whether the vehicle flies with externally commanded thrust and body rates."""
+        return self.vehicle.flies and self.mode == OFFBOARD and self._wants_rates and self._rates is not None
+
     def advance(self) -> None:
         """Fly by setpoints, hold the position, or land."""
         vehicle = self.vehicle
@@ -77,8 +82,8 @@ class Px4Peer(Ros2Peer):
             vehicle.forget()
         if self.mode == LAND:
             self._place = np.array([*self._place[:2], max(vehicle.p[2] - 0.3, -0.5)])
-        by_rates = self.mode == OFFBOARD and self._wants_rates and self._rates is not None
-        u = self._rates if by_rates and self._rates is not None else vehicle.towards(self._place, self._yaw)
+        rates = self._rates if self.by_rates else None
+        u = vehicle.towards(self._place, self._yaw) if rates is None else rates
         self.thrust = float(u[0]) / vehicle.thrust_max
         vehicle.step(u)
         if self.mode == LAND and vehicle.p[2] < GROUND:

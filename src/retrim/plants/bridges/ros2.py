@@ -110,16 +110,17 @@ class MavrosPlant(PilotedPlant[MavrosLink]):
             self._link = connect_link(self._where, MavrosLink)
         await_states(self._link, self.until, keep_on)
 
-    def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
-        """Wait until another pilot has flown the vehicle to the start, and read the autopilot's thrust there."""
-        super().take_off(p, yaw, keep_on)
+    def _learn_thrust(self, keep_on: KeepOn) -> bool:
+        """Read the autopilot's thrust at the start, if mavros publishes it."""
         link = self.link
         link.thrusts.clear()
         self.until(lambda: False, THRUST_S if self._is_reporting() else 0.0, keep_on)
-        if len(link.thrusts) >= ENOUGH_THRUSTS:
-            scale = ThrustScale(0.0, 1.0)
-            scale.learn(list(link.thrusts))
-            self.strongest = scale.per_mass(1.0)
+        if len(link.thrusts) < ENOUGH_THRUSTS:
+            return False
+        scale = ThrustScale(0.0, 1.0)
+        scale.learn(list(link.thrusts))
+        self.strongest = scale.per_mass(1.0)
+        return True
 
     @property
     def notes(self) -> Sequence[str]:

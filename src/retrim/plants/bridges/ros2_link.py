@@ -15,6 +15,7 @@ from ...ros2.message_type import MessageType, message_type
 from ...ros2.node import COMMAND, SENSOR, Endpoint, Publish, Qos, Ros2Node, mismatches
 from .ros2_address import Ros2Address
 from .ros_states import RosStates
+from .target_guardian import RATES_IGNORED, TargetGuardian, level
 from .vehicle_state import Reading
 
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
@@ -145,6 +146,25 @@ class MavrosLink(Ros2Link):
         target.thrust = float(thrust)
         rate.x, rate.y, rate.z = map(float, omega)
         self._publish(self._type.encode(target))
+
+    def target_guardian(self) -> TargetGuardian:
+        """Start a guardian with a node of its own, by the same back end."""
+        topic = self.address.topic("setpoint_raw/attitude")
+        words = (self.node.backend, self.address.router, topic, ATTITUDE_TARGET)
+        return TargetGuardian("retrim.ros2.relay", words)
+
+    def level_target(self, thrust: float, yaw: float) -> bytes:
+        """Return a serialised AttitudeTarget.
+
+        Args:
+            thrust: Share of the motors' thrust, 0 to 1.
+            yaw: Heading of the level attitude [rad].
+        """
+        target = self._type.new()
+        target.header.stamp.sec, target.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
+        target.type_mask, target.thrust = RATES_IGNORED, thrust
+        target.orientation.z, target.orientation.w = level(yaw)
+        return self._type.encode(target)
 
     def _take_target(self, target: Any) -> None:
         if np.isfinite(target.thrust):

@@ -1,0 +1,46 @@
+"""A node that publishes the messages of its standard input: ``main`` of the process that a guardian writes to."""
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+from typing import BinaryIO
+
+LISTENER_S = 5.0  # [s], longest wait for a subscription
+
+
+def publish_frames(publish: Callable[[bytes], object], has_listener: Callable[[], bool], pipe: BinaryIO) -> None:
+    """Wait for a listener, announce this on the standard output, and publish messages until the pipe is closed.
+
+    Args:
+        publish: Publishes a serialised message.
+        has_listener: Whether another node has subscribed.
+        pipe: Messages, each behind its length in four bytes.
+    """
+    until = time.monotonic() + LISTENER_S
+    while not has_listener() and time.monotonic() < until:
+        time.sleep(0.02)
+    print("ready", flush=True)
+    while len(head := pipe.read(4)) == 4:
+        publish(pipe.read(int.from_bytes(head, "little")))
+
+
+def outlive_signals() -> None:
+    """Ignore the signals that end a flight; the end of the pipe ends this process."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def main() -> None:
+    """Publish on a topic; the words are the back end, the router, the topic, and the type of the messages."""
+    from .backends import open_node
+    from .message_type import message_type
+    from .node import COMMAND
+
+    outlive_signals()
+    backend, router, topic, name = sys.argv[1:]
+    node = open_node(backend, (), router)
+    publish = node.advertise(topic, message_type(name), COMMAND)
+    publish_frames(publish, lambda: any(not each.publishes for each in node.endpoints(topic)), sys.stdin.buffer)
+    time.sleep(0.1)  # until the last message has left
+    node.close()
