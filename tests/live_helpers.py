@@ -24,15 +24,16 @@ TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "en
 
 
 class Holds(AbstractController[Float[Array, ""]]):
-    """Holds HOME by four gains; it counts its ticks."""
+    """Holds a place by four gains; it counts its ticks."""
 
     gains: Float[Array, "2"] = eqx.field(default_factory=lambda: jnp.array([4.0, 3.5]))
+    home: tuple[float, ...] = eqx.field(default=tuple(HOME.tolist()), static=True)
 
     def init(self, x: State) -> Float[Array, ""]:
         return jnp.zeros_like(x.p[0])
 
     def __call__(self, memory, t, x):
-        a = self.gains[0] * (jnp.asarray(HOME, x.p.dtype) - x.p) - self.gains[1] * x.v
+        a = self.gains[0] * (jnp.asarray(self.home, x.p.dtype) - x.p) - self.gains[1] * x.v
         force = a + G * jnp.asarray(UP, x.p.dtype)
         d = x.R.T @ force / jnp.sqrt(force @ force)
         rates = 8.0 * jnp.stack([-d[1], d[0], jnp.zeros_like(d[0])])
@@ -48,11 +49,11 @@ def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, secon
     return ControlPlan(folder, controller, box, DT, delay_ticks, window, seconds, frozenset({0}), 20, parent)
 
 
-def holding(gains=(4.0, 3.5), *, fit_result=False):
+def holding(gains=(4.0, 3.5), *, fit_result=False, home=HOME):
     """The controller as programs; ``fit_result``: with a half that is fitted, which does nothing."""
     if not fit_result:
-        return plain_source(setup(), Holds(jnp.array(gains)))
-    arrays, fixed = eqx.partition(Holds(jnp.array(gains)), eqx.is_array)
+        return plain_source(setup(), Holds(jnp.array(gains), tuple(map(float, home))))
+    arrays, fixed = eqx.partition(Holds(jnp.array(gains), tuple(map(float, home))), eqx.is_array)
     parameters = {"policy": arrays, "residual": {"fit": jnp.array(0.0)}}
 
     def predict(parameters, inputs):
