@@ -1,5 +1,6 @@
 """A node that publishes the messages of its standard input: ``main`` of the process that a guardian writes to."""
 
+import os
 import signal
 import sys
 import time
@@ -25,10 +26,16 @@ def publish_frames(publish: Callable[[bytes], object], has_listener: Callable[[]
         publish(pipe.read(int.from_bytes(head, "little")))
 
 
-def outlive_signals() -> None:
-    """Ignore the signals that end a flight; the end of the pipe ends this process."""
+def outlive_flight() -> None:
+    """Ignore the signals that end a flight, and give up the real-time priority of the link.
+
+    The end of the pipe ends this process. With the priority of the link, a thread of a ROS library that spins would
+    take a core from the flight.
+    """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def main() -> None:
@@ -37,7 +44,7 @@ def main() -> None:
     from .message_type import message_type
     from .node import COMMAND
 
-    outlive_signals()
+    outlive_flight()
     backend, router, topic, name = sys.argv[1:]
     node = open_node(backend, (), router)
     publish = node.advertise(topic, message_type(name), COMMAND)
