@@ -1,4 +1,4 @@
-"""A base that many vehicles share: it takes the mean of their steps, and serves a vehicle that has learnt nothing."""
+"""Learners of several vehicles in one program, and the base that the vehicles share."""
 
 import jax
 import jax.numpy as jnp
@@ -20,17 +20,17 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 PUSH = jnp.array([1.5, -1.0, 0.5])
 
 
-def pushed(x, u):
+def push_model(x, u):
     return PUSH
 
 
 @pytest.fixture(scope="module")
 def fleet():
-    """A learner, and what two vehicles with low-rank policies have learnt of the same push; their windows."""
+    """Return a learner, workers of two vehicles that adapted to the same push, and the vehicles' windows."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset(adapt={"fit_steps": 100}))
         learner, low_rank = setup.learner, setup.low_rank(setup.pretrained(), random.key(0))
-        windows = [random_field_flight(pushed, random.key(i), n=setup.preset.adapt.window) for i in (1, 2)]
+        windows = [random_field_flight(push_model, random.key(i), n=setup.preset.adapt.window) for i in (1, 2)]
         workers = []
         for i, window in enumerate(windows):
             state = learner.init(low_rank, random.key(i))
@@ -43,8 +43,8 @@ def weights(base):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(base.policy.params)])
 
 
-def test_a_base_serves_a_vehicle_that_has_learnt_nothing(fleet):
-    """What two have felt lowers the loss of the bare base in the model of the first."""
+def test_shared_base_improves_without_delta(fleet):
+    """The shared base has a lower loss than the initial base, in the first vehicle's model and without a delta."""
     learner, workers, windows = fleet
     first = base = shared_base(workers[0])
     for i in range(40):
@@ -55,7 +55,7 @@ def test_a_base_serves_a_vehicle_that_has_learnt_nothing(fleet):
     assert after < before - 0.01 * abs(before)
 
 
-def test_a_step_that_is_not_finite_changes_nothing(fleet):
+def test_nonfinite_step_leaves_base_unchanged(fleet):
     learner, workers, windows = fleet
     base = shared_base(workers[0])
     state = workers[0].state
@@ -66,7 +66,7 @@ def test_a_step_that_is_not_finite_changes_nothing(fleet):
     np.testing.assert_array_equal(weights(after), weights(base))
 
 
-def test_deltas_go_on_from_the_shared_base(fleet):
+def test_deltas_start_from_shared_base(fleet):
     _, workers, windows = fleet
     base = learn_base(workers, windows, shared_base(workers[0]), random.key(0))
     updates = learn_together(workers, windows, base)
@@ -76,7 +76,7 @@ def test_deltas_go_on_from_the_shared_base(fleet):
     assert extract
 
 
-def test_a_fit_of_many_is_each_ones_own(fleet):
+def test_batched_fit_equals_single_fits(fleet):
     learner, workers, windows = fleet
     alone = [
         ResidualWorker(learner, worker.state).learn(window) for worker, window in zip(workers, windows, strict=True)
@@ -89,17 +89,17 @@ def test_a_fit_of_many_is_each_ones_own(fleet):
 
 
 class DoubleLinear(ResidualWorker):
-    """Computes something else than the class from which it inherits."""
+    """A worker that overrides the computation of its base class."""
 
     def learn(self, window):
         return Rejection(float(window.t[-1]), "residual", "doubled")
 
 
 class Renamed(PolicyWorker):
-    """Computes the same as the class from which it inherits."""
+    """A worker with the computation of its base class."""
 
 
-def test_a_worker_with_its_own_computation_is_not_stacked(fleet):
+def test_worker_with_overridden_computation_is_not_batched(fleet):
     learner, workers, windows = fleet
     assert [each.batch is not None for each in (Worker, ResidualWorker, PolicyWorker, DoubleLinear, Renamed)] == [
         False, True, True, False, True
@@ -110,8 +110,8 @@ def test_a_worker_with_its_own_computation_is_not_stacked(fleet):
         shared_base(doubled[0])
 
 
-def test_a_policy_of_many_is_each_ones_own_and_so_are_its_next_random_numbers(fleet):
-    """Also of three, whose program is one for four."""
+def test_batched_update_equals_single_updates(fleet):
+    """Updates and random keys are equal, also for three workers, whose program has four rows."""
     learner, workers, windows = fleet
     make = lambda: [PolicyWorker(learner, workers[i].state, random.key(7 + k)) for k, i in enumerate((0, 1, 0))]  # noqa: E731
     some = [windows[i] for i in (0, 1, 0)]
@@ -127,7 +127,7 @@ def test_a_policy_of_many_is_each_ones_own_and_so_are_its_next_random_numbers(fl
                 np.testing.assert_allclose(a, b, atol=1e-8)
 
 
-def test_trees_are_stacked_and_taken_apart_to_the_bit():
+def test_unstack_inverts_stack():
     trees = [{"a": jnp.arange(3.0) + i, "key": random.key(i), "name": "same"} for i in range(2)]
     whole = stack(trees)
     assert whole["name"] == "same"
@@ -137,7 +137,7 @@ def test_trees_are_stacked_and_taken_apart_to_the_bit():
         np.testing.assert_array_equal(random.key_data(part["key"]), random.key_data(tree["key"]))
 
 
-def test_a_base_that_nobody_admits_is_known(fleet):
+def test_refused_by_all(fleet):
     better = PolicyUpdate(0.0, 1.0, 2.0, fleet[1][0].state.policy)
     assert refused_by_all([Rejection(0.0, "policy", "worse"), Skip(0.0, "policy")])
     assert not refused_by_all([Rejection(0.0, "policy", "worse"), better])

@@ -1,4 +1,4 @@
-"""The rolling buffer: a window of fixed shape, a copy, with the commands that the plant accepted."""
+"""The rolling buffer returns copies of a window of fixed shape, with the commands that the plant accepted."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,7 @@ def at(*p):
     return State.at(jnp.array(p))
 
 
-def test_window_has_a_fixed_shape_and_masks_what_is_missing():
+def test_window_has_fixed_shape_and_masks_missing_ticks():
     buffer = RollingBuffer(4)
     with pytest.raises(ValueError, match="no tick was pushed"):
         buffer.window()
@@ -36,7 +36,7 @@ def test_window_is_a_copy():
     assert float(before.x.p[-1, 0]) == 1.0
 
 
-def test_the_accepted_command_replaces_the_last_one_alone():
+def test_accepted_command_replaces_only_last_command():
     buffer = RollingBuffer(3)
     for i in range(3):
         buffer.push(0.02 * i, at(float(i), 0.0, 1.0), Command(jnp.array(float(i)), jnp.zeros(3)))
@@ -48,7 +48,7 @@ def test_the_accepted_command_replaces_the_last_one_alone():
     assert len(buffer) == 3
 
 
-def test_clear_forgets_everything():
+def test_clear_empties_buffer():
     buffer = RollingBuffer(3)
     buffer.push(0.0, at(1.0, 0.0, 1.0), Command.hover())
     buffer.clear()

@@ -1,4 +1,4 @@
-"""Online learners, workers, optimisers and learning methods of a user: alone, in batches and in fleets."""
+"""A user's online learners, workers, optimisers and learning methods, in single flights, batches and fleets."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ TICKS = 70
 
 
 class Doubling(OnlineLearner):
-    """Adds a number to each weight, instead of training."""
+    """A learner that adds a number to each weight instead of training."""
 
     amount: float = 1e-4
 
@@ -82,7 +82,7 @@ def setup_of(**adapt):
 
 
 @pytest.mark.usefixtures("as_a_user")
-def test_a_learner_replaces_the_training_and_nothing_else():
+def test_custom_learner_replaces_only_training():
     setup = setup_of(learner="doubling")
     policy = setup.new_policy(random.key(0))
     pilots = [setup.pilot(policy, "mine", random.key(1)) for _ in range(2)]
@@ -98,7 +98,7 @@ def test_a_learner_replaces_the_training_and_nothing_else():
 
 
 @pytest.mark.usefixtures("as_a_user")
-def test_a_worker_of_one_s_own_flies_alone_and_in_a_fleet():
+def test_custom_worker_in_single_flight_and_fleet():
     setup = setup_of(learner="refusing")
     pilot = setup.pilot(setup.new_policy(random.key(0)), "full", random.key(1))
     plant, start = Scenario("large").make(), setup.flight_starts(1)[0]
@@ -115,7 +115,7 @@ def test_a_worker_of_one_s_own_flies_alone_and_in_a_fleet():
 
 
 @pytest.mark.usefixtures("as_a_user")
-def test_an_optimiser_of_one_s_own_trains_the_policy():
+def test_custom_optimiser_trains_policy():
     setup = setup_of(optimiser="sgd", learning_rate=1e-5)
     assert isinstance(setup.learner.optimiser, Sgd)
     policy = setup.new_policy(random.key(0))
@@ -125,13 +125,13 @@ def test_an_optimiser_of_one_s_own_trains_the_policy():
     assert kinds & {"policy", "rejected"}
 
 
-def test_a_learning_method_is_one_of_them():
+def test_custom_method_is_a_learning_method():
     assert learning_methods()[:2] == ("full", "lora")
     assert "mine" in learning_methods()
     assert METHODS["base"].learns is None
 
 
-def test_names_that_do_not_fit():
+def test_unsuitable_names_are_refused():
     with pytest.raises(ConfigError, match="no learner 'bttp'; did you mean 'bptt'"):
         setup_of(learner="bttp")
     with pytest.raises(ConfigError, match="no optimiser 'frish'; did you mean 'fresh'"):
@@ -144,7 +144,7 @@ def test_names_that_do_not_fit():
         setup_of(learner="nothing")
 
 
-def test_settings_of_the_preset_reach_the_subclass():
+def test_subclass_receives_settings_of_preset():
     learner = setup_of(learner="doubling", num_updates=7).learner
     assert isinstance(learner, Doubling)
     assert learner.num_updates == 7

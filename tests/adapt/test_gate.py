@@ -1,4 +1,4 @@
-"""The gate: what is better is admitted, what is worse or broken is refused, and why."""
+"""The gate admits better policies, and refuses worse or broken ones with a reason."""
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 @pytest.fixture(scope="module")
 def train_gate_case():
-    """The environment of a preset, a fresh policy and one that hovers better."""
+    """Return the environment of a preset, a fresh policy, and a policy that hovers better."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset())
         return setup.env, setup.new_policy(random.key(0)), setup.pretrained(1)
@@ -29,7 +29,7 @@ def break_policy(policy):
     return eqx.tree_at(lambda p: p.layers[1].bias, policy, policy.layers[1].bias.at[3].set(jnp.nan))
 
 
-def test_gate_admits_the_better_and_refuses_the_worse(train_gate_case):
+def test_gate_admits_better_and_refuses_worse_policy(train_gate_case):
     env, fresh, better = train_gate_case
     result = verdict(better, fresh, env)
     assert bool(result.admitted)
@@ -39,14 +39,14 @@ def test_gate_admits_the_better_and_refuses_the_worse(train_gate_case):
     assert "worse than the incumbent" in result.reason()
 
 
-def test_gate_refuses_nan_by_name(train_gate_case):
+def test_gate_refuses_nan_with_reason(train_gate_case):
     env, fresh, _ = train_gate_case
     result = verdict(break_policy(fresh), fresh, env)
     assert not bool(result.admitted)
     assert result.reason() == "a weight is not finite"
 
 
-def test_gate_admits_an_equal_and_replaces_a_broken_incumbent(train_gate_case):
+def test_gate_admits_equal_policy_and_replaces_broken_incumbent(train_gate_case):
     env, fresh, _ = train_gate_case
     assert bool(verdict(fresh, fresh, env).admitted)
     assert bool(verdict(fresh, break_policy(fresh), env).admitted)

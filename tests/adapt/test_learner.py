@@ -1,4 +1,4 @@
-"""The online learner: sizes, a fresh optimiser under a cosine, starts of the gate, and fits that must be dropped."""
+"""The online learner: sizes, optimiser schedule, starts of the gate, and fits that must be discarded."""
 
 import dataclasses
 
@@ -24,19 +24,19 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 @pytest.fixture(scope="module")
 def setup():
-    """Its rate for low-rank deltas is another than that for all weights."""
+    """Return a setup whose learning rate for low-rank deltas differs from that for all weights."""
     return Setup.from_preset(tiny_preset(adapt={"low_rank_learning_rate": 0.04}))
 
 
 @pytest.fixture(scope="module")
 def fresh(setup):
-    """State of the learner before the first fit."""
+    """Return the learner state before the first fit."""
     return setup.learner.init(setup.new_policy(random.key(0)), random.key(0))
 
 
 @pytest.fixture(scope="module")
 def window(setup):
-    """Ticks of a point mass that is pushed along x."""
+    """Return ticks of a point mass under a constant push along x."""
     buffer, x, model = RollingBuffer(40), State.at(jnp.array([0.0, 0.0, 1.2])), PointMass(setup.preset.dt)
     step = jax.jit(model.step)
     for i in range(40):
@@ -46,24 +46,24 @@ def window(setup):
 
 
 @pytest.mark.parametrize(("field", "value"), [("num_updates", 0), ("num_envs", -1), ("plant_delay_ticks", -1)])
-def test_impossible_sizes_are_refused_at_construction(setup, field, value):
+def test_invalid_sizes_are_refused_at_construction(setup, field, value):
     fields = {f.name: getattr(setup.learner, f.name) for f in dataclasses.fields(setup.learner)}
     with pytest.raises(ValueError, match=rf"OnlineLearner\.{field} = {value}"):
         OnlineLearner(**(fields | {field: value}))
 
 
-def test_a_residual_fit_without_steps_is_refused(setup):
+def test_residual_fit_without_steps_is_refused(setup):
     with pytest.raises(ValueError, match=r"EnsembleModel\.steps = 0"):
         replace_fields(setup.learner.residual_model, steps=0)
 
 
-def test_a_fresh_residual_predicts_nothing(setup, fresh):
+def test_fresh_residual_predicts_zero(setup, fresh):
     learner, state = setup.learner, fresh
     x = State.at(jnp.array([0.3, -0.2, 1.5]))
     np.testing.assert_array_equal(learner.residual_model.predict(state.residual, x, Command.hover()), 0.0)
 
 
-def test_a_fit_finds_the_push_and_goes_on_from_where_it_ended(setup, fresh, window):
+def test_fit_recovers_push_and_second_fit_continues(setup, fresh, window):
     learner, state = setup.learner, fresh
     errors, residual = [], state.residual
     for _ in range(5):
@@ -75,7 +75,7 @@ def test_a_fit_finds_the_push_and_goes_on_from_where_it_ended(setup, fresh, wind
     np.testing.assert_allclose(result, [0.5, 0.0, 0.0], atol=0.1)
 
 
-def test_a_fit_that_is_not_finite_is_dropped(setup, fresh):
+def test_nonfinite_fit_is_discarded(setup, fresh):
     learner, state = setup.learner, fresh
     buffer = RollingBuffer(40)
     for i in range(10):
@@ -85,7 +85,7 @@ def test_a_fit_that_is_not_finite_is_dropped(setup, fresh):
     jax.tree.map(np.testing.assert_array_equal, new_state, state.residual)
 
 
-def test_a_window_without_a_whole_row_is_dropped(setup, fresh):
+def test_window_without_complete_row_is_discarded(setup, fresh):
     learner, state = setup.learner, fresh
     buffer = RollingBuffer(40)
     buffer.push(0.0, State.at(jnp.array([0.0, 0.0, 1.0])), Command.hover())
@@ -94,8 +94,8 @@ def test_a_window_without_a_whole_row_is_dropped(setup, fresh):
     jax.tree.map(np.testing.assert_array_equal, new_state, state.residual)
 
 
-def test_the_rate_falls_along_a_cosine():
-    """Adam's first step is the rate along each coordinate; under constant gradients so is each later one."""
+def test_learning_rate_follows_cosine():
+    """Under constant gradients, each step of Adam has the length of the learning rate along each coordinate."""
     optimiser = FreshAdam(jnp.array(0.01), jnp.array(jnp.inf)).transformation(10)
     params, update = jnp.zeros(3), jax.jit(optimiser.update)
     memory, steps = optimiser.init(params), []
@@ -107,8 +107,8 @@ def test_the_rate_falls_along_a_cosine():
 
 
 @pytest.mark.parametrize("kind", [FreshAdam, CarriedAdam])
-def test_a_gradient_is_clipped_by_its_norm(kind):
-    """A huge gradient after small ones moves Adam no farther than one at the limit."""
+def test_gradient_is_clipped_by_norm(kind):
+    """A huge gradient after small ones moves Adam no farther than a gradient at the limit."""
 
     def move(huge):
         optimiser = kind(jnp.array(1e-3), jnp.array(0.5)).transformation(3)
@@ -120,13 +120,13 @@ def test_a_gradient_is_clipped_by_its_norm(kind):
 
     move = jax.jit(move)
 
-    np.testing.assert_allclose(move(1e6), move(0.25))  # four of 0.25 have the norm 0.5
+    np.testing.assert_allclose(move(1e6), move(0.25))  # four entries of 0.25 have the norm 0.5
     assert not np.allclose(move(0.1), move(0.25))
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_a_carried_adam_has_a_constant_rate_and_goes_on():
-    """Two short updates are one long one."""
+def test_carried_adam_has_constant_rate_and_continues():
+    """Two short updates equal one long update."""
     optimiser, params = CarriedAdam(jnp.array(0.01), jnp.array(jnp.inf)), jnp.ones(3)
     gradients = jnp.sin(jnp.arange(12.0)).reshape(4, 3)
 
@@ -143,12 +143,12 @@ def test_a_carried_adam_has_a_constant_rate_and_goes_on():
     np.testing.assert_array_equal(after([gradients[:2], gradients[2:]]), after([gradients]))
     one = optimiser.transformation(1)
     change, _ = one.update(jnp.array([3.0, -0.2, 0.01]), one.init(params), params)
-    np.testing.assert_allclose(change, [-0.001, 0.001, -0.001], rtol=1e-5)  # whatever the scale of the gradient
+    np.testing.assert_allclose(change, [-0.001, 0.001, -0.001], rtol=1e-5)  # regardless of the scale of the gradient
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_every_update_of_a_carried_adam_moves_as_far_as_the_first(setup):
-    """Along the same gradient: its momentum starts from rest, its scale is known from then on."""
+def test_updates_of_carried_adam_have_equal_length(setup):
+    """Along the same gradient, the momentum starts from zero in each update, and the scale of the gradient is kept."""
     policy = setup.new_policy(random.key(0))
     optimiser, num = CarriedAdam(jnp.array(0.01), jnp.array(jnp.inf)), 5
     state = PolicyState(policy, optimiser.transformation(num).init(policy.params))
@@ -170,13 +170,13 @@ def test_every_update_of_a_carried_adam_moves_as_far_as_the_first(setup):
     np.testing.assert_allclose(steps, np.tile(0.01 * (1.0 - 0.9 ** np.arange(1, num + 1)), (4, 1)), rtol=1e-4)
 
 
-def test_the_papers_update_is_untouched_by_the_levers(setup, fresh, window):
-    """Written out by hand: task starts, a fresh Adam along a cosine, the world as it is."""
+def test_paper_update_is_bptt_from_task_starts(setup, fresh, window):
+    """The expected update is written out: starts of the task, a fresh Adam with a cosine schedule, the world frame."""
     learner, state = setup.learner, fresh
     trained_policy, _ = learner.update_policy(state.policy, state.residual, window, random.key(8))
 
     @eqx.filter_jit
-    def by_hand(policy, residual):
+    def expected_update(policy, residual):
         schedule = optax.cosine_decay_schedule(1.0, learner.num_updates)
         adam = optax.chain(
             optax.clip_by_global_norm(setup.preset.adapt.max_grad_norm),
@@ -187,33 +187,34 @@ def test_the_papers_update_is_untouched_by_the_levers(setup, fresh, window):
         env = setup.env.with_residual(FittedResidual(learner.residual_model, residual))
         return bptt(PolicyState(policy, adam.init(policy.params)), env, x0, optimiser=adam)[0]
 
-    expected = by_hand(state.policy.policy, state.residual)
+    expected = expected_update(state.policy.policy, state.residual)
     for result, target in zip(trained_policy.policy.layers, expected.policy.layers, strict=True):
         np.testing.assert_allclose(result.weight, target.weight, rtol=1e-9, atol=1e-12)
 
 
-def test_each_update_starts_a_fresh_optimiser(setup, fresh, window):
-    """Moments and counters of an earlier update have no say, nor does the step of the schedule."""
+def test_each_update_starts_with_fresh_optimiser(setup, fresh, window):
+    """Moments, counters and the schedule of an earlier update have no effect."""
     learner, state = setup.learner, fresh
     used, _ = learner.update_policy(state.policy, state.residual, window, random.key(1))
-    assert any(int(leaf) == 3 for leaf in jax.tree.leaves(used.optimiser) if leaf.ndim == 0)  # it did count its steps
+    # the optimiser counted its steps
+    assert any(int(leaf) == 3 for leaf in jax.tree.leaves(used.optimiser) if leaf.ndim == 0)
     stale = eqx.tree_at(lambda s: s.policy, used, state.policy.policy)
     again, _ = learner.update_policy(stale, state.residual, window, random.key(1))
     jax.tree.map(np.testing.assert_array_equal, again, used)
 
 
-def test_an_update_trains_in_the_corrected_model(setup, fresh, window):
-    """With a residual that was fitted to a push, the same update gives another policy than without."""
+def test_update_trains_in_corrected_model(setup, fresh, window):
+    """With a residual fitted to a push, the update returns a different policy than without it."""
     learner, state = setup.learner, fresh
     fit_result, _ = learner.fit_residual(state.residual, window)
     plain, before = learner.update_policy(state.policy, state.residual, window, random.key(1))
     with_push, after = learner.update_policy(state.policy, fit_result, window, random.key(1))
-    assert float(after.incumbent) > float(before.incumbent)  # it is pushed away from the goal
+    assert float(after.incumbent) > float(before.incumbent)  # the push moves the vehicle away from the goal
     assert not np.array_equal(plain.policy.layers[0].weight, with_push.policy.layers[0].weight)
 
 
-def test_the_gate_flies_other_starts_than_training(setup, fresh, window, monkeypatch):
-    """Four of the task that no step trained on, and four states of the window's valid ticks."""
+def test_gate_uses_different_starts_than_training(setup, fresh, window, monkeypatch):
+    """Four starts are new starts of the task, and four are states of the window's valid ticks."""
     training_starts, gate_starts = [], []
 
     def training(state, env, x0, *, optimiser):
@@ -248,7 +249,7 @@ def test_the_gate_flies_other_starts_than_training(setup, fresh, window, monkeyp
 
 @pytest.fixture(scope="module")
 def low_rank(window):
-    """A low-rank policy, and the state after an update of a single step."""
+    """Return a low-rank policy, and the state after an update of one step."""
     setup = Setup.from_preset(tiny_preset(adapt={"num_updates": 1, "low_rank_learning_rate": 0.04}))
     policy = setup.low_rank(setup.new_policy(random.key(0)), random.key(0))
     with jax.numpy_dtype_promotion("standard"):
@@ -257,23 +258,23 @@ def low_rank(window):
     return policy, after
 
 
-def test_low_rank_updates_leave_the_base(low_rank):
+def test_low_rank_update_leaves_base_unchanged(low_rank):
     policy, after = low_rank
     jax.tree.map(np.testing.assert_array_equal, after.policy.base, policy.base)
     sizes = sum(leaf.size for leaf in jax.tree.leaves(after.optimiser))
     assert sizes < 3 * sum(leaf.size for leaf in jax.tree.leaves(policy.delta)) + 10
 
 
-def test_a_low_rank_delta_has_a_learning_rate_of_its_own(low_rank):
-    """Adam's first step is as long as the rate; all weights keep theirs, as the paper's update shows."""
+def test_low_rank_delta_has_separate_learning_rate(low_rank):
+    """The first step of Adam has the length of the learning rate."""
     policy, after = low_rank
     change = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)).max(), after.policy.delta, policy.delta)
     assert max(jax.tree.leaves(change)) == pytest.approx(0.04, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["ensemble", "regression", "layered", "linear", "place", "swing"])
-def test_what_was_learnt_has_the_types_of_nothing_learnt(window, name, key):
-    """Weak types, too: a program that took the first state must not be compiled again for the second, in flight."""
+def test_fitted_residual_has_types_of_fresh_residual(window, name, key):
+    """Weak types are also equal; otherwise a program for the first state is compiled again in flight."""
     learner = Setup.from_preset(tiny_preset(adapt={"residual": name, "fit_steps": 2})).learner
     fresh = jax.eval_shape(learner.residual_model.init, key)
     fit_result, _ = eqx.filter_eval_shape(type(learner).fit_residual, learner, fresh, window)

@@ -1,4 +1,4 @@
-"""Updates as messages: each kind comes back bit for bit, and nothing else ever does."""
+"""Messages of updates: each kind survives a round trip bit for bit, and other data is refused."""
 
 import contextlib
 import json
@@ -25,7 +25,7 @@ SMALL = {"pretrain": {"hidden_sizes": (12, 12)}}
 
 
 def make_learner_state(method):
-    """A learner state with numbers in every leaf: weights, moments and counters."""
+    """Return a learner state with numbers in every leaf: weights, moments and counters."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset(**SMALL))
         policy = setup.new_policy(random.key(0))
@@ -52,8 +52,8 @@ def updates(state):
     }
 
 
-def same(result, expected):
-    """Bit for bit, types included."""
+def assert_identical(result, expected):
+    """Assert that values and types are equal, bit for bit."""
     assert type(result) is type(expected)
     assert result.computed_from == expected.computed_from
     for name in set(expected.__dataclass_fields__) - {"state"}:
@@ -69,11 +69,11 @@ def same(result, expected):
 @pytest.mark.parametrize("kind", KINDS)
 def test_round_trip_is_exact(states, method, kind):
     update = updates(states[method])[kind]
-    same(unpack_update(pack_update(update), states[method], source="test"), update)
+    assert_identical(unpack_update(pack_update(update), states[method], source="test"), update)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_counters_of_the_optimiser_come_back_as_integers(states, method):
+def test_optimiser_counters_stay_integers(states, method):
     state = states[method]
     update = unpack_update(pack_update(updates(state)["policy"]), state, source="test")
     counters = [leaf for leaf in jax.tree.leaves(update.state.optimiser) if jnp.issubdtype(leaf.dtype, jnp.integer)]
@@ -81,8 +81,8 @@ def test_counters_of_the_optimiser_come_back_as_integers(states, method):
     assert all(int(leaf) == 37 for leaf in counters)
 
 
-def test_an_incumbent_without_a_finite_cost_is_still_news(states):
-    """A policy that replaces one that diverged."""
+def test_nonfinite_incumbent_cost_is_allowed(states):
+    """A policy may replace one that diverged."""
     update = PolicyUpdate(1.0, 0.2, float("nan"), states["full"].policy)
     result = unpack_update(pack_update(update), states["full"], source="test")
     assert np.isnan(result.incumbent_cost)
@@ -90,7 +90,7 @@ def test_an_incumbent_without_a_finite_cost_is_still_news(states):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("keep", [0, 5, 100, -1])
-def test_truncated(states, kind, keep):
+def test_truncated_message_is_refused(states, kind, keep):
     data = pack_update(updates(states["full"])[kind])[:keep]
     with pytest.raises(MessageError, match="mailbox: not a whole safetensors file"):
         unpack_update(data, states["full"], source="mailbox")
@@ -98,19 +98,19 @@ def test_truncated(states, kind, keep):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), kind=st.sampled_from(KINDS))
-def test_flipped_bytes_never_arrive_silently(states, data, kind):
-    """Whatever byte is damaged: either a clear refusal, or the very same update."""
+def test_flipped_byte_is_refused_or_harmless(states, data, kind):
+    """A damaged byte leads to a refusal or to an equal update."""
     update = updates(states["lora"])[kind]
     whole = bytearray(pack_update(update))
     header = 8 + int.from_bytes(whole[:8], "little")
     place = data.draw(st.one_of(st.integers(0, min(header, len(whole)) - 1), st.integers(0, len(whole) - 1)))
     whole[place] ^= data.draw(st.integers(1, 255))
     with contextlib.suppress(MessageError):
-        same(unpack_update(bytes(whole), states["lora"], source="test"), update)
+        assert_identical(unpack_update(bytes(whole), states["lora"], source="test"), update)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_states_that_are_not_finite(states, value):
+def test_nonfinite_states_are_refused(states, value):
     state = states["full"]
     policy = eqx.tree_at(lambda s: s.policy.layers[0].bias, state.policy, jnp.full(12, value))
     with pytest.raises(
@@ -125,7 +125,7 @@ def test_states_that_are_not_finite(states, value):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, "1.0", True, None])
 @pytest.mark.parametrize("field", ["computed_from", "rms_error"])
-def test_fields_that_are_no_finite_number(states, field, value):
+def test_nonfinite_fields_are_refused(states, field, value):
     plain = {"computed_from": 1.0, "rms_error": 0.1} | {field: value}
     data = wire.pack(states["full"].residual, kind="residual", about={"update": json.dumps(plain)})
     with pytest.raises(MessageError, match=rf"test: .*'residual' update.*{field}"):
@@ -143,13 +143,13 @@ def test_fields_that_are_no_finite_number(states, field, value):
         ("skipped", None),
     ],
 )
-def test_fields_that_do_not_belong(states, kind, plain):
+def test_unexpected_fields_are_refused(states, kind, plain):
     data = wire.pack((), kind=kind, about={"update": json.dumps(plain)})
     with pytest.raises(MessageError, match=f"test: not the fields of a '{kind}' update"):
         unpack_update(data, states["full"], source="test")
 
 
-def test_a_message_without_fields(states):
+def test_message_without_fields_is_refused(states):
     with pytest.raises(MessageError, match="not the fields of a 'skipped' update"):
         unpack_update(wire.pack((), kind="skipped", about={}), states["full"], source="test")
     nesting = "[" * 100_000 + "]" * 100_000
@@ -157,7 +157,7 @@ def test_a_message_without_fields(states):
         unpack_update(wire.pack((), kind="skipped", about={"update": nesting}), states["full"], source="test")
 
 
-def test_foreign_bytes(states):
+def test_foreign_bytes_are_refused(states):
     like = states["full"]
     with pytest.raises(MessageError, match="not a whole safetensors file"):
         unpack_update(b"this is no update, but a long enough line of text", like, source="test")
@@ -165,8 +165,8 @@ def test_foreign_bytes(states):
         unpack_update(wire.pack({"a": jnp.zeros(3)}, kind="delta", about={}), like, source="test")
 
 
-def test_a_state_of_another_shape(states):
-    """Of another network, and a low-rank state where all weights are expected."""
+def test_state_of_different_shape_is_refused(states):
+    """Examples are the state of a different network, and a low-rank state instead of all weights."""
     setup = Setup.from_preset(tiny_preset(pretrain={"hidden_sizes": (12, 14)}))
     with jax.numpy_dtype_promotion("standard"):
         other = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
@@ -177,16 +177,18 @@ def test_a_state_of_another_shape(states):
         unpack_update(pack_update(updates(states["lora"])["policy"]), states["full"], source="test")
 
 
-def test_integers_where_weights_are_expected(states):
+def test_integer_weights_are_refused(states):
     state = states["full"]
     count = eqx.tree_at(lambda s: s.policy.layers[0].bias, state.policy, jnp.zeros(12, dtype=int))
     with pytest.raises(MessageError, match="has type int64, expected floating point"):
         unpack_update(pack_update(PolicyUpdate(1.0, 0.1, 0.2, count)), state, source="test")
 
 
-def test_a_structure_is_enough_to_read(states):
-    """``like`` may be shapes alone, as a receiver has them before anything was learnt."""
+def test_shapes_suffice_for_reading(states):
+    """``like`` may contain shapes only; a receiver has nothing else before the first update."""
     state = states["full"]
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), state)
     update = updates(state)["policy"]
-    same(unpack_update(pack_update(update), LearnerState(shapes.policy, shapes.residual), source="test"), update)
+    assert_identical(
+        unpack_update(pack_update(update), LearnerState(shapes.policy, shapes.residual), source="test"), update
+    )

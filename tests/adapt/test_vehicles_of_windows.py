@@ -1,4 +1,4 @@
-"""Learners of an identified vehicle: the window tells the path, and commands are those that arrived."""
+"""Learners that identify the vehicle: the window yields the command path, and the learner uses the delayed commands."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ DELAY, LAG, THRUST_LAG, GAIN = 0.05, 0.12, 0.04, 0.8
 
 @pytest.fixture(scope="module")
 def window(as_a_user):
-    """A flight of the point mass behind a known path, under commands that excite it."""
+    """Return a flight of the point mass with a known command path, under commands that excite it."""
     path = CommandPath.of(DELAY, ActuatorResponse.of(THRUST_LAG, LAG, inverse_damping=1.0, thrust_gain=GAIN))
     model = PointMass(DT)
 
@@ -49,7 +49,7 @@ def vehicle(as_a_user):
     return IdentifiedVehicle(PathEstimator.of(DT), PathFamily.of())
 
 
-def test_a_window_identifies_the_vehicle(window, vehicle):
+def test_identification_recovers_command_path(window, vehicle):
     result = eqx.filter_jit(vehicle.identify)(window)
     assert float(result.path.delay) == pytest.approx(DELAY, abs=0.008)
     assert float(result.path.response.thrust_gain) == pytest.approx(GAIN, rel=0.02)
@@ -59,8 +59,8 @@ def test_a_window_identifies_the_vehicle(window, vehicle):
     assert np.all(high[:2] > true[:2] - 0.05)
 
 
-def test_with_the_commands_that_arrived_nothing_is_missing(window, vehicle):
-    """Behind the identified path the model needs no residual, and as commanded it needs a large one."""
+def test_identified_path_removes_residual(window, vehicle):
+    """With the identified path the residual is small, and without it the residual is large."""
 
     @eqx.filter_jit
     def residual(vehicles):
@@ -74,7 +74,7 @@ def test_with_the_commands_that_arrived_nothing_is_missing(window, vehicle):
     assert float(error) < 0.15 * float(without)
 
 
-def test_starts_get_vehicles_from_the_belief(window, vehicle):
+def test_starts_receive_vehicles_from_belief(window, vehicle):
     x = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (4, 8, *leaf.shape)), State.at(jnp.zeros(3)))
     result = eqx.filter_jit(vehicle.identify)(window)
     starts = eqx.filter_jit(vehicle.assign_vehicles)(
@@ -89,7 +89,7 @@ def test_starts_get_vehicles_from_the_belief(window, vehicle):
     np.testing.assert_allclose(starts.member.belief.centre[2, 3], belief.centre, rtol=1e-5)
 
 
-def test_a_window_without_flight_says_nothing(window, vehicle):
+def test_empty_window_leaves_belief_wide(window, vehicle):
     empty = dataclasses.replace(window, valid=jnp.zeros(N, dtype=bool))
     belief = eqx.filter_jit(vehicle.identify)(empty).belief
     assert np.all(belief.half_width > 0.5)

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM or SIGHUP at any moment: exit code 130, no traceback, and what is done is kept."""
+"""Ctrl-C, SIGTERM or SIGHUP at any moment: exit code 130, no traceback, and finished work is saved."""
 
 import re
 import signal
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, as_a_user):
-    """A folder with a policy in p/ that was never trained."""
+    """Return a folder with an untrained policy in p/."""
     here = tmp_path_factory.mktemp("user")
     brief = SMALL.replace("[64, 64]", "[8]\nnum_envs = 2\nhorizon = 20").replace("= 150", "= 20")
     (here / "small.toml").write_text(brief)
@@ -27,7 +27,7 @@ def folder(tmp_path_factory, as_a_user):
 PRETRAIN = "pretrain", "hover", "--config", "small.toml"
 
 
-def test_while_training_keeps_what_was_trained(folder):
+def test_interrupted_training_saves_policy(folder):
     code, out = run_interrupted((*PRETRAIN, "--updates", "100000", "--out", "cut"), folder, after=b"loss ")
     assert code == 130, out
     assert "Traceback" not in out
@@ -39,8 +39,8 @@ def test_while_training_keeps_what_was_trained(folder):
     retrim("fly", "--policy", "cut", "--seconds", "1", "--adapt", "none", "--out", "cut_flown", cwd=folder)
 
 
-def test_while_compiling_leaves_nothing(folder):
-    # A program that takes a minute to compile, so that there is time to interrupt it on any machine.
+def test_interrupted_compilation_saves_nothing(folder):
+    # This program takes a minute to compile, so that there is time to interrupt it on any machine.
     setup = "import time; from retrim import Setup; Setup.pretraining = lambda *_: (time.sleep(60) for _ in range(2))"
     code, out = run_interrupted((*PRETRAIN, "--out", "never"), folder, after=b"compiling", setup=setup)
     assert code == 130, out
@@ -49,7 +49,7 @@ def test_while_compiling_leaves_nothing(folder):
     assert not (folder / "never").exists()
 
 
-def test_between_training_and_its_score_keeps_the_policy_with_results(folder):
+def test_interruption_before_score_keeps_policy_and_results(folder):
     path = folder / "between" / "policy.safetensors"
     code, out = run_interrupted((*PRETRAIN, "--out", "between"), folder, after=path)
     assert code == 130, out
@@ -59,8 +59,8 @@ def test_between_training_and_its_score_keeps_the_policy_with_results(folder):
     assert load_policy(folder / "between")[1].name == "hover/retrim"
 
 
-def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(folder):
-    # What trains for minutes is cut as soon as its policy is there; the flights are never begun.
+def test_interruption_of_demo_before_flights_keeps_policy_and_results(folder):
+    # The demo is interrupted as soon as its policy exists; the flights do not begin.
     small = (
         "from retrim.config import named_presets as presets, loading\nfrom pathlib import Path\n"
         "presets.PRESETS['hover/retrim'] = loading.overlaid(presets.PRESETS['hover/retrim'], Path('small.toml'))"
@@ -73,10 +73,10 @@ def test_between_training_and_flights_the_demo_keeps_the_policy_with_results(fol
     assert load_policy(folder / "demo")[1].pretrain.hidden_sizes == (8,)
 
 
-def test_while_flying_keeps_what_was_flown(folder):
+def test_interrupted_fly_saves_finished_flights(folder):
     words = "fly", "--policy", "p", "--seconds", "20", "--starts", "60", "--adapt", "none", "--plant", "simple"
-    one_by_one = "--latency", "measured"  # flights of one program land at once
-    by = signal.SIGHUP  # as a terminal that is closed does
+    one_by_one = "--latency", "measured"  # flights in one program all end at the same time
+    by = signal.SIGHUP  # signal of a closed terminal
     code, out = run_interrupted((*words, *one_by_one, "--out", "half"), folder, after=b" of 60 flights", by=by)
     assert code == 130, out
     assert "Traceback" not in out
@@ -87,12 +87,12 @@ def test_while_flying_keeps_what_was_flown(folder):
     assert len(list((folder / "half" / "logs").glob("*.npz"))) == result["rows"][0]["n"]
 
 
-def test_while_live_lands_the_vehicle_and_keeps_the_flight(folder):
-    """It has a page and a recording; it does not learn."""
+def test_interrupted_live_lands_and_saves_flight(folder):
+    """The flight has a page and a recording, and does not learn."""
     words = "live", "--policy", "p", "--plant", "simple", "--disturbance", "none", "--adapt", "base-do"
     display = "--page", "--page-port", "18280", "--record", "live.mcap", "--out", "live"
     code, out = run_interrupted((*words, *display), folder, after="│ policy".encode())
-    assert code == 0, out  # without --seconds, Ctrl-C is how a flight ends
+    assert code == 0, out  # without --seconds, Ctrl-C is the regular end of a flight
     assert "Traceback" not in out
     assert "interrupted" not in out
     assert "flight over: landed" in out

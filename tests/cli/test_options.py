@@ -23,12 +23,12 @@ main = importlib.import_module("retrim.cli.main")  # the package has a function 
     "registry", [DISTURBANCES, FAULTS, METHODS, PLANTS, REFERENCES, RESIDUALS, SENSORS, VEHICLES], ids=lambda r: r._kind
 )
 def test_help_lists_every_registered_name(command, registry, tmp_path):
-    display = "".join(retrim(command, "--help", cwd=tmp_path).replace("│", " ").split())  # lines end inside of names
+    display = "".join(retrim(command, "--help", cwd=tmp_path).replace("│", " ").split())  # lines may break inside names
     assert [name for name in registry if name not in display] == []
 
 
 @pytest.mark.parametrize("command", ["pretrain", "fly", "live", "sweep", "export", "demo", "gauntlet"])
-def test_an_option_without_a_default_shows_none(command, tmp_path):
+def test_option_without_default_shows_none(command, tmp_path):
     out = retrim(command, "--help", cwd=tmp_path)
     assert "{None}" not in out
     assert "default: None" not in out
@@ -42,7 +42,7 @@ def test_methods_of_installed_packages_are_listed_and_suggested(tmp_path):
         find_method("rapto")
 
 
-def test_commands_of_a_broken_package_do_not_stop_the_others(monkeypatch, capsys):
+def test_broken_package_does_not_affect_other_commands(monkeypatch, capsys):
     class Broken:
         value = "broken:COMMANDS"
 

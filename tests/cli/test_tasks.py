@@ -1,4 +1,4 @@
-"""Tracking, vision and low-rank adaptation as a user commands them, at reduced size."""
+"""Tracking, vision and low-rank adaptation from the command line, at reduced size."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ SEE = (
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, as_a_user):
-    """A folder with a small policy in t/, trained on a family of references, and a trajectory of the user's."""
+    """Return a folder with a trajectory file, and a small policy in t/ trained on a family of references."""
     here = tmp_path_factory.mktemp("user")
     (here / "tiny.toml").write_text(TINY)
     (here / "see.toml").write_text(SEE)
@@ -30,7 +30,7 @@ def folder(tmp_path_factory, as_a_user):
     return here
 
 
-def test_track_follows_a_file_adapts_by_low_rank_and_its_delta_flies_again(folder):
+def test_track_adapts_by_low_rank_and_flies_delta_again(folder):
     words = "fly", "--policy", "t", "--seconds", "3", "--disturbance", "small", "--reference", "mine.csv"
     retrim(*words, "--adapt", "lora", "--out", "f", cwd=folder)
     base, lora = results(folder / "f")["rows"]
@@ -44,23 +44,24 @@ def test_track_follows_a_file_adapts_by_low_rank_and_its_delta_flies_again(folde
     assert results(folder / "d")["rows"][0]["mean"] != base["mean"]
 
 
-def test_star_is_flown_with_a_warning(folder):
+def test_fly_star_warns(folder):
     words = "--policy", "t", "--seconds", "2", "--adapt", "none", "--reference", "star", "--out", "star"
     out = retrim("fly", *words, cwd=folder)
     assert "warning: vehicle small cannot fly all of reference star" in out
     assert "velocity jumps by 3.0" in out
 
 
-def test_a_family_asks_which_to_fly(folder):
+def test_family_requires_reference_option(folder):
     out = retrim("fly", "--policy", "t", "--out", "never", cwd=folder, code=1)
     assert "trained on circle+figure8: say which to fly, as --reference circle" in out
     assert not (folder / "never").exists()
 
 
-def test_vision_learns_to_see_and_flies_with_occlusion(folder):
+def test_pretrain_vision_and_fly_with_occlusion(folder):
     words = "--config", "see.toml", "--out", "v"
     assert "vision error in its own model" in retrim("pretrain", "vision", *words, cwd=folder)
-    words = "--adapt", "base-do", "--seconds", "2", "--disturbance", "none", "--out", "vf"  # 03_vision.py adapts
+    # 03_vision.py covers adaptation
+    words = "--adapt", "base-do", "--seconds", "2", "--disturbance", "none", "--out", "vf"
     retrim("fly", "--policy", "v", *words, cwd=folder)
     assert (folder / "vf" / "vision_none.png").exists()
     assert results(folder / "vf")["rows"][0]["n"] == 1

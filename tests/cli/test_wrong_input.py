@@ -1,4 +1,4 @@
-"""Wrong input: one clear line, exit code 1 or 2, no traceback; nothing is trained or flown, and no folder is left."""
+"""Wrong input: one clear line, exit code 1 or 2, no traceback; no training, no flight, and no new folder."""
 
 import os
 import stat
@@ -43,7 +43,7 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, as_a_user):
-    """A user's folder with files of every kind, good and bad; its policies were never trained."""
+    """Return a user's folder with valid and invalid files of every kind; its policies are untrained."""
     here = tmp_path_factory.mktemp("user")
     for name, text in FILES.items():
         (here / name).write_bytes(text.encode("latin-1"))
@@ -188,7 +188,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("words", "message"), WRONG, ids=lambda value: " ".join(value) if type(value) is tuple else "")
-def test_wrong_input_gives_one_clear_line_and_leaves_nothing(folder, words, message):
+def test_wrong_input_prints_one_line_and_writes_nothing(folder, words, message):
     before = tree(folder)
     out = retrim(*words, "--out", "new/folder", cwd=folder, code=1)
     assert message in out
@@ -197,7 +197,7 @@ def test_wrong_input_gives_one_clear_line_and_leaves_nothing(folder, words, mess
     assert tree(folder) == before
 
 
-def test_nothing_is_remarked_before_a_flight_is_refused(folder, monkeypatch):
+def test_refused_flight_prints_no_other_remark(folder, monkeypatch):
     monkeypatch.setattr("retrim.live.operator.page.find_spec", lambda name: None)
     out = retrim("live", "--plant", "mavlink:udp:nowhere", cwd=folder, code=1)
     assert out.startswith("retrim: address 'udp:nowhere': expected udp:HOST:PORT")
@@ -216,7 +216,7 @@ def test_nothing_is_remarked_before_a_flight_is_refused(folder, monkeypatch):
         (("reproduce", "nope"), "nope"),
     ],
 )
-def test_wrong_usage_says_how_it_is_used(folder, words, message):
+def test_wrong_usage_explains_usage(folder, words, message):
     before = tree(folder)
     out = retrim(*words, cwd=folder, code=2)
     assert message in out
@@ -237,7 +237,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize("out", ["file", "file/in/it", "/proc/nowhere", "closed/new"])
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_a_place_that_cannot_be_written_is_refused_before_anything_else(folder, words, out, monkeypatch):
+def test_unwritable_output_is_refused_first(folder, words, out, monkeypatch):
     if out.startswith("closed") and os.geteuid() == 0:
         pytest.skip("root may write everywhere")
     (folder / "sizes.toml").write_text("seeds = [0, 1]\n")
@@ -248,7 +248,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_anything_else(folder, 
     assert tree(folder) == before
 
 
-def test_a_plant_that_cannot_do_it_says_so(folder):
+def test_unsupported_disturbance_is_refused(folder):
     pytest.importorskip("rotorpy")
     before = tree(folder)
     words = "--plant", "rotorpy", "--disturbance", "payload", "--adapt", "none", "--out", "new"

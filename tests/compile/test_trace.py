@@ -1,4 +1,4 @@
-"""A controller written as NumPy decides as it does in JAX, tick after tick."""
+"""A controller compiled to NumPy returns the same commands as in JAX, tick after tick."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ def leaves(tree):
 
 
 def check(function, parameters, inputs, tolerance=1e-12):
-    """Assert that the program returns what JAX returns, in the same shapes and types."""
+    """Assert that the program and JAX return the same values, shapes and types."""
     program = NumpyProgram(numpy_program(function, parameters, inputs))
     result = program.step(program.prepare(leaves(parameters)), leaves(inputs))
     expected = leaves(jax.jit(function)(parameters, inputs))
@@ -112,19 +112,19 @@ DRAWS = {
 
 
 @pytest.mark.parametrize("name", DRAWS)
-def test_random_numbers_are_those_of_jax(name):
+def test_random_numbers_equal_jax(name):
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         check(lambda _, k: DRAWS[name](k), jnp.array(0.0), random.key(11), tolerance=2e-6)
         check(lambda _, seed: DRAWS[name](random.key(seed)), jnp.array(0.0), jnp.array(-5, jnp.int32), tolerance=2e-6)
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_each_operation_is_that_of_jax(name):
+def test_operation_equals_jax(name):
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         check(OPERATIONS[name], jnp.array(0.7), X)
 
 
-def test_what_parameters_alone_decide_is_computed_once():
+def test_expressions_of_parameters_are_computed_once():
     source = numpy_program(lambda p, x: jnp.exp(p) * x + jnp.sin(jnp.array(2.0)), jnp.array(0.3), X)
     prepare, step = source.text.split("def step")
     assert "np.exp" in prepare
@@ -132,7 +132,7 @@ def test_what_parameters_alone_decide_is_computed_once():
     assert "np.sin" not in source.text
 
 
-def test_what_has_no_numpy_form_is_named_before_take_off():
+def test_unsupported_operation_is_refused_before_take_off():
     with pytest.raises(ConfigError, match="operation 'sort' in this controller has no NumPy form"):
         numpy_program(lambda p, x: jnp.sort(x), jnp.array(0.0), X)
     with pytest.raises(ConfigError, match="rounding away from zero in this controller has no NumPy form"):
@@ -168,7 +168,7 @@ def test_what_has_no_numpy_form_is_named_before_take_off():
         ("vision/ideal", None),
     ],
 )
-def test_a_preset_flies_the_same_commands(preset, reference):
+def test_preset_gives_same_commands(preset, reference):
     name, _, load = preset.partition(" with a ")
     values = changed(PRESETS[name], adapt={"residual": "swing"}) if load else PRESETS[name]
     setup = Setup.from_preset(values, reference)
@@ -200,8 +200,8 @@ def test_a_preset_flies_the_same_commands(preset, reference):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
-def test_a_controller_that_plans_by_random_roll_outs_flies_the_same_commands():
-    """MPPI: loops, and a random key among the parameters."""
+def test_mppi_gives_same_commands():
+    """MPPI has loops, and a random key among its parameters."""
     setup = Setup.from_preset(PRESETS["hover/fast"])
     pilot = setup.pilot(setup.new_policy(random.key(0)), "mppi", random.key(1))
     assert isinstance(pilot, ControllerPilot)

@@ -1,4 +1,4 @@
-"""A large quadrotor with slow motors, described by seven lines, hovers in wind with a load; others are refused."""
+"""A large quadrotor with slow motors, described by seven lines, hovers in wind with a load; unflyable ones are refused."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ def spec(tmp_path):
     return read_vehicle(tmp_path / "four.toml")
 
 
-def test_a_large_quadrotor_hovers_in_wind_with_a_load(spec):
+def test_large_quadrotor_hovers_in_wind_with_load(spec):
     preset = changed(
         PRESETS["hover/retrim"], vehicle=spec, pretrain={"num_updates": 300, "num_envs": 16, "hidden_sizes": (64, 64)}
     )
@@ -44,12 +44,12 @@ def test_a_large_quadrotor_hovers_in_wind_with_a_load(spec):
     plant = Scenario("wind=5+payload=0.8").make(spec)
     log = fly(plant, pilot, setup.flight_starts(1)[0], ticks=400)
     off = np.linalg.norm(log.p - np.array([0.0, 0.0, 1.0]), axis=1)
-    assert off[-50:].max() < 0.1  # four times as close as the plain policy; a whole training gives 4 mm
+    assert off[-50:].max() < 0.1  # four times as close as the plain policy; full training gives 4 mm
     change = np.linalg.norm(np.diff(log.v[-50:], axis=0), axis=1) / 0.02
-    assert change.max() < 0.5  # and nothing oscillates
+    assert change.max() < 0.5  # no oscillation
 
 
-def test_the_model_of_training_follows_as_the_vehicle_does(spec):
+def test_training_model_has_lag_of_vehicle(spec):
     preset = PRESETS["hover/retrim"]
     for name in PUBLISHED:
         assert lag_of(changed(preset, vehicle=name), make_vehicle(name)) is None
@@ -66,8 +66,8 @@ def test_the_model_of_training_follows_as_the_vehicle_does(spec):
     np.testing.assert_allclose(text.omega, [0.05, 0.06, 0.2])
 
 
-def test_classical_controllers_are_as_slow_as_the_vehicle(spec):
-    """A time that is n times as long makes gains of 1/s, 1/s^2 and 1/s^3 so many times n, n^2 and n^3 less."""
+def test_gains_of_baselines_scale_with_vehicle_lag(spec):
+    """If the lag is n times as long, gains in 1/s, 1/s^2 and 1/s^3 decrease by n, n^2 and n^3."""
     for name in ("hover/retrim", "hover/fast", "track/retrim", "track/fast"):
         assert slowness(Setup.from_preset(PRESETS[name])) == 1.0
     usual, slow = (Setup.from_preset(changed(PRESETS["hover/retrim"], vehicle=vehicle)) for vehicle in ("small", spec))
@@ -80,8 +80,8 @@ def test_classical_controllers_are_as_slow_as_the_vehicle(spec):
             assert float(getattr(one, part)) == pytest.approx(n**power * float(getattr(other, part)))
 
 
-def test_a_vehicle_that_no_rate_loop_can_fly_is_refused_with_its_step_response(tmp_path):
-    slow = dataclasses.replace(read_of(SEVEN_LINES, tmp_path), motor_tau=0.45)
+def test_unflyable_vehicle_is_refused_with_step_response(tmp_path):
+    slow = dataclasses.replace(parse_vehicle(SEVEN_LINES, tmp_path), motor_tau=0.45)
     (tmp_path / "slow.toml").write_text(SEVEN_LINES.replace("motor_tau = 0.1", "motor_tau = 0.45"))
     register_vehicle("slow-one", slow.build)
     for use in (
@@ -99,6 +99,6 @@ def test_a_vehicle_that_no_rate_loop_can_fly_is_refused_with_its_step_response(t
         assert "motor_tau = 0.45 s" in str(error.value)
 
 
-def read_of(text, folder):
+def parse_vehicle(text, folder):
     (folder / "read.toml").write_text(text)
     return read_vehicle(folder / "read.toml")

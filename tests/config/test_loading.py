@@ -1,4 +1,4 @@
-"""Presets from TOML files: overlays, and every mistake as one line that names the path."""
+"""Presets from TOML files: overlays, and one line with the path for every mistake."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from retrim.config.validation import MAX_TOML_BYTES
 
 @pytest.fixture
 def overlay(tmp_path):
-    """Write a file, and return its path."""
+    """Return a function that writes an overlay and returns its path."""
 
     def write(text, name="overlay.toml"):
         path = tmp_path / name
@@ -38,14 +38,14 @@ def test_overlay(overlay):
     assert overlaid(result, overlay("[adapt]\nnum_envs = 3\n")).adapt.num_updates == 7
 
 
-def test_a_table_of_a_task_is_overlaid_key_by_key(overlay):
+def test_task_table_is_overlaid_key_by_key(overlay):
     result = load("vision/occluded", overlay("[vision]\ndropout = 0.2\n"))
     assert result.vision.dropout == 0.2
     assert result.vision.occlusion
     assert result.vision.pixel_noise == 1.0
 
 
-def test_whole_numbers_are_numbers(overlay):
+def test_integers_are_accepted_as_floats(overlay):
     result = load("hover/fast", overlay("termination_box = 4\ngoal = [0, 1, 2]\n[adapt]\nfit_every = 3\n"))
     assert (result.termination_box, result.goal, result.adapt.fit_every) == (4.0, (0.0, 1.0, 2.0), 3.0)
     assert type(result.termination_box) is float
@@ -95,17 +95,17 @@ def test_whole_numbers_are_numbers(overlay):
         ("#" * (MAX_TOML_BYTES + 1), rf"larger than the {MAX_TOML_BYTES} bytes that are accepted"),
     ],
 )
-def test_bad_overlays_name_the_path(overlay, text, message):
+def test_invalid_overlay_names_path(overlay, text, message):
     check_refusal(overlay(text), message)
 
 
-def test_what_is_no_file(tmp_path):
+def test_missing_or_special_file_is_refused(tmp_path):
     check_refusal(tmp_path / "nothing.toml", "no such file")
     check_refusal(tmp_path, "not a regular file")
     check_refusal(Path("/dev/zero"), "not a regular file")
 
 
-def test_unknown_presets():
+def test_unknown_presets_are_refused():
     with pytest.raises(ConfigError, match="no preset 'quick'; there are hover/retrim, hover/any, track/retrim"):
         load("quick")
     with pytest.raises(ConfigError, match=r"no preset 'hover/fsat'; did you mean 'hover/fast'\? there are"):
@@ -113,7 +113,7 @@ def test_unknown_presets():
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", '{"pretrain": 3}', "[" * 100_000, '{"dt": NaN}'])
-def test_json_that_is_no_preset(text):
+def test_invalid_json_is_refused(text):
     with pytest.raises(ConfigError, match="header: ") as error:
         parse(text, source="header")
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Methods by name: whom they fly for, and whom they refuse."""
+"""Methods by name: the presets that they support and the ones that they refuse."""
 
 import equinox as eqx
 import jax
@@ -15,8 +15,8 @@ from retrim_paper.raptor.passive import HoverController
 
 
 @pytest.fixture(scope="module")
-def seeing():
-    """Set-ups whose policies see keypoints: with a pose filter, and without."""
+def keypoint_setups():
+    """Return setups whose policies observe keypoints, with and without a pose filter."""
     return {name: Setup.from_preset(brief_preset(f"vision/{name}")) for name in ("retrim", "ideal")}
 
 
@@ -38,15 +38,15 @@ def seeing():
         ("retrim", "datt", "method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains"),
     ],
 )
-def test_methods_that_need_what_keypoints_do_not_give_are_refused(seeing, name, method, message, key):
-    setup = seeing[name]
+def test_methods_that_need_more_than_keypoints_are_refused(keypoint_setups, name, method, message, key):
+    setup = keypoint_setups[name]
     with pytest.raises(ConfigError, match=message) as error:
         setup.pilot(setup.new_policy(key), method, key)
     assert "\n" not in str(error.value)
 
 
-def test_a_controller_flies_by_the_pose_that_the_filter_sees(seeing, key):
-    setup = seeing["retrim"]
+def test_controller_receives_pose_of_filter(keypoint_setups, key):
+    setup = keypoint_setups["retrim"]
     pilot = setup.pilot(setup.new_policy(key), "indi", key)
     assert type(pilot.controller) is PoseFilteredController
     pilot.reset(Measurement(0.0, setup.flight_starts(1)[0]))
@@ -55,18 +55,18 @@ def test_a_controller_flies_by_the_pose_that_the_filter_sees(seeing, key):
     own = HoverController()
     assert MethodRequest(Setup.from_preset(brief_preset()), None).by_state(own) is own
     with pytest.raises(ConfigError, match="method 'HoverController' needs the state"):
-        MethodRequest(seeing["ideal"], None).by_state(own)
+        MethodRequest(keypoint_setups["ideal"], None).by_state(own)
 
 
 @pytest.mark.parametrize("method", ["full", "lora"])
-def test_a_method_that_learns_needs_a_key(method):
+def test_learning_method_needs_key(method):
     setup = Setup.from_preset(brief_preset(pretrain={"hidden_sizes": (16, 16)}))
     with pytest.raises(ValueError, match="a method that learns needs a key"):
         setup.pilot(setup.new_policy(random.key(0)), method)
 
 
-def test_every_method_has_a_label_of_its_own_and_only_raptor_is_on_board():
-    names = [*METHODS, "datt", "raptor"]  # the last two are entry points of another package
+def test_labels_are_unique_and_only_raptor_is_on_board():
+    names = [*METHODS, "datt", "raptor"]  # the last two are entry points of a different package
     labels = [find_method(name).label for name in names]
     assert len(set(labels)) == len(labels)
     assert [name for name in names if find_method(name).on_board is not None] == ["raptor"]
@@ -74,7 +74,7 @@ def test_every_method_has_a_label_of_its_own_and_only_raptor_is_on_board():
         find_method("math:pi")
 
 
-def test_a_low_rank_delta_is_drawn_from_the_key_and_kept_where_there_is_one(key):
+def test_low_rank_delta_is_drawn_once(key):
     setup = Setup.from_preset("hover/retrim")
     policy = setup.new_policy(key)
     one, same, other = (setup.low_rank(policy, random.key(seed)).delta[0].down for seed in (1, 1, 2))
@@ -87,8 +87,8 @@ def test_a_low_rank_delta_is_drawn_from_the_key_and_kept_where_there_is_one(key)
 
 @pytest.mark.parametrize("method", ["base", "base-do", "base-swing", "base-id", "full", "lora"])
 @pytest.mark.parametrize("name", ["hover/any", "track/any"])
-def test_every_method_of_a_policy_for_many_vehicles_gives_a_command(name, method):
-    """Traced, not compiled: each method wraps the policy in other controllers."""
+def test_methods_of_universal_policy_return_commands(name, method):
+    """Methods are traced, not compiled; each wraps the policy in different controllers."""
     setup = Setup.from_preset(changed(load(name), pretrain={"hidden_sizes": (16, 16)}))
     pilot = setup.pilot(setup.new_policy(random.key(0)), method, random.key(1))
     learning = isinstance(pilot, AdaptivePilot)

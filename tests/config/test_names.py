@@ -1,4 +1,4 @@
-"""Names of files stay names: in presets, C headers, pages and pictures."""
+"""Names of files cannot inject markup or code into presets, C headers, pages or plots."""
 
 import re
 import shutil
@@ -36,7 +36,7 @@ VEHICLE = "mass = 0.7\ninertia = [2e-3, 2e-3, 3e-3]\narm = [0.08, 0.08]\nthrust_
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_names_of_presets_vehicles_and_tasks_are_plain(tmp_path, name):
+def test_special_names_are_refused(tmp_path, name):
     preset = load("hover/retrim")
     for key in ("name", "task"):
         with pytest.raises(ConfigError, match=rf"{key}: .* must be 1 to 64 characters") as error:
@@ -48,7 +48,7 @@ def test_names_of_presets_vehicles_and_tasks_are_plain(tmp_path, name):
         read_vehicle(tmp_path / "v.toml")
 
 
-def test_usual_names_are_plain(tmp_path):
+def test_usual_names_are_accepted(tmp_path):
     for name in (*PRESETS, "track circle+star at 8.0", "a_b-c"):
         assert changed(load("hover/retrim"), name=name).name == name == plain_from(name)
     assert load_for("mine:task", "hover/fast").name == "mine.task on hover/fast"
@@ -57,7 +57,7 @@ def test_usual_names_are_plain(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no C compiler")
-def test_a_remark_in_c_is_a_comment_whatever_it_says(tmp_path):
+def test_c_remark_cannot_end_comment(tmp_path):
     text = "".join(f"/* {remark(name)} */\n/* a {remark(name)}/{remark(name)} */\n" for name in (*HOSTILE, "//", "/"))
     (tmp_path / "a.c").write_text(text + "int main(void) { return 0; }\n")
     words = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Wcomment", "-Wtrigraphs", "-Werror", "-E", "-P", "a.c"]
@@ -66,20 +66,20 @@ def test_a_remark_in_c_is_a_comment_whatever_it_says(tmp_path):
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_cell_of_a_page_is_one_cell_without_links_and_html(name):
+def test_table_cell_has_no_links_or_html(name):
     heading, _, _, _, line, _ = TableSection(("a", "b"), ((name, "1"),), title=f"t {name}").markdown()
     assert heading == f"## {as_text(f't {name}')}"
     assert len(re.findall(r"(?<!\\)\|", line)) == 3
     assert not re.search(r"\]\(|<[a-z]|[\x00-\x1f]", line + heading)
 
 
-def test_dollar_signs_in_pictures_are_text(tmp_path):
+def test_dollar_signs_in_plots_are_text(tmp_path):
     x, name = np.array([1.0, 2.0, 1000.0]), "cost $x_$ and $\\nothing$"
     for figure in (panel_figure(name, [Panel(name, name, name, [Curve(x, x, name)], log=True)]),
                    bars(name, {name: {name: [1.0]}})):  # fmt: skip
-        save(figure, tmp_path, "p")  # whoever reads it as a formula raises
+        save(figure, tmp_path, "p")  # Matplotlib raises if it parses this as a formula.
         ours = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
         formulas = {text.get_text() for text in ours if text.get_parse_math() and "$" in text.get_text()}
         assert name in {text.get_text() for text in ours}
-        assert all("mathdefault{10^" in text for text in formulas)  # powers of ten are drawn as such
+        assert all("mathdefault{10^" in text for text in formulas)  # powers of ten are drawn this way
         assert not any("mathdefault" in text.get_text() for text in ours if not text.get_parse_math())

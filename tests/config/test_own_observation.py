@@ -1,4 +1,4 @@
-"""An observation of a user provides the same as the built-in ones, by its members alone."""
+"""A user's observation has the same features as a built-in one, through its members only."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ DT = 0.02
 
 
 class Sonar(AbstractObservation[StateEstimate]):
-    """Distances to three walls; the memory is an estimate, which is off by a centimetre and by a known push."""
+    """Distances to three walls. The memory is an estimate with an error of a centimetre and a known push."""
 
     state: StateObs
 
@@ -67,7 +67,7 @@ class Sonar(AbstractObservation[StateEstimate]):
 
 
 class Estimating(Sonar):
-    """The same, with an estimator."""
+    """The same observation with an estimator."""
 
     @property
     def state_estimator(self):
@@ -91,14 +91,16 @@ def make(kind, **changes):
 
 
 @pytest.fixture(scope="module")
-def seeing():
+def sonar_setup():
     return make("estimating")
 
 
-def test_a_controller_receives_the_estimated_state(seeing, key):
-    controller = MethodRequest(seeing, None).by_state(BASELINES["geometric"].controller(baseline_request(seeing)))
+def test_controller_receives_estimated_state(sonar_setup, key):
+    controller = MethodRequest(sonar_setup, None).by_state(
+        BASELINES["geometric"].controller(baseline_request(sonar_setup))
+    )
     assert isinstance(controller, PoseFilteredController)
-    x = State(seeing.flight_task.home() + 0.2, jnp.eye(3), jnp.zeros(3))
+    x = State(sonar_setup.flight_task.home() + 0.2, jnp.eye(3), jnp.zeros(3))
     by_estimate, _ = controller(controller.init(x), jnp.array(0.0), x)
     near = State(x.p + 0.01, x.R, x.v)
     plain = controller.inner
@@ -106,14 +108,14 @@ def test_a_controller_receives_the_estimated_state(seeing, key):
     np.testing.assert_allclose(by_estimate.vector(), by_state.vector(), rtol=1e-6)
 
 
-def test_settings_and_methods_follow_from_the_observation(seeing, key):
+def test_settings_and_methods_follow_from_observation(sonar_setup, key):
     baseline = BASELINES["geometric"]
-    assert baseline.settings_for(seeing.flight_task) is baseline.settings_from_keypoints
-    policy = seeing.new_policy(key)
+    assert baseline.settings_for(sonar_setup.flight_task) is baseline.settings_from_keypoints
+    policy = sonar_setup.new_policy(key)
     with pytest.raises(ConfigError, match="base-i"):
-        seeing.pilot(policy, "base-i")
+        sonar_setup.pilot(policy, "base-i")
     with pytest.raises(ConfigError, match="raptor"):
-        seeing.pilot(policy, "raptor")
+        sonar_setup.pilot(policy, "raptor")
     without = make("blind")
     with pytest.raises(ConfigError, match="method 'indi' needs the state"):
         without.pilot(None, "indi", key)
@@ -121,11 +123,11 @@ def test_settings_and_methods_follow_from_the_observation(seeing, key):
         check_frame(without.preset, without.flight_task)
 
 
-def test_the_frame_is_that_of_the_estimated_disturbance(seeing, key):
-    """A push of 1 m/s^2 along x, as the memory has it after the first tick, turns the command; without it, nothing."""
-    controller = seeing.pilot(seeing.new_policy(key), "base-do").controller
+def test_frame_follows_estimated_disturbance(sonar_setup, key):
+    """A push of 1 m/s^2 along x in the memory turns the command; without a push the command is unchanged."""
+    controller = sonar_setup.pilot(sonar_setup.new_policy(key), "base-do").controller
     assert isinstance(controller, PoseFrame)
-    x = State.at(seeing.flight_task.home())
+    x = State.at(sonar_setup.flight_task.home())
     memory = controller.init(x)
     plain, _ = controller.inner(memory, jnp.array(0.0), x)
     first, memory = controller(memory, jnp.array(0.0), x)
@@ -134,43 +136,45 @@ def test_the_frame_is_that_of_the_estimated_disturbance(seeing, key):
     assert float(second.c) > float(first.c)  # effective gravity is stronger than gravity
 
 
-def test_a_controller_refuses_an_observation_without_an_estimator(seeing, key):
+def test_controller_refuses_observation_without_estimator(sonar_setup, key):
     with pytest.raises(ValueError, match="must have a state_estimator, got Sonar"):
         PoseFilteredController(
-            Sonar(seeing.env.task.observation.state), BASELINES["geometric"].controller(baseline_request(seeing))
+            Sonar(sonar_setup.env.task.observation.state),
+            BASELINES["geometric"].controller(baseline_request(sonar_setup)),
         )
-    blind = PolicyController(Sonar(seeing.env.task.observation.state), seeing.new_policy(key))
+    blind = PolicyController(Sonar(sonar_setup.env.task.observation.state), sonar_setup.new_policy(key))
     with pytest.raises(ValueError, match="must have a state_estimator, got Sonar"):
         PoseFrame(blind, jnp.array(6.0))
 
 
-def test_the_learner_keeps_the_frame_that_a_memory_needs(seeing):
+def test_learner_keeps_frame_that_memory_needs(sonar_setup):
     assert isinstance(make("estimating", adapt={"frame": "gravity"}).learner.view, RestView)
     assert isinstance(Setup.from_preset(changed(brief_preset(), adapt={"frame": "gravity"})).learner.view, GravityView)
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_the_encoder_is_trained_with_its_examples(seeing, key):
-    observation, policy = seeing.env.task.observation, seeing.new_policy(key)
+def test_encoder_is_trained_with_examples_of_observation(sonar_setup, key):
+    observation, policy = sonar_setup.env.task.observation, sonar_setup.new_policy(key)
     _, errors = pretrain_encoder(policy, observation, key, steps=60, batch=16)
     assert float(errors[-10:].mean()) < float(errors[:5].mean())
     vision = Setup.from_preset(changed(brief_preset("vision/retrim"), pretrain={"network": f"{__name__}:linear"}))
     assert vision.preset.vision.encoder_steps > 0
-    for task in (seeing.env.task, vision.env.task):
+    for task in (sonar_setup.env.task, vision.env.task):
         with pytest.raises(ConfigError, match=r"encoder_steps needs a perceptron"):
             dataclasses.replace(vision, env=dataclasses.replace(vision.env, task=task)).pretraining()
     task = Setup.from_preset(brief_preset()).env.task
-    dataclasses.replace(vision, env=dataclasses.replace(vision.env, task=task)).pretraining()  # a state needs none
+    # a state needs no encoder
+    dataclasses.replace(vision, env=dataclasses.replace(vision.env, task=task)).pretraining()
 
 
-def test_its_image_is_drawn(seeing, tmp_path):
+def test_image_of_observation_is_drawn(sonar_setup, tmp_path):
     display = flight(0.1)
-    text = picture([display], seeing, display.spec.scenario, tmp_path)[1].read_text()
+    text = picture([display], sonar_setup, display.spec.scenario, tmp_path)[1].read_text()
     assert "points in the image" in text
 
 
-def test_an_observation_around_another_measures_no_more_than_that(seeing):
-    inner = seeing.env.task.observation
+def test_wrapped_observation_measures_no_more(sonar_setup):
+    inner = sonar_setup.env.task.observation
     around = HeadingObs(inner, jnp.zeros(3))
     assert (around.size, around.measures_state, around.has_frame_in_memory) == (3, False, True)
-    assert around.state_estimator is None  # its estimate would be that of the turned state
+    assert around.state_estimator is None  # its estimate would be that of the rotated state

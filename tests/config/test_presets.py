@@ -1,4 +1,4 @@
-"""Presets: their numbers, and what cannot be one."""
+"""Presets: their numbers, and invalid combinations."""
 
 import math
 
@@ -16,7 +16,7 @@ def test_presets_survive_json():
         assert parse(dump(preset), source="test") == preset
 
 
-def test_the_papers_numbers():
+def test_numbers_of_paper():
     paper = load("hover/paper")
     p, a = paper.pretrain, paper.adapt
     assert (p.num_updates, p.num_envs, p.horizon, p.hidden_sizes) == (300, 100, 150, (512, 512))
@@ -37,7 +37,7 @@ def test_the_papers_numbers():
     assert (vision.adapt.num_updates, vision.adapt.num_envs) == (50, 30)
 
 
-def test_a_hundred_hertz_has_the_same_times():
+def test_100_hz_preset_has_same_times():
     fast, fine = load("hover/fast"), load("hover/100hz")
     for ticks in (
         lambda p: p.pretrain.horizon,
@@ -66,13 +66,13 @@ def test_a_hundred_hertz_has_the_same_times():
         ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2', 'stiff', 'sharp', 'exact' or 'view'"),
     ],
 )
-def test_what_does_not_fit_together(tables, message):
+def test_inconsistent_settings_are_refused(tables, message):
     with pytest.raises(ConfigError, match=message) as error:
         changed(load("hover/fast"), **tables)
     assert "\n" not in str(error.value)
 
 
-def test_several_mistakes_are_all_named():
+def test_all_mistakes_are_reported():
     with pytest.raises(
         ConfigError, match=r"adapt\.window: .*; pretrain\.num_envs: |pretrain\.num_envs: .*; adapt\.window: "
     ):
@@ -258,7 +258,7 @@ OURS["hover/100hz"] = OURS["hover/fast"] | {
 }
 
 
-def test_defaults_are_the_papers():
+def test_defaults_are_those_of_paper():
     paper = Preset()
     assert tuple(vars(paper.pretrain).values()) == DEFAULTS["pretrain"]
     assert tuple(vars(paper.adapt).values()) == DEFAULTS["adapt"]
@@ -266,8 +266,8 @@ def test_defaults_are_the_papers():
     assert tuple(getattr(paper, name) for name in (*names, "actuator_tau")) == DEFAULTS["rest"]
 
 
-def test_results_depend_on_these_numbers():
-    """What each preset changes of the paper's, written out once more: published results were made with them."""
+def test_presets_of_published_results_are_unchanged():
+    """The differences between each preset and the paper are listed again, since published results depend on them."""
     assert set(OURS) == set(PRESETS)
     for name, tables in OURS.items():
         assert PRESETS[name] == changed(Preset(), name=name, **tables), name

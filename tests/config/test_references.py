@@ -1,4 +1,4 @@
-"""References by name: files with their suffixes, families, and names that are refused."""
+"""References by name: files with suffixes, families, and invalid names."""
 
 import math
 
@@ -18,35 +18,35 @@ from retrim.tasks.shapes import circle
 
 @pytest.fixture
 def lap(tmp_path):
-    """A closed file of one round."""
+    """Return a closed trajectory file of one round."""
     file = tmp_path / "lap.csv"
     angles = np.linspace(0.0, 2.0 * math.pi, 101)
     file.write_text("\n".join(f"{a / 2.0},{math.sin(a)},{math.cos(a)},1" for a in angles))
     return file
 
 
-def repeats(reference):
+def is_periodic(reference):
     return float(reference.lap[0]) < float(reference.lap[1])
 
 
-def test_a_file_is_flown_as_its_name_says(lap):
-    assert repeats(make_reference(str(lap)))
-    assert repeats(make_reference(f"{lap}:laps"))
-    assert not repeats(make_reference(f"{lap}:once"))
+def test_suffix_of_file_name_selects_repetition(lap):
+    assert is_periodic(make_reference(str(lap)))
+    assert is_periodic(make_reference(f"{lap}:laps"))
+    assert not is_periodic(make_reference(f"{lap}:once"))
 
 
-def test_an_open_file_is_no_lap(tmp_path):
+def test_open_file_is_not_a_lap(tmp_path):
     file = tmp_path / "Open.CSV"
     file.write_text("0,0,0,1\n2,1,0,1\n4,2,0,1\n6,3,0,1\n")
-    assert not repeats(make_reference(str(file)))
+    assert not is_periodic(make_reference(str(file)))
     with pytest.raises(ConfigError, match=r"Open\.CSV: its last point is 3\.000 m from its first"):
         make_reference(f"{file}:laps")
 
 
-def test_a_file_in_a_family(lap):
+def test_file_in_family(lap):
     family = make_reference(f"circle+{lap}:once")
     assert family.joins.shape == (2, 2)
-    assert not repeats(family)
+    assert not is_periodic(family)
 
 
 @pytest.mark.parametrize(
@@ -61,12 +61,12 @@ def test_a_file_in_a_family(lap):
         ("builtins:dict", "is a dict, not a function that gives a Reference"),
     ],
 )
-def test_what_is_refused(name, message, lap):
+def test_invalid_references_are_refused(name, message, lap):
     with pytest.raises(ConfigError, match=message):
         make_reference(name.format(lap))
 
 
-def test_every_registered_name_makes_a_reference():
+def test_every_registered_name_builds_a_reference():
     for name in REFERENCES:
         assert isinstance(make_reference(name), Reference)
 
@@ -74,8 +74,8 @@ def test_every_registered_name_makes_a_reference():
 # ---- requirements of a flight
 
 
-def test_a_flight_lasts_as_long_as_a_reference_that_ends(lap):
-    """Its last seconds are what is scored: a flight of 60 s would be scored while it hovers."""
+def test_flight_lasts_as_long_as_finite_reference(lap):
+    """The last seconds are scored; a longer flight would be scored in hover."""
     preset = load("track/preview")
     assert Setup.from_preset(preset, str(lap)).flight_task.flight_seconds == 60.0
     assert Setup.from_preset(preset, f"{lap}:once").flight_task.flight_seconds == pytest.approx(math.pi, abs=1e-3)
@@ -83,8 +83,10 @@ def test_a_flight_lasts_as_long_as_a_reference_that_ends(lap):
     assert Setup.from_preset(preset).flight_task.flight_seconds == 60.0
 
 
-def test_limits_are_those_of_the_vehicle_that_flies():
-    """A circle whose rates the large vehicle has (10 rad/s), and the small one, of training, has not (6 rad/s)."""
+def test_limits_are_those_of_flight_vehicle():
+    """The circle needs rates that the large vehicle reaches (10 rad/s) and the small one from training (6 rad/s) does
+    not.
+    """
     preset = load("track/preview")
     hasty = circle(radius=3.0, period=1.4)
     assert hasty.infeasibility(small()) != hasty.infeasibility(large())
@@ -97,14 +99,14 @@ def test_limits_are_those_of_the_vehicle_that_flies():
 
 
 @pytest.mark.parametrize("name", ["circle=max", "{}=max", "{}:once=max"])
-def test_a_paced_reference_has_the_path_of_its_name(lap, name):
+def test_paced_reference_has_path_of_its_name(lap, name):
     name = name.format(lap)
     paced, plain = make_reference(name), make_reference(plain_name(name))
     np.testing.assert_array_equal(paced.rows, plain.rows)
     assert is_paced(name) and not is_paced(plain_name(name)) and not is_paced(f"{name}+circle=max")  # noqa: PT018
 
 
-def test_a_paced_flight_trains_on_the_references_of_pretraining():
+def test_paced_flight_trains_on_references_of_pretraining():
     setup = Setup.from_preset("track/paced", "star=max")
     assert setup.pace is not None
     assert setup.learner.env.task.reference is setup.env.task.reference
@@ -115,6 +117,6 @@ def test_a_paced_flight_trains_on_the_references_of_pretraining():
     assert Setup.from_preset(single).pace is not None
 
 
-def test_an_unknown_paced_reference_is_refused():
+def test_unknown_paced_reference_is_refused():
     with pytest.raises(ConfigError, match="no reference 'circel'"):
         make_reference("circel=max")

@@ -1,4 +1,4 @@
-"""Names: what is registered, what is imported from one's own module, and what does not exist."""
+"""Names: registered names, names imported from a user's module, and unknown names."""
 
 import math
 import subprocess
@@ -119,7 +119,7 @@ def reference():
 
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
-    """A module of one's own in the current folder, under a name of this test."""
+    """Return a user's module in the current folder, under a unique name."""
     name = f"mine_{tmp_path.name.replace('-', '_')}"
     (tmp_path / f"{name}.py").write_text(textwrap.dedent(MINE))
     monkeypatch.chdir(tmp_path)
@@ -131,7 +131,7 @@ def mine(tmp_path, monkeypatch):
 # ---- the registry itself
 
 
-def test_a_thing_is_registered_once():
+def test_name_is_registered_once():
     things = Registry("thing", example="module:name")
     assert things.register("one", abs) is abs
     assert things.find("one") is things["one"] is abs
@@ -144,7 +144,7 @@ def test_a_thing_is_registered_once():
     assert len(things) == 1
 
 
-def test_a_place_is_imported_when_it_is_first_used(mine):
+def test_module_is_imported_at_first_use(mine):
     sys.path.append(str(Path.cwd()))
     things = Registry("thing", example="module:name", expected="a plant")
     things.register_place("late", f"{mine}:plant")
@@ -158,13 +158,13 @@ def test_a_place_is_imported_when_it_is_first_used(mine):
         things.find("number")
 
 
-def test_no_link_is_imported_before_its_use():
+def test_links_are_imported_at_first_use():
     code = "import sys; import retrim.config; print([m for m in sys.modules if m.startswith('retrim.plants.bridges.')])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
 @pytest.mark.parametrize("kind", REGISTRIES)
-def test_an_object_of_a_wrong_type_is_refused(kind):
+def test_object_of_wrong_type_is_refused(kind):
     with pytest.raises(ConfigError, match=rf"{kind} 'math:pi' is a float, not an? "):
         REGISTRIES[kind].find("math:pi")
     with pytest.raises(ConfigError, match=rf"{kind} 'pi' is a float, not an? "):
@@ -173,13 +173,13 @@ def test_an_object_of_a_wrong_type_is_refused(kind):
 
 
 @pytest.mark.parametrize("name", ["", "a:b", "a+b", "a=b", "a b", "a\n"])
-def test_names_that_cannot_be(name):
+def test_invalid_names_are_refused(name):
     with pytest.raises(ConfigError, match="must not be empty nor contain"):
         Registry("thing", example="module:name").register(name, abs)
 
 
 @pytest.mark.parametrize("kind", REGISTRIES)
-def test_an_unknown_name_lists_the_names_and_the_nearest(kind):
+def test_unknown_name_lists_names_and_nearest(kind):
     model = REGISTRIES[kind]
     nearest = max(model, key=len)
     with pytest.raises(ConfigError, match=rf"no {kind} '{nearest}x'; did you mean '{nearest}'\? there are ") as error:
@@ -192,7 +192,7 @@ def test_an_unknown_name_lists_the_names_and_the_nearest(kind):
         model.find("qqqqqq")
 
 
-def test_installed_packages_bring_names(monkeypatch):
+def test_installed_packages_add_names(monkeypatch):
     calls = []
 
     def entry_points(group):
@@ -214,7 +214,7 @@ def test_installed_packages_bring_names(monkeypatch):
         ("leaving:thing", "SystemExit|RuntimeError"),
     ],
 )
-def test_a_module_that_cannot_be_imported(mine, tmp_path, text, message):
+def test_module_that_cannot_be_imported_is_refused(mine, tmp_path, text, message):
     (tmp_path / "broken.py").write_text("1 / 0")
     (tmp_path / "unfinished.py").write_text("def thing(:")
     (tmp_path / "leaving.py").write_text("raise RuntimeError('not today')")
@@ -226,15 +226,15 @@ def test_a_module_that_cannot_be_imported(mine, tmp_path, text, message):
 @pytest.mark.parametrize(
     "name", ["mine:", ":thing", "a+b:thing", "mine:thing.part", "a.:b", "../mine:thing", "mine :a"]
 )
-def test_a_python_name_is_a_module_and_a_name_in_it(name):
+def test_invalid_python_names_are_refused(name):
     with pytest.raises(ConfigError, match="a Python name is as module:name"):
         VEHICLES.find(name)
 
 
-# ---- things of one's own
+# ---- a user's own objects
 
 
-def test_ones_own_task(mine):
+def test_custom_task(mine):
     preset = changed(tiny_preset(), task=f"{mine}:task", options={"height": 2.5})
     setup = Setup.from_preset(preset)
     assert type(setup.env.task).__name__ == "Higher"
@@ -254,12 +254,12 @@ def test_ones_own_task(mine):
         ("no_residual", "gives a int, expected a retrim.AbstractTask"),
     ],
 )
-def test_a_task_that_is_none(mine, name, message):
+def test_invalid_custom_task_is_refused(mine, name, message):
     with pytest.raises(ConfigError, match=message):
         Setup.from_preset(changed(tiny_preset(), task=f"{mine}:{name}"))
 
 
-def test_ones_own_plant_vehicle_sensors_and_disturbance(mine):
+def test_custom_plant_vehicle_sensors_and_disturbance(mine):
     scenario = Scenario(f"{mine}:gust=2.5+none", f"{mine}:plant", f"{mine}:vehicle", f"{mine}:sensors")
     assert scenario.entry.about == "A plant of mine."
     plant = scenario.make(dt=0.01, seed=3)
@@ -273,31 +273,31 @@ def test_ones_own_plant_vehicle_sensors_and_disturbance(mine):
         Scenario(plant=f"{mine}:plant_entry", vehicle="large")
 
 
-def test_a_size_that_ones_own_disturbance_refuses(mine):
+def test_size_refused_by_custom_disturbance(mine):
     with pytest.raises(ConfigError, match=rf"disturbance '{mine}:gust=7': no more than 5"):
         disturbance(f"{mine}:gust=7")
 
 
-def test_a_plant_that_is_none(mine):
+def test_invalid_custom_plant_is_refused(mine):
     with pytest.raises(ConfigError, match="is a int, not a function of a PlantRequest"):
         Scenario(plant=f"{mine}:NUMBER")
     with pytest.raises(ConfigError, match=r"gives a int, expected a retrim\.Plant"):
         Scenario(plant=f"{mine}:no_residual").make()
 
 
-def test_a_disturbance_that_is_none(mine):
+def test_invalid_custom_disturbance_is_refused(mine):
     with pytest.raises(ConfigError, match=rf"disturbance '{mine}:no_disturbance=2' gives a float, expected a retrim"):
         disturbance(f"{mine}:no_disturbance=2")
 
 
-def test_a_vehicle_that_is_none(mine):
+def test_invalid_custom_vehicle_is_refused(mine):
     with pytest.raises(ConfigError, match=r"gives a str, expected a retrim\.Vehicle"):
         Scenario(vehicle=f"{mine}:no_vehicle").make()
     with pytest.raises(ConfigError, match="vehicle"):
         Setup.from_preset(changed(tiny_preset(), vehicle=f"{mine}:NUMBER"))
 
 
-def test_ones_own_residual(mine):
+def test_custom_residual(mine):
     setup = Setup.from_preset(changed(tiny_preset(), adapt={"residual": f"{mine}:residual"}))
     assert type(setup.learner.residual_model).__name__ == "Zero"
     assert setup.learner.residual_model.steps == 2
@@ -307,7 +307,7 @@ def test_ones_own_residual(mine):
         Setup.from_preset(changed(tiny_preset(), adapt={"residual": f"{mine}:no_residual"}))
 
 
-def test_ones_own_reference(mine):
+def test_custom_reference(mine):
     result = make_reference(f"{mine}:reference")
     np.testing.assert_allclose(result(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     setup = Setup.from_preset(changed(load("track/paper"), pretrain={"hidden_sizes": (8,)}), f"{mine}:reference")

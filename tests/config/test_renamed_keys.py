@@ -1,4 +1,4 @@
-"""Old names of preset keys: files and JSON with them mean what they meant."""
+"""Old names of preset keys keep their meaning in files and JSON."""
 
 import json
 
@@ -22,19 +22,19 @@ def with_old_keys(preset: Preset) -> str:
 
 
 @pytest.mark.parametrize("form", [str, str.encode])
-def test_json_with_old_keys_is_the_same_preset(form):
+def test_json_with_old_keys_gives_same_preset(form):
     text = form(with_old_keys(PRESET))
     assert parse(text, source="header") == PRESET
     assert missing_defaults(PRESET, text) == {}
 
 
-def test_an_overlay_with_old_keys_is_the_same_preset(tmp_path):
+def test_overlay_with_old_keys_gives_same_preset(tmp_path):
     path = tmp_path / "old.toml"
     path.write_text("[track]\nfelt_copies = 3\nfelt_push = 2.5\n")
     assert load("track/retrim", path) == PRESET
 
 
-def test_both_names_of_a_key_are_refused(tmp_path):
+def test_old_and_new_name_together_are_refused(tmp_path):
     path = tmp_path / "both.toml"
     path.write_text("[track]\nfelt_copies = 3\ngravity_copies = 3\n")
     with pytest.raises(ConfigError, match=r"both.toml: track\.felt_copies is now track\.gravity_copies; remove"):

@@ -1,4 +1,4 @@
-"""Where a flight takes place: disturbances with sizes, sensors, and a plant that gets what the scenario says."""
+"""Scenarios: disturbances with sizes, sensors, and the plant that they configure."""
 
 import dataclasses
 
@@ -44,7 +44,7 @@ def effects(name, t=0.0, seed=0):
         ("push=2+large", 0.0, 4.0),
     ],
 )
-def test_pushes(name, t, push):
+def test_push_acts_in_its_interval(name, t, push):
     result = effects(name, t)
     np.testing.assert_allclose(result.push, push)
     np.testing.assert_array_equal(result.wind, 0.0)
@@ -52,18 +52,18 @@ def test_pushes(name, t, push):
 
 
 @pytest.mark.parametrize(("name", "speed"), [("wind", 4.0), ("wind=6", 6.0), ("wind=0", 0.0)])
-def test_wind_blows_diagonally(name, speed):
+def test_wind_is_diagonal(name, speed):
     np.testing.assert_allclose(effects(name).wind, [speed / 2**0.5, speed / 2**0.5, 0.0])
 
 
 @pytest.mark.parametrize(("name", "mean"), [("gusts", 4.0), ("gusts=8", 8.0)])
-def test_gusts_have_that_mean(name, mean):
+def test_gusts_have_stated_mean(name, mean):
     winds = np.stack([effects(name, t).wind for t in np.arange(0.0, 200.0, 5.0)])
     np.testing.assert_allclose(winds.mean(axis=0), [mean / 2**0.5, mean / 2**0.5, 0.0], atol=0.25 * mean)
     assert winds.std() > 0.05 * mean
 
 
-def test_the_fan_blows_at_the_goal_and_nowhere_else():
+def test_fan_acts_at_goal_only():
     fan = disturbance("fan")
     at_goal = np.stack([fan(jnp.array(t), HERE).wind for t in np.arange(0.0, 20.0, 1.0)]).mean(axis=0)
     assert np.linalg.norm(at_goal) == pytest.approx(4.0, rel=0.15)
@@ -77,7 +77,7 @@ def test_the_fan_blows_at_the_goal_and_nowhere_else():
         disturbance("fan=0")
 
 
-def test_a_walk_has_that_rate_and_stays_within_its_bounds():
+def test_random_walk_has_stated_rate_and_bounds():
     after_a_second = np.stack([effects("walk", 1.0, seed=seed).push for seed in range(60)])
     np.testing.assert_allclose(after_a_second.std(), 0.5, rtol=0.25)
     late = np.stack([effects("walk=3", t).push for t in np.arange(0.0, 100.0, 0.5)])
@@ -95,35 +95,35 @@ def test_a_walk_has_that_rate_and_stays_within_its_bounds():
         ("pickup", 20.1, 0.0),
     ],
 )
-def test_loads(name, t, mass):
+def test_load_adds_mass(name, t, mass):
     assert float(effects(name, t).mass) == pytest.approx(mass)
 
 
 @pytest.mark.parametrize(
     ("name", "t", "gain"), [("battery", 50.0, 0.9), ("battery=0.001", 50.0, 0.95), ("battery", 1000.0, 0.8)]
 )
-def test_batteries_sag(name, t, gain):
+def test_battery_sag_reduces_thrust(name, t, gain):
     np.testing.assert_allclose(effects(name, t).gain, gain)
 
 
 @pytest.mark.parametrize(("name", "gain"), [("weak-rotor", 0.9), ("weak-rotor=0.7", 0.7)])
-def test_a_weak_rotor_is_the_first(name, gain):
+def test_weak_rotor_is_first_rotor(name, gain):
     np.testing.assert_allclose(effects(name).gain, [gain, 1.0, 1.0, 1.0])
 
 
-def test_a_sum_has_the_effects_of_both():
+def test_sum_has_effects_of_both_disturbances():
     both = effects("push=2+wind=6")
     np.testing.assert_allclose(both.push, 2.0)
     assert float(jnp.linalg.norm(both.wind)) == pytest.approx(6.0)
 
 
-def test_what_is_random_follows_from_the_seed():
+def test_random_disturbances_follow_from_seed():
     for name in ("walk", "gusts", "fan"):
         same, again, other = effects(name, 2.0, 1), effects(name, 2.0, 1), effects(name, 2.0, 2)
         for field in ("push", "wind"):
             np.testing.assert_array_equal(getattr(same, field), getattr(again, field))
         assert not np.array_equal(same.push + same.wind, other.push + other.wind)
-    twice = disturbance("walk+walk")(jnp.array(2.0), HERE).push  # each part draws its own
+    twice = disturbance("walk+walk")(jnp.array(2.0), HERE).push  # each part has its own random numbers
     assert not np.allclose(twice, 2.0 * effects("walk", 2.0).push)
 
 
@@ -177,14 +177,14 @@ def test_sizes_have_bounds(name):
         ("wind+weather", "no disturbance 'weather'"),
     ],
 )
-def test_sizes_that_cannot_be(name, message):
+def test_invalid_sizes_are_refused(name, message):
     with pytest.raises(ConfigError, match=message) as error:
         disturbance(name)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("plant", ["bem", "simple", "rotorpy", "mujoco", "crazyflow"])
-def test_the_control_period_reaches_every_plant(plant):
+def test_every_plant_receives_control_period(plant):
     try:
         assert Scenario(plant=plant).make(dt=0.01).dt == 0.01
     except PlantError as error:
@@ -192,7 +192,7 @@ def test_the_control_period_reaches_every_plant(plant):
 
 
 @pytest.mark.parametrize("plant", ["rotorpy", "mujoco", "crazyflow", "betaflight"])
-def test_plants_without_a_state_of_the_disturbance_refuse_a_load_on_a_cable(plant):
+def test_plants_without_disturbance_state_refuse_slung_load(plant):
     for plain in ("payload", "none"):
         Scenario(plain, plant=plant)
     with pytest.raises(ConfigError, match=f"plant '{plant}' cannot carry a load on a cable; disturbance 'wind.slung"):
@@ -202,7 +202,7 @@ def test_plants_without_a_state_of_the_disturbance_refuse_a_load_on_a_cable(plan
 
 
 @pytest.mark.parametrize("plant", ["bem", "simple"])
-def test_a_delay_is_that_of_the_plant(plant):
+def test_plant_has_stated_delay(plant):
     assert Scenario(plant=plant, delay=0.035).make().simulation.delay == jnp.array(0.035)
     assert Scenario(plant=plant).make().simulation.delay == jnp.array(0.02)
 
@@ -214,7 +214,7 @@ def test_a_delay_is_that_of_the_plant(plant):
         ({"plant": "mujoco"}, 0.015, "plant 'mujoco' with sensors 'ideal' at dt = 0.015 s: .* the simulator's step"),
     ],
 )
-def test_a_control_period_that_cannot_be_divided_is_named(options, dt, text):
+def test_indivisible_control_period_is_refused(options, dt, text):
     if "plant" in options:
         pytest.importorskip(options["plant"])
     with pytest.raises(ConfigError, match=text) as error:
@@ -222,12 +222,12 @@ def test_a_control_period_that_cannot_be_divided_is_named(options, dt, text):
     assert "\n" not in str(error.value)
 
 
-def test_a_kick_gains_its_speed_within_a_tenth_of_a_second():
+def test_kick_reaches_its_speed_within_tenth_of_a_second():
     gain = sum(0.001 * effects("kick=4", 7.95 + 0.001 * ms).push for ms in range(300))
     np.testing.assert_allclose(gain, [4.0 / 2**0.5, 4.0 / 2**0.5, 0.0], rtol=0.02)
 
 
-def test_every_disturbance_is_looked_at_here():
+def test_bounds_cover_every_disturbance():
     assert set(DISTURBANCES) == set(BOUNDS) | {"none", "small", "large"}
 
 
@@ -252,8 +252,8 @@ def test_sensors_by_name(name, numbers):
 # ---- the plant
 
 
-def test_a_scenario_is_made_of_its_parts():
-    """Disturbance and sensors follow from the seed; vehicle and control period arrive."""
+def test_scenario_configures_plant():
+    """Disturbance and sensors follow from the seed; the plant receives the vehicle and the control period."""
 
     def fly_once(seed, **options):
         plant = Scenario("walk", "simple", "large", "mocap", **options).make("small", dt=0.01, seed=seed)
@@ -267,7 +267,7 @@ def test_a_scenario_is_made_of_its_parts():
     assert not np.array_equal(one.measured.p, one.true.p)
 
 
-def test_the_vehicle_of_training_flies_unless_the_scenario_has_another():
+def test_vehicle_of_scenario_replaces_vehicle_of_training():
     for scenario, name, mass in (
         (Scenario(), "kingfisher", 0.752),
         (Scenario(vehicle="small"), "small", 0.19),
@@ -281,15 +281,15 @@ def test_the_vehicle_of_training_flies_unless_the_scenario_has_another():
 
 @pytest.mark.parametrize("plant", ["bem", "simple"])
 @pytest.mark.parametrize(("error", "expected"), [(None, 0.035), (0.0, 0.0), (-0.1, -0.1)])
-def test_the_error_of_the_thrust_map_reaches_the_plant(plant, error, expected):
-    """A hover command lifts the vehicle by that share of its weight; 3.5 % unless told otherwise."""
+def test_plant_receives_thrust_map_error(plant, error, expected):
+    """A hover command lifts the vehicle by this share of its weight; the default is 3.5 %."""
     scenario = Scenario(plant=plant) if error is None else Scenario(plant=plant, thrust_error=error)
     x0 = State.at(jnp.array([0.0, 0.0, 1.0]))
     log = fly(scenario.make(), FunctionPilot(lambda measurement: Command.hover()), x0, ticks=2)
     assert log.v[1, 2] / 0.02 == pytest.approx(9.81 * expected, abs=0.02 * 9.81 * abs(expected) + 0.01)
 
 
-def test_scenarios_that_cannot_be():
+def test_invalid_scenarios_are_refused():
     for wrong, message in (
         ({"thrust_error": 1.2}, "thrust error 1.2 must be between"),
         ({"sensors": "mocap", "plant": "mujoco"}, "measures its true state"),

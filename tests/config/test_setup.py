@@ -1,4 +1,4 @@
-"""From a preset's numbers to objects: every number arrives where it acts, for every preset."""
+"""From the numbers of a preset to objects: for every preset, every number has its effect."""
 
 import itertools
 import math
@@ -55,7 +55,7 @@ UNCLIPPED = ("hover/paper", "hover/released", "track/paper", "track/blind", "vis
 
 @pytest.fixture(scope="module", params=PRESETS)
 def case(request):
-    """A preset, with a small network, and its set-up."""
+    """Return a preset with a small network, and its setup."""
     preset = changed(load(request.param), pretrain={"hidden_sizes": (12, 12)})
     with jax.numpy_dtype_promotion("standard"):
         return preset, Setup.from_preset(preset)
@@ -64,7 +64,7 @@ def case(request):
 # ---- the environment
 
 
-def test_every_clock_ticks_alike(case):
+def test_all_parts_have_same_control_tick(case):
     preset, setup = case
     for env in (setup.env, setup.learner.env):
         assert env.dynamics.dt == env.task.dt == preset.dt
@@ -72,7 +72,7 @@ def test_every_clock_ticks_alike(case):
     assert Scenario().make(dt=preset.dt).dt == preset.dt
 
 
-def test_the_model_has_the_presets_delay_and_lag(case):
+def test_model_has_delay_and_lag_of_preset(case):
     preset, setup = case
     delays = {"hover/paper": 0, "track/paper": 0, "track/blind": 0, "hover/released": 2, "hover/100hz": 2}
     assert preset.delay_ticks == delays.get(preset.name, 1)
@@ -88,7 +88,7 @@ def test_the_model_has_the_presets_delay_and_lag(case):
             assert isinstance(env.dynamics, PointMass)
 
 
-def test_the_task_has_the_presets_numbers(case):
+def test_task_has_numbers_of_preset(case):
     preset, setup = case
     kinds = {("hover", "paper"): Hover, ("hover", "l2"): L2Hover, ("vision", "paper"): Hover, ("vision", "l2"): L2Hover}
     kinds |= {
@@ -111,7 +111,7 @@ def test_the_task_has_the_presets_numbers(case):
     assert (preset.reward == "l2") == (preset.name in sharp)
 
 
-def test_the_observation_has_the_presets_numbers(case):
+def test_observation_has_numbers_of_preset(case):
     preset, setup = case
     observation = setup.env.task.observation
     vehicle = make_vehicle(preset.vehicle)
@@ -136,7 +136,7 @@ def test_the_observation_has_the_presets_numbers(case):
         assert scales.history == preset.command_history
 
 
-def test_occlusion_is_switched_on_in_flight_alone(case):
+def test_occlusion_acts_in_flight_only(case):
     preset, setup = case
     flight = setup.flight_task.observation_in_flight
     if preset.name in ("vision/occluded", "vision/retrim"):
@@ -146,12 +146,12 @@ def test_occlusion_is_switched_on_in_flight_alone(case):
         assert (flight.lag is None) == (preset.actuator_tau is None)
         assert flight.delay_ticks == preset.plant_delay_ticks
         np.testing.assert_array_equal(flight.full.whiten, setup.env.task.observation.whiten)
-        assert isinstance(setup.learner.env.task.observation, Keypoints)  # nor in updates
+        assert isinstance(setup.learner.env.task.observation, Keypoints)  # no occlusion in updates
     else:
         assert flight is setup.flight_task.observation
 
 
-def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(case):
+def test_policy_has_layers_of_preset_and_limits_of_vehicle(case):
     preset, setup = case
     policy = setup.new_policy(random.key(0))
     sizes = (setup.env.task.observation.size, *preset.pretrain.hidden_sizes, 4)
@@ -164,13 +164,13 @@ def test_a_policy_has_the_presets_layers_and_the_vehicles_limits(case):
 # ---- the learner
 
 
-def test_the_learner_has_the_presets_numbers(case):
+def test_learner_has_numbers_of_preset(case):
     preset, setup = case
     a, learner = preset.adapt, setup.learner
     if preset.family is None:
         assert learner.plant_delay_ticks == preset.plant_delay_ticks
         assert isinstance(learner.vehicles, OwnVehicle)
-    else:  # the identified path has the delay
+    else:  # the identified path contains the delay
         assert learner.plant_delay_ticks == 0
         assert isinstance(learner.vehicles, IdentifiedVehicle)
         assert learner.vehicles.family is setup.env.family
@@ -206,7 +206,7 @@ def test_the_learner_has_the_presets_numbers(case):
 
 
 @pytest.mark.parametrize("latency", ["fixed", "measured"])
-def test_the_pilot_has_the_presets_schedule(case, latency, monkeypatch):
+def test_pilot_has_schedule_of_preset(case, latency, monkeypatch):
     preset, result = case
     a, learners, pilots = preset.adapt, [], []
 
@@ -255,7 +255,7 @@ def test_the_pilot_has_the_presets_schedule(case, latency, monkeypatch):
         assert float(flight.reach) == pytest.approx(0.5)
         flight = flight.inner
     assert isinstance(flight, PolicyController)
-    if a.lap_learning:  # on the reference that laps shift
+    if a.lap_learning:  # on the reference that the laps shift
         own = flight.observation.reference.reference
         assert eqx.tree_equal(own, result.flight_reference)
     elif preset.family is None:
@@ -281,8 +281,8 @@ def test_methods(case):
 # ---- the optimiser of pretraining
 
 
-def moves(optimiser, gradients):
-    """What the optimiser does to a parameter under these gradients."""
+def optimiser_steps(optimiser, gradients):
+    """Return the steps that the optimiser takes along a parameter under these gradients."""
 
     def step(memory, gradient):
         change, memory = optimiser.update(gradient, memory, jnp.zeros(4))
@@ -292,29 +292,29 @@ def moves(optimiser, gradients):
     return np.asarray(jax.jit(lambda rows: jax.lax.scan(step, optimiser.init(jnp.zeros(4)), rows)[1])(rows))
 
 
-def test_pretraining_falls_along_a_cosine(case):
+def test_pretraining_rate_follows_cosine(case):
     preset, setup = case
     p = preset.pretrain
-    steps = -moves(setup.optimiser, np.full(p.num_updates, 0.1))
+    steps = -optimiser_steps(setup.optimiser, np.full(p.num_updates, 0.1))
     expected = 0.5 * p.learning_rate * (1.0 + np.cos(np.pi * np.arange(p.num_updates) / p.num_updates))
     np.testing.assert_allclose(steps, expected, rtol=1e-4)
 
 
-def test_pretraining_clips_if_the_preset_says_so(case):
-    """Four entries of 0.5 have the norm 1: a larger gradient moves the parameter no farther where that is the limit."""
+def test_pretraining_clips_gradient_if_preset_has_limit(case):
+    """Four entries of 0.5 have the norm 1; with this limit, a larger gradient moves the parameter no farther."""
     preset, setup = case
     limit = preset.pretrain.max_grad_norm
     assert limit in (None, 1.0)
     assert (limit is None) == (preset.name in UNCLIPPED)
-    at_limit, beyond = (moves(setup.optimiser, [0.01, 0.01, huge])[-1] for huge in (0.5, 5.0))
+    at_limit, beyond = (optimiser_steps(setup.optimiser, [0.01, 0.01, huge])[-1] for huge in (0.5, 5.0))
     assert (at_limit == pytest.approx(beyond)) == (limit is not None)
 
 
-def test_pretraining_has_the_presets_second_decay(case):
-    """After a large gradient and a zero one, Adam's second moment tells its decay."""
+def test_pretraining_has_second_decay_of_preset(case):
+    """After a large gradient and a zero gradient, the second moment of Adam shows its decay."""
     preset, setup = case
     b1, b2, rate = 0.9, preset.pretrain.adam_b2, preset.pretrain.learning_rate
-    change = moves(setup.optimiser, [0.4, 0.0])[1]
+    change = optimiser_steps(setup.optimiser, [0.4, 0.0])[1]
     m, v = b1 * (1 - b1) * 0.4 / (1 - b1**2), b2 * (1 - b2) * 0.16 / (1 - b2**2)
     cosine = 0.5 * (1 + math.cos(math.pi / preset.pretrain.num_updates))
     assert float(change) == pytest.approx(-rate * cosine * m / (math.sqrt(v) + 1e-8), rel=1e-6)
@@ -323,9 +323,9 @@ def test_pretraining_has_the_presets_second_decay(case):
 # ---- wrong arguments
 
 
-def test_what_does_not_fit_is_one_line():
+def test_inconsistent_arguments_give_one_line():
     for wrong in (
-        changed(load("vision/ideal"), dt=0.008),  # a frame is no whole number of ticks
+        changed(load("vision/ideal"), dt=0.008),  # a camera frame is not a whole number of ticks
         changed(load("vision/occluded"), plant_delay_ticks=9),
     ):
         with pytest.raises(ConfigError, match=r"preset 'vision/(ideal|occluded)': ") as error:
@@ -336,7 +336,7 @@ def test_what_does_not_fit_is_one_line():
 @pytest.mark.parametrize(
     ("hidden", "message"), [((16, 16, 16), "3 ranks .* for 4 layers"), ((8, 16), "rank 10 for weights 16 x 8")]
 )
-def test_a_network_that_low_rank_cannot_take(hidden, message):
+def test_unsuitable_network_for_low_rank_is_refused(hidden, message):
     setup = Setup.from_preset(tiny_preset(pretrain={"hidden_sizes": hidden}))
     with pytest.raises(ConfigError, match=f"preset 'hover/fast': LoRA: {message}") as error:
         setup.pilot(setup.new_policy(random.key(0)), "lora", random.key(1))
@@ -346,7 +346,7 @@ def test_a_network_that_low_rank_cannot_take(hidden, message):
 # ---- starts
 
 
-def test_flight_starts_follow_from_seed_and_home_alone():
+def test_flight_starts_depend_on_seed_and_home_only():
     one, other = (
         Setup.from_preset(tiny_preset()),
         Setup.from_preset(changed(load("hover/released"), pretrain={"hidden_sizes": (8,)})),
@@ -361,8 +361,8 @@ def test_flight_starts_follow_from_seed_and_home_alone():
     assert 0.05 < np.stack([x.v for x in starts]).std() < 0.2
 
 
-def test_a_frame_is_refused_for_what_cannot_be_turned():
-    """A goal that moves; and keypoints without occlusion, for there is no filter that feels."""
+def test_gravity_frame_is_refused_for_unsuitable_tasks():
+    """Examples are a moving goal, and keypoints without occlusion, which have no filter that estimates the disturbance."""
 
     class Moving(Hover):
         def target(self, t):
@@ -380,8 +380,8 @@ def test_a_frame_is_refused_for_what_cannot_be_turned():
     assert isinstance(seeing.pilot(seeing.new_policy(random.key(0)), "base-do").controller, PoseFrame)
 
 
-def test_training_follows_references_as_they_are_felt():
-    """Every member of the family is a built-in reference, level or tilted and scaled; flight follows the plain one."""
+def test_training_references_are_tilted_and_scaled():
+    """Each member is a built-in reference, level or tilted and scaled; flights use the plain reference."""
     setup = Setup.from_preset(changed(load("track/retrim"), track={"reference": "circle+star", "gravity_copies": 2}))
     training_reference, flight = setup.env.task.reference, setup.flight_task.reference
     assert training_reference.joins.shape[0] == 2 * (1 + 2)
@@ -398,7 +398,7 @@ def test_training_follows_references_as_they_are_felt():
 # ---- at 100 Hz
 
 
-def test_a_hundred_hertz_trains_flies_and_adapts():
+def test_train_fly_and_adapt_at_100_hz():
     preset = changed(
         load("hover/100hz"),
         pretrain={"hidden_sizes": (32, 32), "num_updates": 150, "num_envs": 8, "horizon": 120},
@@ -426,7 +426,7 @@ def test_a_hundred_hertz_trains_flies_and_adapts():
     assert after < 0.7 * before
 
 
-def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
+def test_model_has_known_lag_of_vehicle():
     spec = VehicleSpec("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05, (0.07, 0.08, 0.4))
     for name in ("hover/retrim", "track/retrim"):
         setup = Setup.from_preset(changed(load(name), vehicle=spec))
@@ -438,17 +438,17 @@ def test_a_vehicle_whose_lag_is_known_is_modelled_with_it():
 
 
 @pytest.mark.parametrize(("delay", "ticks"), [(0.041, 2), (0.0, 0), (None, 1)])
-def test_a_vehicle_whose_delay_is_known_is_trained_with_it(delay, ticks):
+def test_model_has_known_delay_of_vehicle(delay, ticks):
     body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
     setup = Setup.from_preset(changed(load("hover/retrim"), vehicle=VehicleSpec(*body, command_delay=delay)))
     assert setup.learner.plant_delay_ticks == setup.preset.plant_delay_ticks == ticks
-    exact = 0.02 if delay is None else delay  # the model, and the observer in flight
+    exact = 0.02 if delay is None else delay  # both the model, and the observer in flight
     observer = setup.controller(setup.learner.init(setup.new_policy(random.key(0)), random.key(2))).frame.observer
     assert [float(setup.env.delay), float(observer.path.delay)] == pytest.approx([exact, exact])
     assert Setup.from_preset(setup.preset).preset == setup.preset
 
 
-def test_a_delay_of_too_many_ticks_is_one_line_that_says_why():
+def test_excessive_delay_is_refused_with_reason():
     body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
     preset = changed(load("hover/retrim"), dt=0.005, vehicle=VehicleSpec(*body, command_delay=0.15))
     with pytest.raises(ConfigError, match=r"'made_up': command_delay = 0.15 s is 30 ticks of dt = 0.005 s") as error:

@@ -1,4 +1,4 @@
-"""The trust boundary: Python names of files are data until the user names them, too."""
+"""The trust boundary: Python names in files remain data until the user also names them."""
 
 import os
 import sys
@@ -16,7 +16,7 @@ from retrim.io.logs import read_map
 
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
-    """A module of the current folder that leaves a mark when it is imported."""
+    """Return a module of the current folder that creates a file when it is imported."""
     name = f"mine_{os.getpid()}_{tmp_path.name}"
     (tmp_path / f"{name}.py").write_text(
         f"from pathlib import Path\nPath({str(tmp_path / 'mark')!r}).touch()\n"
@@ -41,17 +41,17 @@ def mine(tmp_path, monkeypatch):
         ([("a:b",), {"x": ["c:d"]}], ("a:b", "c:d")),
     ],
 )
-def test_a_name_with_a_colon_is_python_unless_it_says_how_a_file_is_flown(values, names):
+def test_name_with_colon_is_python_unless_it_is_a_file_suffix(values, names):
     assert python_names(values) == names
 
 
-def test_names_of_a_preset_are_those_that_it_would_import():
+def test_names_of_preset_are_its_imports():
     preset = changed(load("track/retrim"), vehicle="a:b", adapt={"residual": "c:d"}, track={"reference": "circle+e:f"})
     assert set(python_names(preset)) == {"a:b", "c:d", "e:f"}
     assert python_names(changed(load("hover/retrim"), task="g:h", options={"i": "j:k"})) == ("g:h",)
 
 
-def test_a_refusal_is_one_short_line_with_the_way_out():
+def test_refusal_is_one_line_with_remedy():
     with pytest.raises(ConfigError, match=r"^f: names Python code, 'os:abort', .*pass --trust os:abort, or trust="):
         check_trust("os:abort", (), source="f")
     with pytest.raises(ConfigError) as error:
@@ -62,7 +62,7 @@ def test_a_refusal_is_one_short_line_with_the_way_out():
 
 
 @pytest.mark.parametrize("key", ["task", "vehicle"])
-def test_a_policy_file_imports_what_is_trusted_and_nothing_else(mine, tmp_path, key):
+def test_policy_file_imports_only_trusted_names(mine, tmp_path, key):
     name, preset = f"{mine}:{key}", tiny_preset()
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(random.key(0))
@@ -88,7 +88,7 @@ def test_a_policy_file_imports_what_is_trusted_and_nothing_else(mine, tmp_path, 
         "[adapt]\nresidual = '{name}'",
     ],
 )
-def test_a_file_over_a_preset_needs_trust_and_the_preset_below_does_not(mine, tmp_path, text):
+def test_overlay_needs_trust_and_preset_below_does_not(mine, tmp_path, text):
     (tmp_path / "over.toml").write_text(text.format(name=f"{mine}:vehicle"))
     below = load("hover/retrim")
     with pytest.raises(ConfigError, match="names Python code"):
@@ -102,7 +102,7 @@ def test_a_file_over_a_preset_needs_trust_and_the_preset_below_does_not(mine, tm
 
 
 @pytest.mark.parametrize("key", ["methods", "disturbances", "plants", "vehicles", "sensors", "references"])
-def test_a_sweep_file_needs_trust(mine, tmp_path, key):
+def test_sweep_file_needs_trust(mine, tmp_path, key):
     (tmp_path / "s.toml").write_text(f"{key} = ['{mine}:vehicle']")
     with pytest.raises(ConfigError, match=f"names Python code, '{mine}:vehicle'"):
         read_sweep(tmp_path / "s.toml")
@@ -113,7 +113,7 @@ def test_a_sweep_file_needs_trust(mine, tmp_path, key):
     assert mine not in sys.modules
 
 
-def test_fields_of_a_log_map_are_looked_up_in_the_log_only(mine, tmp_path):
+def test_log_map_fields_are_looked_up_in_log_only(mine, tmp_path):
     (tmp_path / "m.toml").write_text(
         f"[time]\nfield = '{mine}:t'\n[position]\nfields = ['{mine}:p']\n[velocity]\nfields = ['{mine}:v']\n"
         f"[attitude]\nfields = ['{mine}:q']\nform = 'xyzw'\n[thrust]\nfields = ['{mine}:c']\nunit = 'm/s^2'\n"

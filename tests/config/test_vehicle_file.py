@@ -1,4 +1,4 @@
-"""Vehicle files: a plausible quadrotor flies on both plants; an impossible one is one line that names the key."""
+"""Vehicle files: a plausible quadrotor flies on both plants, and an impossible one is refused with the name of the key."""
 
 import dataclasses
 
@@ -34,7 +34,7 @@ def vehicle_file(tmp_path):
     return write
 
 
-def test_a_seven_inch_quadrotor(vehicle_file):
+def test_seven_inch_quadrotor(vehicle_file):
     spec = read_vehicle(vehicle_file())
     assert spec.name == "seven_inch"
     vehicle = spec.build()
@@ -51,8 +51,8 @@ def test_a_seven_inch_quadrotor(vehicle_file):
 
 
 @pytest.mark.parametrize("size", [0.5, 1.3])
-def test_what_a_file_leaves_out_follows_from_its_size(vehicle_file, size):
-    """A vehicle of so many times every length: areas by its square, rotors by the fourth and fifth power."""
+def test_missing_values_follow_from_size(vehicle_file, size):
+    """With all lengths scaled by n, areas scale with n^2, and rotors with n^4 and n^5."""
     spec = read_vehicle(vehicle_file(propeller_diameter="5.5", propeller="'5 inch'"))
     arm = tuple(size * length for length in spec.arm)
     other = dataclasses.replace(
@@ -68,23 +68,24 @@ def test_what_a_file_leaves_out_follows_from_its_size(vehicle_file, size):
         np.testing.assert_allclose(getattr(bigger, name), size**power * getattr(one, name), rtol=1e-6, err_msg=name)
     for name in ("base", "linear", "root"):
         assert getattr(bigger.esc, name) == pytest.approx(size**-2 * getattr(one.esc, name))
-    like = dataclasses.replace(spec, arm=(0.075, 0.1), inertia=(0.004, 0.005, 0.008)).build()  # as far as kingfisher's
+    # as far as the arms of kingfisher
+    like = dataclasses.replace(spec, arm=(0.075, 0.1), inertia=(0.004, 0.005, 0.008)).build()
     np.testing.assert_allclose(like.drag_area, kingfisher().drag_area)
-    # Without propellers of its own, they are as large as nine tenths of what the shorter arm leaves them:
+    # Without a stated size, propellers have 0.9 of the largest size that the shorter arm allows:
     bare = read_vehicle(vehicle_file(propeller_diameter=None)).build()
     assert float(bare.propeller.radius) == pytest.approx(0.9 * 0.105, rel=0.02)
 
 
 @pytest.mark.parametrize(("kind", "inches"), [("3 inch", 3.0), ("3 inch", 6.0), ("5 inch", 5.0)])
-def test_a_propeller_is_as_large_as_it_is_said_to_be(vehicle_file, kind, inches):
+def test_propeller_has_stated_size(vehicle_file, kind, inches):
     vehicle = read_vehicle(vehicle_file(propeller=f"'{kind}'", propeller_diameter=str(inches))).build()
     assert float(vehicle.propeller.radius) == pytest.approx(0.5 * inches * 0.0254, rel=0.02)
 
 
 @pytest.mark.parametrize("plant", ["bem", "simple"])
 @pytest.mark.parametrize("propeller", [None, "7.0"])
-def test_it_hovers_on_hover_commands(vehicle_file, plant, propeller):
-    """Within 5 cm over a second, without an error of the thrust map."""
+def test_vehicle_hovers_on_hover_commands(vehicle_file, plant, propeller):
+    """The vehicle stays within 5 cm for a second, without a thrust-map error."""
     path = vehicle_file(propeller_diameter=propeller)
     setup = Scenario(plant=plant, vehicle=str(path), thrust_error=0.0).make()
     x0 = State.at(jnp.array([0.3, -0.2, 1.5]))
@@ -92,13 +93,13 @@ def test_it_hovers_on_hover_commands(vehicle_file, plant, propeller):
     assert np.linalg.norm(log.p - log.p[0], axis=1).max() < 0.05
 
 
-def test_its_drag_is_what_the_file_says(vehicle_file):
+def test_drag_equals_file(vehicle_file):
     spec = read_vehicle(vehicle_file(drag_area="[0.01, 0.02, 0.03]"))
     np.testing.assert_array_equal(spec.build().drag_area, [0.01, 0.02, 0.03])
 
 
-def test_a_preset_keeps_the_content_of_its_vehicle_file(vehicle_file, tmp_path):
-    """The file is found beside the overlay, and is needed only once."""
+def test_preset_contains_its_vehicle_file(vehicle_file, tmp_path):
+    """The file is found relative to the overlay, and is needed only once."""
     path = vehicle_file()
     overlay = tmp_path / "overlay.toml"
     overlay.write_text("vehicle = 'seven_inch.toml'\n")
@@ -111,7 +112,7 @@ def test_a_preset_keeps_the_content_of_its_vehicle_file(vehicle_file, tmp_path):
     assert float(Scenario().make(preset.vehicle).simulation.model.vehicle.mass) == 1.2
 
 
-def test_a_scenario_keeps_the_content_of_its_vehicle_file(vehicle_file):
+def test_scenario_contains_its_vehicle_file(vehicle_file):
     path = vehicle_file()
     scenario = Scenario(vehicle=str(path))
     path.unlink()
@@ -174,7 +175,7 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize(("changes", "message"), IMPOSSIBLE)
-def test_impossible_vehicles_are_refused_by_name(vehicle_file, changes, message):
+def test_impossible_vehicles_are_refused_by_key(vehicle_file, changes, message):
     path = vehicle_file(**changes)
     for use in (lambda: read_vehicle(path), lambda: Scenario(vehicle=str(path))):
         with pytest.raises(ConfigError, match=message) as error:
@@ -183,7 +184,7 @@ def test_impossible_vehicles_are_refused_by_name(vehicle_file, changes, message)
         assert str(path) in str(error.value)
 
 
-def test_a_vehicle_file_that_is_none(tmp_path):
+def test_invalid_vehicle_file_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"nothing\.toml: no such file"):
         read_vehicle(tmp_path / "nothing.toml")
     (tmp_path / "text.toml").write_text("this is a letter")
@@ -191,7 +192,7 @@ def test_a_vehicle_file_that_is_none(tmp_path):
         read_vehicle(tmp_path / "text.toml")
 
 
-def test_an_impossible_vehicle_in_a_preset():
+def test_impossible_vehicle_in_preset_is_refused():
     table = dict(
         zip(SEVEN_INCH, (1.2, (0.008, 0.009, 0.015), (0.1, 0.1), 10.0, (8.0, 8.0, 4.0), 0.04, 7.0), strict=True)
     )
