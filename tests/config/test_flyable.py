@@ -1,4 +1,4 @@
-"""A large quadrotor with slow motors, described by seven lines, hovers in wind with a load; unflyable ones are refused."""
+"""A large quadrotor with slow motors, described by seven lines, hovers in wind with a load; others are refused."""
 
 import dataclasses
 

@@ -362,7 +362,7 @@ def test_flight_starts_depend_on_seed_and_home_only():
 
 
 def test_gravity_frame_is_refused_for_unsuitable_tasks():
-    """Examples are a moving goal, and keypoints without occlusion, which have no filter that estimates the disturbance."""
+    """Examples: a moving goal, and keypoints without occlusion, which have no filter that estimates the disturbance."""
 
     class Moving(Hover):
         def target(self, t):

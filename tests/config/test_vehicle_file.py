@@ -1,4 +1,4 @@
-"""Vehicle files: a plausible quadrotor flies on both plants, and an impossible one is refused with the name of the key."""
+"""Vehicle files: a plausible quadrotor flies on both plants; an impossible one is refused with the name of the key."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Flights of an identified vehicle: the controller inside receives the vehicle, thrust and rates."""
+"""Flights of an identified vehicle: the inner controller receives the vehicle, thrust and rates."""
 
 import dataclasses
 
@@ -32,12 +32,12 @@ from retrim.plants.sim import Simulation
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
 DT = 0.02
-family = PathFamily.of  # the type of numbers follows from the test
+family = PathFamily.of  # the dtype follows from the test
 SHORT = {"num_updates": 10, "num_envs": 2, "horizon": 20, "hidden_sizes": (16, 16)}
 
 
-class Weak(AbstractController[Command]):
-    """A soft hover that needs no policy; its memory contains its last inputs."""
+class SlowHover(AbstractController[Command]):
+    """A slow hover controller without a policy; its memory contains its last inputs."""
 
     actuators: ActuatorState = dataclasses.field(default_factory=lambda: ActuatorState.at(Command.hover()))
     member: Member = dataclasses.field(
@@ -60,8 +60,8 @@ class Weak(AbstractController[Command]):
         return dataclasses.replace(self, member=member)
 
 
-class Still(AbstractController[None]):
-    """Commands the hover thrust of its vehicle, and no rates."""
+class HoverThrust(AbstractController[None]):
+    """A controller that commands the hover thrust of its vehicle and no rates."""
 
     def init(self, x):
         del x
@@ -108,8 +108,8 @@ def x0(as_a_user):
 
 
 @pytest.mark.parametrize(("delay", "lag", "gain"), [(0.0, 0.03, 1.0), (0.05, 0.12, 0.7), (0.03, 0.2, 1.4)])
-def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
-    controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
+def test_vehicle_is_identified_in_flight(x0, delay, lag, gain):
+    controller = IdentifiedFlight(SlowHover(), PathEstimator.of(DT), family(), PathBelief.unknown())
     _, memory = fly(simulation(delay, lag, gain=gain), controller, x0)
     memory = memory.flight
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], memory)
@@ -120,12 +120,12 @@ def test_the_vehicle_is_identified_in_flight(x0, delay, lag, gain):
     assert np.all(np.asarray(memory.belief.half_width[0]) > 0.9)  # unknown at take-off
 
 
-def test_excitation_identifies_a_vehicle_that_stands_still():
+def test_excitation_identifies_hovering_vehicle():
     """Without the doublets, delay and lag are not excited."""
     flights, at = {}, 50  # 1 s
     for name, excitation in {"still": Excitation.of(longest=0.0), "excited": Excitation.of()}.items():
         controller = IdentifiedFlight(
-            Still(), PathEstimator.of(DT), family(), PathBelief.unknown(), excitation=excitation
+            HoverThrust(), PathEstimator.of(DT), family(), PathBelief.unknown(), excitation=excitation
         )
         start = State.at(jnp.array([0.0, 0.0, 1.0]))
         flights[name] = fly(simulation(0.04, 0.1, gain=1.2), controller, start, at + 1)[1].path.estimate
@@ -137,9 +137,9 @@ def test_excitation_identifies_a_vehicle_that_stands_still():
 
 
 @pytest.mark.parametrize("lift", [2.0, -2.0])
-def test_a_push_is_not_a_gain_of_the_thrust(x0, lift):
+def test_push_is_not_identified_as_thrust_gain(x0, lift):
     """The controller reduces its thrust under a lift, as it would with a larger gain."""
-    controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
+    controller = IdentifiedFlight(SlowHover(), PathEstimator.of(DT), family(), PathBelief.unknown())
     for senses in (True, False):
         plant = simulation(0.02, 0.08, gain=0.8, lift=lift)
         _, memory = fly(plant, controller, x0, senses=senses)
@@ -147,8 +147,8 @@ def test_a_push_is_not_a_gain_of_the_thrust(x0, lift):
         assert np.abs(np.asarray(gain.mean)[60:] - 0.8).max() < 0.04
 
 
-def test_belief_and_gain_never_jump(x0):
-    controller = IdentifiedFlight(Weak(), PathEstimator.of(DT), family(), PathBelief.unknown())
+def test_belief_and_gain_change_continuously(x0):
+    controller = IdentifiedFlight(SlowHover(), PathEstimator.of(DT), family(), PathBelief.unknown())
     _, memory = fly(simulation(0.08, 0.2, gain=0.6), controller, x0)
     memory = memory.flight
     low, high = jax.vmap(lambda each: each.ends)(memory.belief)
@@ -158,13 +158,13 @@ def test_belief_and_gain_never_jump(x0):
 
 
 @pytest.mark.parametrize("rates_sensed", [True, False])
-def test_the_tracked_rates_are_those_of_the_vehicle(x0, rates_sensed):
-    """Exactly, where the path is known; with a gyroscope, at once, where it is not."""
+def test_tracked_rates_equal_rates_of_vehicle(x0, rates_sensed):
+    """The rates are exact if the path is known. With a gyroscope, they are exact at once for an unknown path."""
     model = CommandPath.of(0.03, ActuatorResponse.of(0.03, 0.1, inverse_damping=1.0))
     path = model if not rates_sensed else CommandPath.of(0.0, ActuatorResponse.of(0.03, 0.01))
     plant = simulation(0.03, 0.1)
 
-    true, memory = fly(plant, ActuatorTracking(Weak(), path, DT), x0, 100, senses=rates_sensed)
+    true, memory = fly(plant, ActuatorTracking(SlowHover(), path, DT), x0, 100, senses=rates_sensed)
     message, _ = memory.inner
     R = np.asarray(true.R)
     turn = np.einsum("kji,kjl->kil", R[:-1], R[1:])
@@ -174,26 +174,26 @@ def test_the_tracked_rates_are_those_of_the_vehicle(x0, rates_sensed):
 
 
 @pytest.mark.parametrize("wrap", [FiniteController, "integral", "near", "tracking"])
-def test_controllers_around_another_one_pass_the_vehicle_on(wrap, x0):
-    """A wrapper that swallowed it would fly a policy for the wrong vehicle without a word."""
+def test_wrappers_forward_vehicle_to_inner_controller(wrap, x0):
+    """Otherwise a wrapper would silently fly a policy for the wrong vehicle."""
     task = Setup.from_preset("hover/retrim").flight_task
     makers = {
         "integral": lambda inner: IntegralAction(inner, task, jnp.array(0.5), jnp.array(1.0)),
         "near": lambda inner: NearTarget(inner, task, jnp.array(1.0)),
         "tracking": lambda inner: ActuatorTracking(inner, family().path(jnp.zeros(4)), DT),
     }
-    outer = makers.get(wrap, wrap)(Weak())
+    outer = makers.get(wrap, wrap)(SlowHover())
     member = Member(family().path(jnp.ones(4)), PathBelief.between(jnp.ones(4), jnp.ones(4)))
     result = outer.with_vehicle(member)
     inner = next(getattr(result, name) for name in ("inner", "base") if hasattr(result, name))
     np.testing.assert_array_equal(inner.member.belief.centre, np.ones(4))
-    if wrap != "tracking":  # it tells the controller inside itself
+    if wrap != "tracking":  # the wrapper forwards the vehicle
         message = outer.with_actuators(ActuatorState.at(Command(jnp.array(5.0), jnp.ones(3))))
         inner = next(getattr(message, name) for name in ("inner", "base") if hasattr(message, name))
         assert float(inner.actuators.command.c) == 5.0
 
 
-def test_a_vehicle_file_is_believed_within_a_factor_of_two():
+def test_vehicle_file_sets_belief_within_factor_of_two():
     vehicle = {
         "name": "mine", "mass": 0.3, "inertia": [4e-4, 5e-4, 8e-4], "arm": [0.06, 0.07], "thrust_max": 11.0,
         "rates_max": [10.0, 10.0, 4.0], "motor_tau": 0.03, "rate_lag": [0.1, 0.1, 0.2], "command_delay": 0.03,
@@ -206,22 +206,22 @@ def test_a_vehicle_file_is_believed_within_a_factor_of_two():
         )
         assert np.all(at >= low - 1e-5)
         assert np.all(at <= high + 1e-5)
-    assert float(high[0]) < 0.5  # the file does say something
+    assert float(high[0]) < 0.5  # the file states something
     np.testing.assert_array_equal(prior_belief(load("hover/any"), family()).half_width, np.ones(4))
 
 
-def test_a_preset_for_one_vehicle_identifies_none():
+def test_preset_for_one_vehicle_has_no_identification():
     setup = Setup.from_preset(changed(load("hover/retrim"), pretrain=SHORT))
     with pytest.raises(ConfigError, match="hover/any"):
         setup.pilot(setup.new_policy(random.key(0)), "base-id")
 
 
-def test_past_commands_must_cover_the_delays_of_the_family():
+def test_past_commands_must_cover_delays_of_family():
     with pytest.raises(ConfigError, match="5 ticks"):
         changed(load("hover/any"), command_history=4)
 
 
-def test_the_observer_is_as_fast_as_the_vehicle_permits(as_a_user):
+def test_observer_time_constant_follows_vehicle(as_a_user):
     setup = Setup.from_preset(changed(load("hover/any"), pretrain=SHORT))
     flight = setup.pilot(setup.new_policy(random.key(0)), "base-id").controller
 

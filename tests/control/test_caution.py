@@ -1,4 +1,4 @@
-"""Caution after a self-induced oscillation: which motions raise it, and what it changes."""
+"""Caution after a self-induced oscillation: its causes and its effects."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 DT = 0.02
 
 
-def levels(angles):
+def caution_levels(angles):
     """Return the level of caution while the vehicle rolls through the angles [rad]."""
     level = State.at(jnp.zeros(3))
 
@@ -36,20 +36,20 @@ def levels(angles):
     return np.asarray(lax.scan(step, Caution.none(level), jnp.asarray(angles, dtype=jnp.float32))[1])
 
 
-def test_one_recovery_does_not_raise_it():
+def test_single_recovery_does_not_raise_caution():
     t = np.arange(0.0, 4.0, DT)
-    assert levels(0.8 * np.sin(7.0 * t) * np.exp(-2.0 * t)).max() == 0.0
+    assert caution_levels(0.8 * np.sin(7.0 * t) * np.exp(-2.0 * t)).max() == 0.0
 
 
-def test_a_lasting_oscillation_raises_it_and_calm_flight_lowers_it():
+def test_oscillation_raises_and_calm_flight_lowers_caution():
     t = np.arange(0.0, 4.0, DT)
-    level = levels(np.concatenate([0.9 * np.sin(7.0 * t), np.zeros(1500)]))
+    level = caution_levels(np.concatenate([0.9 * np.sin(7.0 * t), np.zeros(1500)]))
     assert level[len(t) - 1] > 0.5
     assert level[-1] < 0.05
     assert level.max() <= 1.0
 
 
-def test_it_makes_the_assumed_vehicle_slower_and_changes_nothing_else():
+def test_caution_only_slows_assumed_vehicle():
     belief = PathBelief.between(jnp.array([-0.8, -0.6, -0.3, 0.1]), jnp.array([-0.7, -0.2, 0.5, 0.4]))
     none = Caution.none(State.at(jnp.zeros(3)))
     for level in (0.0, 0.4, 1.0):
@@ -59,14 +59,14 @@ def test_it_makes_the_assumed_vehicle_slower_and_changes_nothing_else():
             np.testing.assert_allclose(result, expected, atol=1e-6)
 
 
-def test_it_makes_the_commands_of_the_thrust_smaller():
+def test_caution_reduces_thrust_commands():
     none = Caution.none(State.at(jnp.zeros(3)))
     assert float(none.gain(jnp.array(1.2))) == pytest.approx(1.2)
     assert float(dataclasses.replace(none, level=jnp.array(1.0)).gain(jnp.array(1.2))) == pytest.approx(1.8)
 
 
-class Textbook(AbstractController[None]):
-    """A hover with a stiffness that suits the assumed vehicle: it is unstable on one that is much slower."""
+class StiffHover(AbstractController[None]):
+    """A hover controller with a stiffness for the assumed vehicle; it is unstable on a much slower vehicle."""
 
     lateness: jnp.ndarray = dataclasses.field(default_factory=lambda: jnp.array(0.1))
 
@@ -86,8 +86,8 @@ class Textbook(AbstractController[None]):
 
 
 @pytest.mark.parametrize("watches", [False, True])
-def test_an_oscillation_by_a_wrong_estimate_ends(watches):
-    """The estimate states a quarter of delay and lag; without caution the vehicle oscillates to the end."""
+def test_caution_ends_oscillation_from_wrong_estimate(watches):
+    """The estimate contains a quarter of the true delay and lag; without caution the oscillation does not end."""
     family = PathFamily.of()
     response = ActuatorResponse.of(0.03, 0.15, inverse_damping=1.0)
     limits = (small().command_min, small().command_max)
@@ -95,10 +95,10 @@ def test_an_oscillation_by_a_wrong_estimate_ends(watches):
     plant = Simulation(model, lambda t, x: ExternalEffects.calm(x.p.dtype), None, random.key(0), jnp.array(0.05))
     wrong = family.coordinates(jnp.array(0.0125), jnp.array(0.0375), jnp.array(0.3), jnp.array(0.03))
     belief = PathBelief.between(wrong, wrong)
-    flight = BeliefFlight(Textbook(), family, belief, VehicleEstimate(belief, jnp.array(1.0)), DT, watches)
+    flight = BeliefFlight(StiffHover(), family, belief, VehicleEstimate(belief, jnp.array(1.0)), DT, watches)
     start = dataclasses.replace(State.at(jnp.array([0.5, -0.3, 0.0])), R=so3.exp(jnp.array([0.1, 0.0, 0.0])))
     ticks = batch_flight(plant, flight, start, ticks=600)
-    error = np.linalg.norm(np.asarray(ticks.true.p)[:, :2], axis=-1)  # the height needs an observer of the gain
+    error = np.linalg.norm(np.asarray(ticks.true.p)[:, :2], axis=-1)  # control of height needs an observer of the gain
     if not watches:
         assert error[-50:].mean() > 0.3
         assert ticks.condition is None

@@ -1,4 +1,4 @@
-"""Controllers without a policy: geometric tracking and INDI hold, reject, follow, and do not care where they are."""
+"""Controllers without a policy: geometric tracking and INDI hover, reject steps, track, and are equivariant."""
 
 import dataclasses
 
@@ -49,12 +49,12 @@ def _fly_once(controller, x0, push, start, ticks):
 
 
 def fly_once(controller, x0, push, seconds=8.0, start=0.0):
-    """States by tick, in the lagged model with a command delay of one tick, pushed from ``start`` on [s]."""
+    """Return states by tick in the lagged model, delayed by one tick; the push acts from ``start`` [s] on."""
     return _fly_once(controller, x0, push, jnp.array(start), round(seconds / DT))
 
 
 @pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])
-def test_it_comes_to_hover_from_anywhere_near(kind, key):
+def test_converges_to_hover_from_nearby_states(kind, key):
     task = hover_task()
     for k in random.split(key, 3):
         x0 = State(jnp.array(GOAL) + random.uniform(k, (3,), minval=-1.0), random_state(k, 0.3).R, jnp.zeros(3))
@@ -65,35 +65,35 @@ def test_it_comes_to_hover_from_anywhere_near(kind, key):
 
 @pytest.mark.parametrize("kind", ["geometric-i", "indi"])
 @pytest.mark.parametrize("push", [(2.0, 2.0, 2.0), (-1.0, 0.5, -3.0)])
-def test_it_rejects_a_step(kind, push):
+def test_rejects_step_disturbance(kind, push):
     task, d = hover_task(), jnp.array(push)
     path = fly_once(make(kind, task), State.at(jnp.array(GOAL)), d, start=1.0, seconds=12.0)
     error = jnp.sqrt(jnp.sum((path.p - jnp.array([GOAL])) ** 2, axis=1))
-    assert float(jnp.max(error)) > 0.02  # the step is felt
+    assert float(jnp.max(error)) > 0.02  # the step has an effect
     assert float(error[-1]) < 2e-3
 
 
-def test_without_integral_action_it_rests_where_its_spring_balances_the_push():
+def test_offset_without_integral_action_balances_push():
     d = jnp.array([0.6, -0.3, 0.2])
     path = fly_once(make("geometric", hover_task()), State.at(jnp.array(GOAL)), d)
-    expected = d / 12.0 * (1.0 + 6.0 * DT + 0.5 * 12.0 * DT**2)  # what it predicts knows of no push
+    expected = d / 12.0 * (1.0 + 6.0 * DT + 0.5 * 12.0 * DT**2)  # the prediction does not contain the push
     np.testing.assert_allclose(path.p[-1] - jnp.array(GOAL), expected, rtol=0.01)
 
 
-def test_indi_believes_the_accelerometer():
-    """A measured acceleration beyond that of the velocities is a disturbance to it."""
+def test_indi_uses_accelerometer():
+    """INDI treats measured acceleration that the velocities do not explain as a disturbance."""
     task, x = hover_task(), State.at(jnp.array(GOAL))
     plain = make("indi", task)
-    _, memory = plain(plain.init(x), jnp.array(0.0), x)  # before the first tick there is nothing to compare
+    _, memory = plain(plain.init(x), jnp.array(0.0), x)  # the first tick has no earlier velocity to compare with
     level, _ = plain(memory, jnp.array(DT), x)
     pull, _ = plain.with_inertial(jnp.zeros(3), jnp.array([0.0, 0.0, -1.0]))(memory, jnp.array(DT), x)
-    share = 1.0 - np.exp(-DT / 0.08)  # of 1 m/s^2; and the vehicle will have fallen a little until it is answered
+    share = 1.0 - np.exp(-DT / 0.08)  # of 1 m/s^2; the vehicle falls a little before the controller responds
     assert share < float(pull.c - level.c) < 1.2 * share
 
 
 @pytest.mark.parametrize("kind", ["geometric", "indi"])
-def test_it_asks_for_nothing_that_the_vehicle_refuses(kind):
-    """Far away and upside down: both limits of the thrust, and those of the rates."""
+def test_commands_stay_within_limits(kind):
+    """The vehicle is far away and upside down, so that commands reach the limits of thrust and rates."""
     controller, low, high = make(kind, hover_task()), *(limit.vector() for limit in LIMITS)
     message = set()
     for R, z in ((jnp.eye(3), -9.0), (so3.exp(jnp.array([2.8, 0.4, 0.0])), 9.0)):
@@ -106,7 +106,7 @@ def test_it_asks_for_nothing_that_the_vehicle_refuses(kind):
 
 
 @pytest.mark.parametrize("kind", ["geometric", "geometric-i", "indi"])
-def test_it_follows_a_figure_8(kind):
+def test_tracks_figure_8(kind):
     reference = figure8()
     task = Track(reference, Preview(reference, small().omega_max, 0), jnp.array(1.0), jnp.array(5.0))
     here = at(reference, [0.0])
@@ -118,7 +118,7 @@ def test_it_follows_a_figure_8(kind):
 
 
 @pytest.mark.parametrize("kind", ["geometric", "indi"])
-def test_it_does_not_care_where_it_is_or_where_north_is(kind, key):
+def test_commands_are_equivariant_to_position_and_heading(kind, key):
     task, x = hover_task(), random_state(key, 0.5)
     turn, shift = so3.rotz(jnp.array(1.2)), jnp.array([5.0, -3.0, 2.0])
     here = dataclasses.replace(task, goal=jnp.array(GOAL))
@@ -134,7 +134,7 @@ def test_it_does_not_care_where_it_is_or_where_north_is(kind, key):
     np.testing.assert_allclose(decide(state_after, turn @ jnp.array(GOAL) + shift, 1.2), first, atol=1e-9)
 
 
-def test_attitudes_are_rotations_and_a_vehicle_in_its_attitude_is_told_the_reference(key):
+def test_desired_attitude_is_rotation_and_its_fixed_point_commands_reference(key):
     for k in random.split(key, 5):
         thrust = flyable(thrust_of(5.0 * random.normal(k, (3,))))
         R = attitude_of(thrust, jnp.array(0.7))

@@ -1,4 +1,4 @@
-"""The frame of the gravity that is felt: Eq. (1) is the same in it, exactly."""
+"""The frame of effective gravity: Eq. (1) has exactly the same form in it."""
 
 import dataclasses
 
@@ -46,16 +46,16 @@ awake = eqx.filter_jit(lambda size, key: jax.tree.map(lambda leaf: leaf + 0.02, 
 
 
 def always(d, x, u):
-    """A residual that is ``d`` everywhere; with ``eqx.Partial`` a value, another of which compiles nothing."""
+    """Return ``d``. ``eqx.Partial`` makes ``d`` a value, so that a different ``d`` needs no new compilation."""
     return d
 
 
-def close(a, b, atol=1e-12):
+def assert_close(a, b, atol=1e-12):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=atol), a, b)
 
 
 @pytest.mark.parametrize("d", PUSHES)
-def test_felt_gravity_is_standard_gravity_in_the_frame(d):
+def test_effective_gravity_is_standard_gravity_in_frame(d):
     frame = EffectiveGravityFrame.of(jnp.array(d))
     np.testing.assert_allclose(frame.Q @ frame.Q.T, np.eye(3), atol=1e-12)
     assert float(jnp.linalg.det(frame.Q)) == pytest.approx(1.0)
@@ -68,8 +68,8 @@ def test_felt_gravity_is_standard_gravity_in_the_frame(d):
 @pytest.mark.parametrize(
     "model", [PointMass(0.02), LaggedModel(PointMass(0.02), first_order(0.03))], ids=["bare", "lagged"]
 )
-def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
-    """From any state, under any command, with any residual: one tick of Eq. (1), turned before or after."""
+def test_step_commutes_with_frame(model, key):
+    """For any state, command and residual, a step of Eq. (1) may be transformed before or after the step."""
     k_x, k_u = random.split(key)
     x, u = random_state(k_x), random_command(k_u)
 
@@ -86,19 +86,19 @@ def test_a_tick_in_the_frame_is_a_tick_in_the_world(model, key):
 
     all_pushes = jax.jit(jax.vmap(ticks, in_axes=(0, None)))
     for drag in (0.0, 0.3):  # without, and with a part that depends on the state
-        close(*all_pushes(jnp.array(PUSHES), jnp.array(drag)))
+        assert_close(*all_pushes(jnp.array(PUSHES), jnp.array(drag)))
 
 
-def test_into_the_frame_and_back_is_nothing(key):
+def test_frame_round_trip_is_identity(key):
     frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 3.0]))
     x, u = random_state(key), random_command(key)
-    close(frame.world_state(frame.state(x)), x)
-    close(frame.world_command(frame.command(u)), u)
+    assert_close(frame.world_state(frame.state(x)), x)
+    assert_close(frame.world_command(frame.command(u)), u)
 
 
 @pytest.mark.parametrize("make", [circle, figure8, star])
-def test_flatness_flies_the_turned_reference(make):
-    """The reference's command in the frame, taken back to the world, gives its acceleration under the push."""
+def test_flat_command_in_frame_gives_reference_acceleration(make):
+    """The command for the reference in the frame, transformed to the world, gives its acceleration under the push."""
     reference, times, away = make(), jnp.array([0.0, 0.8, 2.2, 4.3, 5.1]), HOME + jnp.array([0.1, 0.7, -0.2])
 
     @jax.jit
@@ -112,8 +112,8 @@ def test_flatness_flies_the_turned_reference(make):
         return here, points, close_to, frame.scale, in_frame.lap, (inside, reference.distance(away))
 
     here, points, (p, v), scale, lap, (inside, outside) = jax.tree.map(np.asarray, observe(jnp.array(PUSHES)))
-    close(points.p, p)
-    close(points.v, v)
+    assert_close(points.p, p)
+    assert_close(points.v, v)
     thrust = points.u[..., 0] / scale[:, None]
     needs = np.linalg.norm(here.a - np.array([0.0, 0.0, -9.81]) - np.array(PUSHES)[:, None], axis=-1)
     np.testing.assert_allclose(thrust, needs, rtol=1e-6)
@@ -123,8 +123,8 @@ def test_flatness_flies_the_turned_reference(make):
     np.testing.assert_allclose(inside, outside, rtol=1e-6)
 
 
-def test_the_turned_command_follows_the_turned_path():
-    """From the reference's own state its rates keep the thrust where the path needs it, over a second."""
+def test_flat_rates_in_frame_follow_path():
+    """From the state of the reference, its rates keep the thrust in the required direction for a second."""
 
     @jax.jit
     @jax.vmap
@@ -152,8 +152,8 @@ def test_the_turned_command_follows_the_turned_path():
 
 
 @pytest.mark.parametrize("kind", [Track, L2Track])
-def test_a_turned_task_sees_and_rewards_the_same(kind, key):
-    """The reference's own state has the same reward, and what a preview shows is turned and scaled."""
+def test_task_in_frame_has_same_observation_and_reward(kind, key):
+    """The state of the reference has the same reward, and the preview is rotated and scaled."""
     reference, frame = figure8(), EffectiveGravityFrame.of(jnp.array([1.0, 2.0, -1.0]))
     task = kind(reference, Preview(reference, small().omega_max), jnp.array(1.0), jnp.array(5.0), 0.02, 50)
     t, x = jnp.array(4.2), random_state(key)
@@ -178,27 +178,27 @@ def test_a_turned_task_sees_and_rewards_the_same(kind, key):
 
 
 @pytest.mark.parametrize("d", [(2.0, -1.0, 1.5), (-2.0, 2.0, 2.0)])
-def test_a_constant_push_leaves_nothing_to_learn(d, key):
-    """Roll-outs in the view under a known push are those without one, in the frame; so are their rewards."""
+def test_known_constant_push_equals_calm_roll_out(d, key):
+    """Roll-outs and rewards under a known push in the view equal those without a push in the frame."""
     env, d = hover_env(horizon=25), jnp.array(d)  # too short to be terminated
     frame, policy = EffectiveGravityFrame.of(d), fresh(15, key)
     start = Start(jnp.array(0.0), random_state(key))
     with_push = roll(GravityView(LIMIT)(env, eqx.Partial(always, d)), policy, start)
     calm_env, calm_start = Env(env.dynamics, env.task.in_frame(frame)), Start(start.t, frame.state(start.x))
     calm = roll(calm_env, policy, calm_start)
-    close(jax.vmap(frame.state)(with_push.x), calm.x, 1e-9)
-    close(jax.vmap(frame.command)(with_push.u), calm.u, 1e-9)
+    assert_close(jax.vmap(frame.state)(with_push.x), calm.x, 1e-9)
+    assert_close(jax.vmap(frame.command)(with_push.u), calm.u, 1e-9)
     np.testing.assert_allclose(with_push.reward, calm.reward, atol=1e-9)
 
 
-def test_the_world_is_seen_as_it_is():
+def test_world_view_is_identity():
     env, residual = hover_env(), lambda x, u: x.v
     observation = WorldView()(env, residual)
     assert observation.frame_disturbance is None
     assert observation.dynamics.residual is residual
 
 
-def test_the_frame_sends_no_gradient_back(key):
+def test_frame_has_no_gradient(key):
     """As for the residual (paper, Sec. III-D), gradients flow through the analytical model only."""
     env = hover_env(horizon=5)
     view = GravityView(LIMIT)(env, lambda x, u: -0.5 * x.v)
@@ -210,8 +210,8 @@ def test_the_frame_sends_no_gradient_back(key):
     np.testing.assert_array_equal(jax.jit(jax.jacobian(tilt))(x.v), 0.0)
 
 
-def test_what_is_known_needs_no_estimate(key):
-    """The observer sees what the known residual does not say; the frame answers both, each once."""
+def test_observer_excludes_known_residual(key):
+    """The observer estimates the part outside the known residual, and the frame compensates for each once."""
     d = jnp.array([1.0, 0.0, -2.0])
     residual = lambda x, u: d - 0.4 * x.v + 0.1 * (u.c - 9.81) * x.R[:, 2]  # noqa: E731
     x, u = random_state(key), random_command(key)
@@ -234,8 +234,8 @@ def test_what_is_known_needs_no_estimate(key):
     np.testing.assert_allclose(*both, atol=1e-6)
 
 
-def test_the_frame_is_capped_and_defined_near_free_fall():
-    """An estimate beyond the limit turns no farther; a falling vehicle still has a frame."""
+def test_frame_is_limited_and_defined_near_free_fall():
+    """An estimate beyond the limit rotates no farther, and a falling vehicle still has a frame."""
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.2), LIMIT, jnp.array(2.0))
     s = observer.init(State.at(jnp.zeros(3)))
     falling = State(jnp.zeros(3), jnp.eye(3), jnp.array([0.0, 0.0, -1e4]))
@@ -246,8 +246,8 @@ def test_the_frame_is_capped_and_defined_near_free_fall():
     assert 0.0 < float(frame.scale) < 3.0
 
 
-def test_what_a_pose_filter_feels_turns_the_picture(key):
-    """With an estimate that is right, the command under a push is that of the calm flight; the last one is kept."""
+def test_pose_filter_estimate_rotates_image(key):
+    """With a correct estimate, the command under a push equals that of the calm flight, and the last command is kept."""
     d, x = jnp.array([1.5, -1.0, 2.0]), State(HOME + jnp.array([0.1, -0.1, 0.1]), jnp.eye(3), jnp.zeros(3))
     frame = EffectiveGravityFrame.of(d)
     full = Keypoints.of(HOME, small().omega_max, whitened=False)
@@ -270,26 +270,26 @@ def test_what_a_pose_filter_feels_turns_the_picture(key):
         return commands, (after[1], u), (controller.accepted(after, last)[1], last)
 
     back = PointMass(0.02).step(State(x.p, x.R, -x.v), Command.hover(), jnp.zeros(3))
-    close(back.p, x.p)  # it hovers: a tick ago it was here
+    assert_close(back.p, x.p)  # it hovers: a tick ago it was here
     commands, memory, accepted_command = decide()
     np.testing.assert_allclose(*commands, atol=1e-4)
-    close(*memory)
-    close(*accepted_command)
+    assert_close(*memory)
+    assert_close(*accepted_command)
 
 
-def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(key):
-    """A vehicle at rest at home under a push that is known sees a picture that stands still, from the first tick on."""
+def test_roll_out_memory_of_images_is_in_frame(key):
+    """A vehicle at rest at the goal under a known push sees a constant image from the first tick on."""
     d, full = jnp.array([1.5, -1.0, 2.0]), Keypoints.of(HOME, small().omega_max, whitened=False)
     task = dataclasses.replace(hover_task(horizon=14), observation=full)
     env = RestView(LIMIT)(Env(PointMass(0.02), task), lambda x, u: d)
     observation = []
 
-    class Looking(type(full)):
+    class RecordingKeypoints(type(full)):
         def stacked(self, frames):
             jax.debug.callback(lambda rows: observation.append(np.asarray(rows)), frames)
             return super().stacked(frames)
 
-    looking = Looking(**{f.name: getattr(full, f.name) for f in dataclasses.fields(full)})
+    looking = RecordingKeypoints(**{f.name: getattr(full, f.name) for f in dataclasses.fields(full)})
     env = eqx.tree_at(lambda e: e.task.observation, env, looking)
     frame = EffectiveGravityFrame.of(d)
     at_rest = State(HOME, frame.world_state(State.at(frame.vector(HOME))).R, jnp.zeros(3))
@@ -301,19 +301,19 @@ def test_what_a_roll_out_remembers_of_pictures_is_of_the_frame_that_it_flies_in(
     np.testing.assert_allclose(first, np.repeat(first[-1:], len(first), axis=0), atol=1e-9)
 
 
-def test_training_on_keypoints_sees_one_frame(key):
-    """That of what was learnt, at rest; its norm is limited."""
+def test_keypoint_training_uses_one_frame(key):
+    """The frame is that of the learned disturbance at rest, with a limited norm."""
     d, env = jnp.array([1.5, -1.0, 2.0]), hover_env(horizon=3)
     observation = RestView(LIMIT)(env, lambda x, u: d - 0.5 * x.v)
-    close(observation.frame(random_state(key), Command.hover()), EffectiveGravityFrame.of(d))
+    assert_close(observation.frame(random_state(key), Command.hover()), EffectiveGravityFrame.of(d))
     far = RestView(LIMIT)(env, lambda x, u: 9.0 * d).frame(random_state(key), Command.hover())
     np.testing.assert_allclose(jnp.linalg.norm(far.d), LIMIT, rtol=1e-6)
 
 
 @pytest.mark.parametrize("d", [(1.0, 0.5, -1.0), (-2.0, 2.0, 2.0)])
 @pytest.mark.parametrize("tracking", [None, "preview", "relative", "both"])
-def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
-    """With a perfect estimate, a controller flies under a push as without one, in the frame."""
+def test_flight_under_known_push_is_rotated_calm_flight(d, tracking):
+    """With a perfect estimate, a flight under a push equals the calm flight in the frame."""
     env, d = hover_env(horizon=40), jnp.array(d)
     frame, x0 = (
         EffectiveGravityFrame.of(d),
@@ -343,7 +343,7 @@ def test_a_flight_under_a_known_push_is_the_calm_flight_turned(d, tracking):
 
 @eqx.filter_jit
 def _positions(in_frame, d, memory, x):
-    """Of 40 ticks under the push ``d``."""
+    """Return the positions of 40 ticks under the push ``d``."""
 
     def tick(carry, k):
         memory, x = carry
@@ -353,8 +353,8 @@ def _positions(in_frame, d, memory, x):
     return lax.scan(tick, (memory, x), jnp.arange(40.0))[1]
 
 
-def test_a_known_rate_bias_is_taken_off_the_command(key):
-    """A vehicle that turns too fast flies, tick for tick, as one that does not; the policy remembers what it meant."""
+def test_known_rate_bias_is_subtracted_from_command(key):
+    """A vehicle that turns too fast flies as one that does not; the policy's memory contains its intended command."""
     bias, policy = jnp.array([0.3, -0.2, 0.1]), awake(23, key)
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.05), LIMIT, jnp.array(4.0))
     inner = PolicyController(hover_env(history=2).task.observation, policy)
@@ -372,11 +372,11 @@ def test_a_known_rate_bias_is_taken_off_the_command(key):
         x = State.at(HOME + 0.1)
         return lax.scan(tick, (x, controller.init(x)), jnp.arange(10.0))[1]
 
-    close(fly(naive, RateBiasedModel(PointMass(0.02), bias)), fly(plain, PointMass(0.02)), 1e-9)
+    assert_close(fly(naive, RateBiasedModel(PointMass(0.02), bias)), fly(plain, PointMass(0.02)), 1e-9)
 
 
-def test_a_corrected_model_turns_as_the_vehicle_was_seen_to_turn(key):
-    """In the world with bias and lag; in the frame, whose controller answers the bias, with the lag."""
+def test_corrected_model_has_observed_rates(key):
+    """In the world it has the bias and the lag; in the frame, whose controller compensates for the bias, only the lag."""
     model = RegressionModel.of(0.02)
     fresh = model.init(key)
     names = replace_fields(
@@ -387,11 +387,13 @@ def test_a_corrected_model_turns_as_the_vehicle_was_seen_to_turn(key):
     true = LaggedModel(PointMass(0.02), first_order(0.08))
     for observation, expected in ((world, RateBiasedModel(true, names.rates.bias)), (in_frame, true)):
         x, u = random_state(key), random_command(key)
-        close(observation.step(observation.init(x), u, jnp.zeros(3)), expected.step(expected.init(x), u, jnp.zeros(3)))
+        assert_close(
+            observation.step(observation.init(x), u, jnp.zeros(3)), expected.step(expected.init(x), u, jnp.zeros(3))
+        )
 
 
-class Standstill(AbstractController[None]):
-    """Commands hover in every frame."""
+class HoverInAnyFrame(AbstractController[None]):
+    """A controller that commands hover in every frame."""
 
     def in_frame(self, frame):
         return self
@@ -406,23 +408,23 @@ class Standstill(AbstractController[None]):
         return memory
 
 
-def everywhere(force, p):
-    """A map with one value."""
+def constant_map(force, p):
+    """A map with one constant value."""
     return force
 
 
-def bump(height, p):
-    """A force near the origin of the plane."""
+def local_map(height, p):
+    """A map with a force near the origin of the plane."""
     return height * jnp.exp(-0.5 * jnp.sum(p[:2] ** 2) / 0.2**2)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 2.0])
-def test_a_wrong_map_does_not_change_the_estimate_of_a_steady_disturbance(share):
-    """The observer estimates the remainder of the map, so their sum is the disturbance, whatever the map states."""
+def test_wrong_map_does_not_change_estimate_of_steady_disturbance(share):
+    """The observer estimates the remainder, so the sum of the map and the remainder is the disturbance for any map."""
     d = jnp.array([1.0, -0.5, 2.0])
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.02), LIMIT, jnp.array(jnp.inf))
     nothing = eqx.Partial(always, jnp.zeros(3))
-    frame = GravityFrame(Standstill(), observer, nothing, place=eqx.Partial(everywhere, share * d))
+    frame = GravityFrame(HoverInAnyFrame(), observer, nothing, place=eqx.Partial(constant_map, share * d))
     np.testing.assert_allclose(_estimate_after(60, frame, d), d, atol=2e-2)
 
 
@@ -439,11 +441,11 @@ def _estimate_after(ticks, frame, d):
     return lax.scan(tick, (frame.init(x), x), jnp.arange(float(ticks)))[0][0].frame.d
 
 
-def test_the_map_is_read_where_the_command_acts():
+def test_map_is_evaluated_at_predicted_position():
     observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.02), LIMIT, jnp.array(jnp.inf))
-    force = eqx.Partial(bump, jnp.array([0.0, 0.0, 2.0]))
+    force = eqx.Partial(local_map, jnp.array([0.0, 0.0, 2.0]))
     frame = GravityFrame(
-        Standstill(), observer, eqx.Partial(always, jnp.zeros(3)), place=force, lead=jnp.array(0.06)
+        HoverInAnyFrame(), observer, eqx.Partial(always, jnp.zeros(3)), place=force, lead=jnp.array(0.06)
     ).with_age(0.02)
     x = State(jnp.array([-0.2, 0.0, 1.0]), jnp.eye(3), jnp.array([2.0, 0.0, 0.0]))
     _, memory = frame(frame.init(x), jnp.array(0.0), x)

@@ -1,4 +1,4 @@
-"""Learning over laps: the error that repeats vanishes, and other errors do not disturb it."""
+"""Learning over laps removes the repeating error, and other errors do not disturb it."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ LAG = 0.1  # [s]
 
 
 class Follower(AbstractController[tuple[()]]):
-    """Commands the position of its reference a little later, as the body rates of a command."""
+    """A controller that commands the slightly delayed position of its reference as body rates."""
 
     reference: AbstractReference
 
@@ -52,7 +52,7 @@ def errors(reference, seconds=60.0, bias=0.0, noise=0.0, off=0.0):
 
 
 @pytest.mark.parametrize("make", [circle, figure8])
-def test_the_lateness_and_the_bias_of_a_vehicle_vanish(make):
+def test_lag_and_bias_vanish(make):
     result, _ = errors(make(), bias=0.05)
     assert result[400:450].mean() > 0.03
     assert result[-250:].mean() < 0.05 * result[400:450].mean()
@@ -64,18 +64,18 @@ def test_noise_is_not_learned():
     assert np.abs(shift - without).max() < 5e-3
 
 
-def test_a_vehicle_that_was_knocked_away_teaches_nothing():
+def test_large_error_is_not_learned():
     _, shift = errors(circle(), seconds=20.0, off=2.0 * NEAR)
     assert (shift == 0.0).all()
 
 
-def test_the_shift_is_bounded():
+def test_shift_is_bounded():
     _, shift = errors(circle(), off=0.8 * NEAR)
     assert np.abs(shift).max() <= LARGEST
     assert np.abs(shift[2]).max() == pytest.approx(LARGEST)
 
 
-def test_a_path_without_laps_is_flown_as_it_is():
+def test_path_without_laps_is_not_shifted():
     once = Reference.of(lambda t: [np.sin(0.5 * t), 0.0, 1.0], seconds=10.0)
     result, shift = errors(once, seconds=8.0, bias=0.05)
     assert (shift == 0.0).all()

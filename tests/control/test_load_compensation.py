@@ -1,4 +1,4 @@
-"""A controller that knows of no load flies one: the pull is compensated, and the swing is damped."""
+"""A controller without a load model flies a slung load: the pull is compensated, and the swing is damped."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ HOME = np.array([0.0, 0.0, 1.0])
 TASK = hover_task()
 
 
-class HomeKeeper(AbstractController[tuple[()]]):
+class GoalKeeper(AbstractController[tuple[()]]):
     """A proportional-derivative law for a goal, in any frame."""
 
     goal: jax.Array
@@ -38,17 +38,17 @@ class HomeKeeper(AbstractController[tuple[()]]):
         return command_for(x, thrust, TASK.setpoint(t), jnp.array([20.0, 20.0, 8.0])), ()
 
     def in_frame(self, frame):
-        return HomeKeeper(frame.vector(self.goal))
+        return GoalKeeper(frame.vector(self.goal))
 
 
 def controller(load=True):
     observer = DisturbanceObserver(PointMass(DT), jnp.array(0.05), jnp.array(6.0), jnp.array(4.0), CommandPath.of(0.0))
     compensation = LoadCompensation(TASK) if load else None
-    return GravityFrame(HomeKeeper(jnp.asarray(HOME)), observer, load=compensation, lead=jnp.array(0.5 * DT))
+    return GravityFrame(GoalKeeper(jnp.asarray(HOME)), observer, load=compensation, lead=jnp.array(0.5 * DT))
 
 
 def flight(with_load, *parts, seconds=8.0, x0=None):
-    """The log of a flight that starts 1 m from home, and the swing after each tick [deg]."""
+    """Return the log of a flight that starts 1 m from the goal, and the swing after each tick [deg]."""
     plant = SimPlant(CheapModel(), SumOfDisturbances(parts), delay_s=0.0)
     start = State.at(jnp.array([1.0, 0.3, 1.2])) if x0 is None else x0
     angles = []
@@ -69,17 +69,17 @@ def error(log, begin):
 
 
 @pytest.mark.parametrize(("share", "length"), [(0.2, 0.5), (0.4, 0.3)])
-def test_the_swing_decays_and_the_vehicle_comes_to_rest(share, length):
+def test_swing_decays_and_vehicle_comes_to_rest(share, length):
     load = SlungLoad.of(share, length=length)
     log, swing = flight(True, load)
     _, without = flight(False, load)
-    assert swing[:100].max() > 20.0  # the way home excites it
+    assert swing[:100].max() > 20.0  # the flight to the goal excites the swing
     assert swing[300:].max() < 5.0
     assert swing[300:].max() < 0.5 * without[300:].max()
     assert error(log, 6.0).max() < 0.05
 
 
-def test_without_a_load_the_flight_is_that_without_compensation():
+def test_compensation_without_load_has_no_effect():
     push = Constant(jnp.array([1.0, -0.5, 0.5]))
     one, _ = flight(True, push)
     other, _ = flight(False, push)
@@ -87,7 +87,7 @@ def test_without_a_load_the_flight_is_that_without_compensation():
     assert error(one, 7.0).max() < 0.02
 
 
-def test_a_pick_up_and_a_release_in_hover_move_the_vehicle_a_little():
+def test_pick_up_and_release_in_hover_move_vehicle_little():
     load = SlungLoad.of(0.3, picked=3.0, dropped=6.0)
     log, _ = flight(True, load, seconds=9.0, x0=State.at(jnp.asarray(HOME)))
     assert error(log, 0.0).max() < 0.3
@@ -95,7 +95,7 @@ def test_a_pick_up_and_a_release_in_hover_move_the_vehicle_a_little():
     assert error(log, 8.5).max() < 0.02
 
 
-def test_no_trust_in_what_was_learned_leaves_the_observer_alone():
+def test_zero_trust_leaves_only_observer():
     load = SlungLoad.of(0.3)
     frame = dataclasses.replace(controller(), trust_residual=jnp.array(0.0))
     logs = [
@@ -105,12 +105,12 @@ def test_no_trust_in_what_was_learned_leaves_the_observer_alone():
     np.testing.assert_allclose(logs[0].u, logs[1].u, atol=1e-9)
 
 
-def test_the_laws_of_a_controller():
+def test_controller_conformance():
     check_controller(controller(), x0=State.at(jnp.asarray(HOME)))
 
 
-def test_a_turned_world_turns_the_frame(key):
-    """The motion of the frame follows the swing, whatever its heading."""
+def test_frame_is_equivariant_to_heading(key):
+    """The motion of the frame follows the swing for any heading."""
     compensation, x = LoadCompensation(TASK), State.at(jnp.asarray(HOME))
     memory = compensation.init(x)
     z = memory.estimate.z.at[:4].set(random.normal(key, (4,)) * 0.3).at[7].set(0.3)
@@ -125,12 +125,12 @@ def test_a_turned_world_turns_the_frame(key):
     (pull, a), (pull_turned, a_turned) = sway(z), sway(quarter)
     np.testing.assert_allclose(a_turned, jnp.stack([-a[1], a[0], a[2]]), atol=1e-12)
     np.testing.assert_allclose(pull_turned, jnp.stack([-pull[1], pull[0], pull[2]]), atol=1e-12)
-    assert float(a[:2] @ z[2:4]) > 0.0  # along the velocity of the load: this takes energy from the swing
+    assert float(a[:2] @ z[2:4]) > 0.0  # along the velocity of the load, which takes energy from the swing
     assert float(a[2]) == 0.0
 
 
-def test_a_planned_state_includes_the_weight_of_the_load():
-    """A vehicle with a load of 30 % needs 1.3 times its own thrust, so a flight at a variable pace is slower."""
+def test_planned_state_includes_weight_of_load():
+    """With a load of 30 % the vehicle needs 1.3 times its own thrust, so a flight at a variable pace is slower."""
     frame, x = controller(), State.at(jnp.asarray(HOME))
     memory = frame.init(x)
     estimate = memory.load.estimate

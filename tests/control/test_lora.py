@@ -1,4 +1,4 @@
-"""Low-rank adaptation: nothing at first, the base never moves, exact gradients, sizes as published."""
+"""Low-rank adaptation: a fresh delta is zero, the base is constant, gradients are exact, and sizes are as published."""
 
 import equinox as eqx
 import jax
@@ -26,8 +26,8 @@ def size(tree):
 
 
 @eqx.filter_jit
-def move(lora, key):
-    """With a delta that changes something."""
+def perturb_delta(lora, key):
+    """Return the policy with a non-zero delta."""
     leaves, shape = jax.tree.flatten(lora.delta)
     keys = random.split(key, len(leaves))
     return lora.with_params(
@@ -35,13 +35,13 @@ def move(lora, key):
     )
 
 
-def same(a, b):
+def assert_identical(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 @eqx.filter_jit
-def awake(key):
-    """A policy that does not command hover."""
+def random_policy(key):
+    """Return a policy whose command is not hover."""
     fresh = Policy.of(15, small(), key=key, hidden=(8, 8))
     noise = [
         0.3 * random.normal(k, layer.weight.shape) for k, layer in zip(random.split(key, 3), fresh.layers, strict=True)
@@ -51,7 +51,7 @@ def awake(key):
 
 @pytest.fixture
 def base(key):
-    return awake(key)
+    return random_policy(key)
 
 
 @pytest.fixture
@@ -66,8 +66,8 @@ def test_parameter_count_of_the_paper(key):
     assert size(lora.base.layers) == 272_900
 
 
-def test_a_fresh_delta_changes_nothing(base, lora, key):
-    same(lora.merged(), base)
+def test_fresh_delta_is_zero(base, lora, key):
+    assert_identical(lora.merged(), base)
     for k in random.split(key, 3):
         o = random.normal(k, (15,))
         np.testing.assert_array_equal(lora.merged()(o).vector(), base(o).vector())
@@ -77,9 +77,9 @@ def test_a_fresh_delta_changes_nothing(base, lora, key):
         assert 0.5 * bound < float(jnp.abs(thin.down).max()) <= bound
 
 
-def test_merged_by_hand(base, lora, key):
-    """W + scale up down in NumPy, bias as it was; and the commands of y = W x + scale B (A x) + b."""
-    trained_policy = move(lora, key)
+def test_merge_equals_numpy_formula(base, lora, key):
+    """The weights are W + scale up down with the same bias, and the commands are y = W x + scale B (A x) + b."""
+    trained_policy = perturb_delta(lora, key)
     plain = trained_policy.merged()
     for layer, frozen, thin in zip(plain.layers, base.layers, trained_policy.delta, strict=True):
         merge_result = np.asarray(frozen.weight) + 4.0 * np.asarray(thin.up) @ np.asarray(thin.down)
@@ -95,45 +95,45 @@ def test_merged_by_hand(base, lora, key):
     assert float(jnp.abs(plain(jnp.asarray(o)).vector() - base(jnp.asarray(o)).vector()).max()) > 1e-3
 
 
-def test_merging_twice_and_forgetting(base, lora, key):
-    """Plain is plain; and with the fresh delta put back, it is the base again."""
-    trained_policy = move(lora, key)
-    same(trained_policy.merged().merged(), trained_policy.merged())
-    same(trained_policy.with_params(lora.delta).merged(), base)
+def test_merge_is_idempotent_and_fresh_delta_restores_base(base, lora, key):
+    """A merged policy stays the same, and with a fresh delta the policy equals the base."""
+    trained_policy = perturb_delta(lora, key)
+    assert_identical(trained_policy.merged().merged(), trained_policy.merged())
+    assert_identical(trained_policy.with_params(lora.delta).merged(), base)
 
 
-def test_scale_counts(base, key):
-    one, two = (move(LoraPolicy.of(base, key=key, ranks=RANKS, scale=s), key).merged() for s in (1.0, 2.0))
+def test_scale_multiplies_delta(base, key):
+    one, two = (perturb_delta(LoraPolicy.of(base, key=key, ranks=RANKS, scale=s), key).merged() for s in (1.0, 2.0))
     for frozen, a, b in zip(base.layers, one.layers, two.layers, strict=True):
         np.testing.assert_allclose(b.weight - frozen.weight, 2.0 * (a.weight - frozen.weight), atol=1e-13)
 
 
 @pytest.mark.parametrize("contact", [False, True])
-def test_gradient_through_the_pull_is_exact(contact, lora, key):
-    """What bptt does, perturbations and then back through the merger, against autodiff of the loss in the delta."""
+def test_gradient_of_delta_is_exact(contact, lora, key):
+    """The path of bptt, by perturbations and then through the merge, equals autodiff of the loss in the delta."""
     env = hover_env(horizon=5, delay_ticks=1)
-    lora = move(lora, key) if contact else lora
+    lora = perturb_delta(lora, key) if contact else lora
     x0 = draw_starts(env.task, key, 3)
 
     @eqx.filter_jit
-    def both(lora):
+    def gradients(lora):
         layers, pull = jax.vjp(lambda delta: lora.with_params(delta).merged().layers, lora.params)
         value, by_layers = policy_gradient(lora.merged().with_params(layers), env, x0)
         loss = lambda delta: policy_loss(lora.with_params(delta).merged(), env, x0)  # noqa: E731
         return (value, pull(by_layers)[0]), jax.value_and_grad(loss)(lora.delta)
 
-    (value, result), (expected, target) = both(lora)
+    (value, result), (expected, target) = gradients(lora)
     assert float(value) == pytest.approx(float(expected), rel=1e-13)
     for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(target), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12 * max(1.0, float(jnp.abs(b).max())))
     assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(result)) > 1e-4
-    if not contact:  # B is zero: A has no gradient yet, B has
+    if not contact:  # B is zero: A has no gradient yet, but B has
         for thin in result:
             np.testing.assert_array_equal(thin.down, 0.0)
 
 
-def test_no_gradient_reaches_the_base(lora, key):
-    lora = move(lora, key)
+def test_base_has_no_gradient(lora, key):
+    lora = perturb_delta(lora, key)
     o = random.normal(key, (15,))
     slope = jax.jit(jax.grad(lambda p: jnp.sum(p.merged()(o).vector())))(lora)
     for leaf in jax.tree.leaves((slope.base, slope.scale)):
@@ -142,7 +142,7 @@ def test_no_gradient_reaches_the_base(lora, key):
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_training_moves_the_delta_only_and_lowers_the_loss(key):
+def test_training_changes_only_delta_and_lowers_loss(key):
     env = hover_env(horizon=40, heading=0.3)
     base = Policy.of(15, small(), key=key, hidden=(32, 32))
     lora = LoraPolicy.of(base, key=key)
@@ -152,8 +152,8 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
     state, losses = train(PolicyState(lora, optimiser.init(lora.params)), random_starts(env.task, key, 40, 8))
     assert losses.shape == (40,)
     trained_policy = state.policy
-    same(trained_policy.base, before)
-    same(trained_policy.scale, lora.scale)
+    assert_identical(trained_policy.base, before)
+    assert_identical(trained_policy.scale, lora.scale)
     for thin, fresh in zip(trained_policy.delta, lora.delta, strict=True):
         assert float(jnp.abs(thin.up - fresh.up).max()) > 1e-3
         assert float(jnp.abs(thin.down - fresh.down).max()) > 1e-4
@@ -163,27 +163,27 @@ def test_training_moves_the_delta_only_and_lowers_the_loss(key):
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_a_gradient_that_is_not_finite_changes_nothing(lora, key):
+def test_nonfinite_gradient_changes_nothing(lora, key):
     env, optimiser = hover_env(horizon=3), optax.adam(1e-2)
     state = PolicyState(lora, jax.jit(optimiser.init)(lora.params))
     x0 = random_starts(env.task, key, 1, 2)
     bad = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
     after, losses = eqx.filter_jit(lambda s, x: bptt(s, env, x, optimiser=optimiser))(state, bad)
     assert not np.isfinite(losses).all()
-    same(after, state)
+    assert_identical(after, state)
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
-    """An update returns a low-rank policy with the same base; the gate is given plain policies."""
+def test_learner_accepts_low_rank_policy(key, monkeypatch):
+    """An update returns a low-rank policy with the same base, and the gate receives merged policies."""
     preset = tiny_preset(pretrain={"horizon": 20, "hidden_sizes": (12, 12)})
     judgements = []
 
-    def noting(candidate, incumbent, *rest, **options):
+    def recording_judge(candidate, incumbent, *rest, **options):
         judgements.extend([candidate, incumbent])
         return judge(candidate, incumbent, *rest, **options)
 
-    monkeypatch.setattr("retrim.adapt.learner.judge", noting)
+    monkeypatch.setattr("retrim.adapt.learner.judge", recording_judge)
     setup = Setup.from_preset(preset)
     base = setup.new_policy(random.key(0))
     state = setup.learner.init(setup.low_rank(base, random.key(1)), random.key(2))
@@ -193,20 +193,20 @@ def test_the_learner_beside_the_flight_takes_it(key, monkeypatch):
     k = random.key(3)
     after, verdict = setup.learner.update_policy(state.policy, state.residual, buffer.window(), k)
     assert isinstance(after.policy, LoraPolicy)
-    same(after.policy.base, base)
+    assert_identical(after.policy.base, base)
     assert any(float(jnp.abs(thin.up).max()) > 0.0 for thin in after.policy.delta)
     assert [type(p) for p in judgements] == [Policy, Policy]
     assert bool(verdict.finite)
     assert bool(verdict.admitted) == (float(verdict.candidate) <= float(verdict.incumbent))
-    # a broken delta is found in the merged weights
+    # the merged weights show a broken delta
     x0 = draw_starts(setup.env.task, key, 2)
     bad = eqx.tree_at(lambda p: p.delta[0].up, after.policy, jnp.full_like(after.policy.delta[0].up, jnp.nan))
     result = judge(bad.merged(), base, setup.env, x0)
     assert result.reason() == "a weight is not finite"
 
 
-def test_starts_are_drawn_from_what_was_flown(key):
-    """Each is a state of the window with its own time; rows that were never filled are not drawn."""
+def test_starts_are_drawn_from_valid_rows(key):
+    """Each start is a state of the window with its own time; rows without data are not drawn."""
     buffer = RollingBuffer(5)
     for i in range(3):
         buffer.push(0.02 * (i + 1), State.at(jnp.array([float(i + 1), 0.0, 1.0])), Command.hover())
@@ -230,17 +230,17 @@ def test_starts_are_drawn_from_what_was_flown(key):
         ((9, 4, 1), "rank 9 for weights 8 x 15"),
     ],
 )
-def test_impossible_ranks(ranks, message, base, key):
+def test_invalid_ranks_are_refused(ranks, message, base, key):
     with pytest.raises(ValueError, match=message):
         LoraPolicy.of(base, key=key, ranks=ranks)
 
 
-def test_the_largest_ranks_are_possible(base, key):
+def test_largest_ranks_are_accepted(base, key):
     full = LoraPolicy.of(base, key=key, ranks=(8, 8, 4))
     assert size(full.delta) == 8 * 23 + 8 * 16 + 4 * 12
 
 
-def test_a_delta_must_fit(base, lora, key):
+def test_delta_of_other_shape_is_refused(base, lora, key):
     with pytest.raises(ValueError, match="2 deltas for 3 layers"):
         LoraPolicy(base, lora.delta[:2], lora.scale, lora.shift)
     wider = LoraPolicy.of(Policy.of(15, small(), key=key, hidden=(9, 8)), key=key, ranks=RANKS)
@@ -248,5 +248,5 @@ def test_a_delta_must_fit(base, lora, key):
         LoraPolicy(base, wider.delta, lora.scale, lora.shift)
     with pytest.raises(ValueError, match="layer 0"):
         lora.with_params(wider.delta)
-    with pytest.raises(TypeError, match="rank"):  # by the shape check, which tests switch on
+    with pytest.raises(TypeError, match="rank"):  # by the shape check, which the tests enable
         LowRankFactors(jnp.zeros((2, 8)), jnp.zeros((4, 1)))

@@ -1,4 +1,4 @@
-"""The monitor: calm flights keep what was learned; errors and oscillations step back, in order, with a cause."""
+"""The monitor keeps adaptation in calm flights; after errors and oscillations it steps back in order, with a cause."""
 
 import dataclasses
 
@@ -27,8 +27,8 @@ DT = 0.02
 
 
 @pytest.fixture(scope="module")
-def flying(as_a_user):
-    """A policy that hovers, and a monitor of it that has learned nothing."""
+def hover_case(as_a_user):
+    """Return a policy that hovers, and its monitor before any learning."""
     brief = {"hidden_sizes": (32, 32), "num_envs": 8, "num_updates": 200, "horizon": 100, "learning_rate": 0.01}
     setup = Setup.from_preset(changed(load("hover/retrim"), pretrain=brief))
     policy = setup.pretrained(0)
@@ -36,7 +36,7 @@ def flying(as_a_user):
 
 
 def flight(setup, monitor, *, seconds=4.0, fault=None, later=None, model=CheapModel(DT)):  # noqa: B008
-    """Fly from a start; after 2 s ``later`` takes over, if there is one."""
+    """Fly from a start; after 2 s the controller ``later`` takes over, if given."""
     push = Constant(jnp.full(3, 0.5, dtype=jnp.float32))
     simulation = Simulation(model, push, None, random.key(0), jnp.array(0.02), fault)
     half, whole = round(2.0 / DT), round(seconds / DT)
@@ -56,17 +56,17 @@ def stages(ticks):
     return np.asarray(ticks.condition.stage)
 
 
-def test_a_calm_flight_stays_adapted(flying):
-    setup, _, monitor = flying
+def test_calm_flight_keeps_adapted_policy(hover_case):
+    setup, _, monitor = hover_case
     ticks, error = flight(setup, monitor)
     assert (stages(ticks) == Stage.ADAPTED).all()
     assert error[-25:].max() < 0.02
     assert stage_events(ticks.condition, DT * np.arange(200.0)) == []
 
 
-def test_a_policy_that_flies_worse_is_given_up(flying):
-    """The policy that takes over at 2 s commands what another task would: the monitor flies the base policy again."""
-    setup, policy, monitor = flying
+def test_worse_policy_is_abandoned(hover_case):
+    """From 2 s on, the policy commands a different task, and the monitor returns to the base policy."""
+    setup, policy, monitor = hover_case
     worse = eqx.tree_at(lambda p: p.layers[-1].bias, policy, replace_fn=lambda b: b + jnp.array(0.15, b.dtype))
     later = setup.controller(setup.learner.init(worse, random.key(0)))
     ticks, error = flight(setup, monitor, later=later, seconds=9.0)
@@ -79,9 +79,9 @@ def test_a_policy_that_flies_worse_is_given_up(flying):
     assert error[-25:].max() < 0.02 < worst
 
 
-def test_late_measurements_do_not_fly_the_estimate(flying):
-    """Measurements that are 40 ms late make the observer drive the vehicle; the monitor ends that."""
-    setup, _, monitor = flying
+def test_late_measurements_disable_estimate(hover_case):
+    """With measurements that are 40 ms late, the observer destabilises the vehicle, and the monitor stops using it."""
+    setup, _, monitor = hover_case
     world = {"fault": measurement_fault("late=2"), "model": LinearDragQuadrotor.of(small(), DT), "seconds": 8.0}
     _, error = flight(setup, monitor, **world)
     _, observations = flight(setup, monitor.frame, **world)
@@ -90,7 +90,7 @@ def test_late_measurements_do_not_fly_the_estimate(flying):
 
 
 def judge_excess(monitor, memory, *, excess, ticks=1):
-    """The memory after some intervals whose errors exceed those of the twin by so much [m]."""
+    """Return the memory after intervals whose errors exceed those of the twin by ``excess`` [m]."""
     x = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
     last = round(INTERVAL / DT)
     for _ in range(ticks):
@@ -109,8 +109,8 @@ def judge(monitor, memory, t, x):
     return monitor(memory, t, x)[1]
 
 
-def test_steps_back_are_in_order_and_last_longer_each_time(flying):
-    _, _, monitor = flying
+def test_steps_back_are_ordered_and_grow_longer(hover_case):
+    _, _, monitor = hover_case
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
     waits = []
     for stage in (Stage.OBSERVED, Stage.SLOW, Stage.BASE):
@@ -133,9 +133,9 @@ def step_back_to_base(monitor, excess):
     return memory
 
 
-def test_an_error_that_the_base_policy_shares_is_tolerated(flying):
-    """The state estimate of an autopilot may wander by centimetres, under every policy."""
-    _, _, monitor = flying
+def test_error_shared_by_base_policy_is_tolerated(hover_case):
+    """The state estimate of an autopilot may wander by centimetres under every policy."""
+    _, _, monitor = hover_case
     memory = judge_excess(monitor, step_back_to_base(monitor, 0.06), excess=0.05, ticks=STRIKES)
     assert (int(memory.stage), int(memory.cause)) == (Stage.ADAPTED, Cause.NO_GAIN)
     memory = judge_excess(monitor, memory, excess=0.1, ticks=2 * STRIKES)
@@ -144,31 +144,32 @@ def test_an_error_that_the_base_policy_shares_is_tolerated(flying):
     assert int(memory.stage) == Stage.OBSERVED
 
 
-def test_a_base_policy_that_flies_better_is_not_left(flying):
-    _, _, monitor = flying
+def test_better_base_policy_is_kept(hover_case):
+    _, _, monitor = hover_case
     memory = judge_excess(monitor, step_back_to_base(monitor, 0.2), excess=0.09, ticks=2 * STRIKES)
     assert int(memory.stage) == Stage.BASE
 
 
-def test_an_oscillation_is_never_tolerated(flying):
-    _, _, monitor = flying
+def test_oscillation_is_not_tolerated(hover_case):
+    _, _, monitor = hover_case
     memory = step_back_to_base(monitor, 0.06)
     memory = dataclasses.replace(memory, best=jnp.array(int(Stage.SLOW)))
     assert int(judge_excess(monitor, memory, excess=0.06, ticks=2 * STRIKES).stage) == Stage.BASE
 
 
-def test_fewer_bad_intervals_than_needed_change_nothing(flying):
-    _, _, monitor = flying
+def test_few_bad_intervals_change_nothing(hover_case):
+    _, _, monitor = hover_case
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
     for _ in range(3):
         memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES - 1)
         memory = judge_excess(monitor, memory, excess=0.5 * MARGIN)
     assert int(memory.stage) == Stage.ADAPTED
-    assert int(judge_excess(monitor, memory, excess=1.0).stage) == Stage.OBSERVED  # far off: once is enough
+    # a large error: one interval suffices
+    assert int(judge_excess(monitor, memory, excess=1.0).stage) == Stage.OBSERVED
 
 
-def test_a_second_oscillation_is_the_last_one(flying):
-    _, _, monitor = flying
+def test_second_oscillation_is_final(hover_case):
+    _, _, monitor = hover_case
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
     wild = lambda m: dataclasses.replace(m, swings=dataclasses.replace(m.swings, size=jnp.float32(100.0)))  # noqa: E731
     x = State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32))
@@ -182,7 +183,7 @@ def test_a_second_oscillation_is_the_last_one(flying):
     assert int(calm.stage) == Stage.BASE
 
 
-def test_swings_count_reversals_and_not_steps():
+def test_swing_measure_counts_reversals_not_steps():
     def size(ds):
         def tick(s, d):
             s = s.after(d, DT)
@@ -199,8 +200,8 @@ def test_swings_count_reversals_and_not_steps():
     assert slow < 8.0 < fast
 
 
-def test_the_monitor_has_the_frame_of_the_set_up(flying):
-    setup, policy, monitor = flying
+def test_monitor_has_frame_of_setup(hover_case):
+    setup, policy, monitor = hover_case
     assert isinstance(monitor, Monitor)
     again = setup.controller(setup.learner.init(policy, random.key(1)))
     assert jax.tree.structure(again.frame.observer) == jax.tree.structure(monitor.frame.observer)

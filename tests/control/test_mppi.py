@@ -1,4 +1,4 @@
-"""MPPI plans better with more samples, stays within the limits, and an estimator takes a push off it."""
+"""MPPI plans better with more samples and stays within the limits, and an estimator compensates for a push."""
 
 import dataclasses
 
@@ -39,23 +39,23 @@ def mppi(estimator=None, samples=256, seed=0):
     )
 
 
-def test_attitudes_turn_as_one_by_one(key):
+def test_batched_attitude_update_equals_single_updates(key):
     R = jax.vmap(lambda k: random_state(k).R)(random.split(key, 5))
     w = jnp.concatenate([random.normal(key, (4, 3)), jnp.zeros((1, 3))])
     result = jax.jit(lambda R, w: jnp.moveaxis(_turn(jnp.moveaxis(R, 0, -1), w.T), -1, 0))(R, w)
     np.testing.assert_allclose(result, jax.jit(jax.vmap(lambda R, w: R @ so3.exp(w)))(R, w), atol=1e-9)
 
 
-def test_noise_is_as_correlated_as_it_is_told():
-    """Of variance one at every tick, and exp(-difference / time constant) between ticks."""
+def test_noise_has_stated_correlation():
+    """The variance is one at every tick, and the correlation of two ticks is exp(-difference / time constant)."""
     for tau in (1e-3, 0.1, 0.5):
         colour = dataclasses.replace(mppi(), correlation=jnp.array(tau))._colour(jnp.zeros(()).dtype)
         t = DT * np.arange(30)
         np.testing.assert_allclose(colour @ colour.T, np.exp(-np.abs(t[:, None] - t[None]) / tau), atol=1e-6)
 
 
-def test_a_plan_costs_what_it_does(key):
-    """Of a plan that stays where the vehicle should be: nothing; and a metre away: its distance, for the horizon."""
+def test_plan_cost_is_integrated_distance(key):
+    """A plan that stays at the goal costs nothing; a plan one metre away costs this distance over the horizon."""
     controller = mppi(samples=3)
     hover = jnp.tile(Command.hover(float).vector()[None, :, None], (30, 1, 3))
     expected = jax.vmap(controller.task.setpoint)(DT * jnp.arange(30.0))
@@ -66,7 +66,7 @@ def test_a_plan_costs_what_it_does(key):
 
 
 def test_more_samples_plan_better(key):
-    """Mean over seeds of the cost of the mean that is planned, from a start that is off and tilted."""
+    """The score is the mean cost of the planned mean over seeds, from a displaced and tilted start."""
     x = State(jnp.array([0.4, -0.3, 1.2]), so3.exp(jnp.array([0.2, -0.1, 0.3])), jnp.array([0.5, 0.0, -0.2]))
     expected = jax.vmap(hover_task().setpoint)(DT * jnp.arange(30.0))
 
@@ -94,7 +94,7 @@ def test_more_samples_plan_better(key):
 
 @eqx.filter_jit
 def fly_once(controller, push):
-    """Positions and commands of 4 s in the lagged model, whose commands act a tick late."""
+    """Return positions and commands of 4 s in the lagged model with a command delay of one tick."""
     model = LaggedModel(PointMass(DT), first_order(TAU))
 
     def tick(carry, k):
@@ -109,7 +109,7 @@ def fly_once(controller, push):
 
 
 @pytest.mark.parametrize("push", [0.0, 2.0])
-def test_it_hovers_within_the_limits_and_the_estimator_takes_the_push_off(push):
+def test_hovers_within_limits_and_estimator_compensates_push(push):
     errors = []
     for estimator in (None, L1):
         p, u = (np.asarray(column) for column in fly_once(mppi(estimator, samples=128), jnp.full(3, push)))

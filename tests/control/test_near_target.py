@@ -1,4 +1,4 @@
-"""A controller behind NearTarget: unchanged near the target, and from far away that of a vehicle at the limit."""
+"""NearTarget leaves a controller unchanged near the target, and limits the error that it sees from far away."""
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ def command(controller, x):
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.1, 0.29, 0.31, 2.0, 50.0])
-def test_the_controller_sees_no_larger_error_than_the_limit(controller, distance):
+def test_controller_sees_limited_error(controller, distance):
     x = random_state(random.key(0))
     direction = x.p / jnp.linalg.norm(x.p)
     far, display = (
@@ -39,13 +39,13 @@ def test_the_controller_sees_no_larger_error_than_the_limit(controller, distance
     np.testing.assert_allclose(command(controller, far), command(controller.inner, display), rtol=1e-5, atol=1e-5)
 
 
-def test_an_infinite_limit_changes_nothing(controller):
+def test_infinite_limit_has_no_effect(controller):
     wide = NearTarget(controller.inner, controller.task, jnp.array(jnp.inf))
     x = random_state(random.key(2))
     np.testing.assert_array_equal(command(wide, x), command(controller.inner, x))
 
 
-def test_it_turns_with_its_task(controller):
+def test_near_target_is_equivariant(controller):
     frame, x = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5])), random_state(random.key(3))
     in_frame, observation = controller.in_frame(frame), frame.state(x)
     home = in_frame.task.home()

@@ -1,4 +1,4 @@
-"""A policy around any network: equal to the built-in perceptron for the same network, also in its gradient."""
+"""A policy with any network equals the built-in perceptron for the same network, including its gradient."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ policy_gradient = eqx.filter_jit(learn.policy_gradient)
 
 class Perceptron(eqx.Module):
     layers: tuple[eqx.nn.Linear, ...]
-    calls: jax.Array  # not trained
+    calls: jax.Array  # a constant
 
     def __call__(self, observation):
         h = observation
@@ -30,7 +30,7 @@ class Perceptron(eqx.Module):
 
 
 @pytest.fixture
-def both(key):
+def both_policies(key):
     env = hover_env()
     policy = Policy.of(env.task.observation.size, small(), key=key, hidden=(8, 8))
     policy = jax.tree.map(lambda leaf: leaf, policy)
@@ -38,16 +38,16 @@ def both(key):
     return env, policy, NetworkPolicy.create(Perceptron(policy.layers, jnp.array(3)), small())
 
 
-def test_commands_are_those_of_the_perceptron(both, key):
-    env, policy, network = both
+def test_commands_equal_perceptron(both_policies, key):
+    env, policy, network = both_policies
     o = random.normal(key, (env.task.observation.size,))
     np.testing.assert_allclose(network(o).vector(), policy(o).vector(), rtol=1e-12)
     by = jnp.array([0.1, -0.2, 0.3, 0.0])
     np.testing.assert_allclose(network.shifted(by)(o).vector(), policy.shifted(by)(o).vector(), rtol=1e-12)
 
 
-def test_gradients_are_those_of_the_perceptron(both, key):
-    env, policy, network = both
+def test_gradients_equal_perceptron(both_policies, key):
+    env, policy, network = both_policies
     x0 = draw_starts(env.task, key, 3)
     loss, gradient = policy_gradient(network, env, x0)
     expected_loss, expected = policy_gradient(policy, env, x0)
@@ -57,8 +57,8 @@ def test_gradients_are_those_of_the_perceptron(both, key):
         np.testing.assert_allclose(mine, theirs, rtol=1e-7, atol=1e-12)
 
 
-def test_only_real_numbers_are_trained(both):
-    _, _, network = both
+def test_only_floating_point_leaves_are_trained(both_policies):
+    _, _, network = both_policies
     assert len(network.params) == len(network.leaves) - 1
     changed_policy = network.with_params(tuple(2.0 * leaf for leaf in network.params))
     assert int(next(leaf for leaf in changed_policy.leaves if leaf.dtype.kind == "i")) == 3
@@ -69,7 +69,7 @@ def request_for(name):
     return NetworkRequest(preset, 15, small(), random.key(0))
 
 
-def test_networks_of_wrong_kinds():
+def test_unsuitable_networks_are_refused():
     class Three(eqx.Module):
         def __call__(self, o):
             return o[:3]

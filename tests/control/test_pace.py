@@ -1,4 +1,4 @@
-"""The largest pace: at its factors, commands reach the limits of the vehicle and do not exceed them."""
+"""The largest pace: at the computed factors, commands reach the limits of the vehicle and do not exceed them."""
 
 from functools import partial
 
@@ -34,7 +34,7 @@ def points_of(reference, pace=1.0, phase=4.0):
     return points_ahead(reference, clock)[1]
 
 
-def still(points):
+def stationary(points):
     return jnp.zeros_like(points.p)
 
 
@@ -56,7 +56,7 @@ def test_thrust_at_the_factor_is_the_limit(push, thrust, pace):
 def factors_along(reference, bounds, share):
     phases = jnp.arange(0.0, 3.0, STEP) + 4.0
     points = jax.vmap(lambda phase: at_pace(reference(phase), share, jnp.zeros(())))(phases)
-    return largest_factors(points, bounds, still(points), STEP / share)
+    return largest_factors(points, bounds, stationary(points), STEP / share)
 
 
 def test_factors_are_inverse_to_the_pace():
@@ -67,30 +67,30 @@ def test_factors_are_inverse_to_the_pace():
         np.testing.assert_allclose(slow.min() / fast.min(), 2.0, rtol=1e-2)
 
 
-def test_a_corner_is_cut_by_the_permitted_distance():
+def test_corner_is_cut_by_permitted_distance():
     """A vehicle that turns with the acceleration a and cuts a jump of the velocity by e can absorb sqrt(8 a e)."""
     reference = star()
     bounds = limits(1e6, (1e6,) * 3)
     phases = jnp.arange(3.0, 9.0, STEP)
     points = jax.jit(jax.vmap(reference))(phases)
-    factors = largest_factors(points, bounds, still(points))
+    factors = largest_factors(points, bounds, stationary(points))
     v = np.asarray(points.v)
     jump = np.linalg.norm(np.diff(v, axis=0), axis=1).max()
     np.testing.assert_allclose(float(factors.min()) * jump, np.sqrt(8.0 * 10.0 * 0.05), rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["thrust", "rates", "lag", "d"])
-def test_less_of_the_vehicle_means_a_slower_pace(name):
+def test_weaker_vehicle_has_slower_pace(name):
     points = points_of(figure8())
-    first = largest_factors(points, limits(), still(points))
+    first = largest_factors(points, limits(), stationary(points))
     changed = {"thrust": limits(thrust=15.0), "rates": limits(rates=(3.0, 3.0, 4.0)), "lag": limits(lag=0.2)}
-    d = jnp.broadcast_to(jnp.array([[0.0, 0.0, -12.0]]), points.p.shape) if name == "d" else still(points)
+    d = jnp.broadcast_to(jnp.array([[0.0, 0.0, -12.0]]), points.p.shape) if name == "d" else stationary(points)
     second = largest_factors(points, changed.get(name, limits(thrust=23.0)), d)
     assert (np.asarray(second) <= np.asarray(first) + 1e-9).all()
     assert float(second.mean()) < 0.97 * float(first.mean())
 
 
-def test_growth_meets_the_first_limit_in_time():
+def test_pace_grows_to_first_limit():
     tau, factors = jnp.array([0.0, 0.5, 1.0]), jnp.array([2.0, 0.8, 0.9])
     growth = largest_growth(tau, factors, jnp.array(1.0))
     np.testing.assert_allclose(growth, np.log(0.8) / 0.5)
@@ -109,8 +109,8 @@ def ideal_flight(reference, bounds, dt):
 
 @pytest.mark.parametrize("make", [circle, figure8, star])
 @pytest.mark.parametrize("vehicle", [small, large])
-def test_an_ideal_flight_stays_within_the_limits(make, vehicle):
-    """The pace grows until a limit is reached; thrust and rates, by differences of the positions, remain below it."""
+def test_ideal_flight_stays_within_limits(make, vehicle):
+    """The pace grows until a limit is reached; thrust and rates from position differences remain below it."""
     reference, dt = make(), 0.02
     bounds = pace_limits(load("track/retrim"), vehicle())
 
@@ -132,7 +132,7 @@ def test_an_ideal_flight_stays_within_the_limits(make, vehicle):
         assert jumps.max() <= 1.25 * np.sqrt(8.0 * 10.0 * 0.05)
 
 
-def test_the_first_lap_is_slow_and_its_share_is_known():
+def test_first_lap_is_slow_with_known_share():
     reference, bounds = figure8(), pace_limits(load("track/retrim"), large())
     pace = slow_pace(reference)
     points = jax.jit(jax.vmap(reference))(jnp.linspace(0.0, 8.0, 400))

@@ -1,4 +1,4 @@
-"""A flight at a variable pace: it begins slowly, waits for a vehicle that is off, and is the same in every pilot."""
+"""A flight at a variable pace starts slowly, waits for a displaced vehicle, and is the same in every pilot."""
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +26,8 @@ from retrim.tasks.shapes import figure8
 TICKS = 60
 
 
-class Expecting(AbstractController[tuple[()]]):
-    """Commands hover, and expects that a share of the thrust is missing."""
+class ExpectsMissingThrust(AbstractController[tuple[()]]):
+    """A controller that commands hover and expects a share of the thrust to be missing."""
 
     missing: jax.Array
 
@@ -42,9 +42,9 @@ class Expecting(AbstractController[tuple[()]]):
 
 
 def final_clock(missing=0.0, off=0.0, ticks=1500, limits=None):
-    """Fly with a vehicle at a distance from the reference; return the last memory."""
+    """Return the last memory of a flight at a distance from the reference."""
     limits = limits or pace_limits(load("track/retrim"), small())
-    controller = PacedFlight.of(Expecting(jnp.array(missing)), figure8(), limits, 0.02)
+    controller = PacedFlight.of(ExpectsMissingThrust(jnp.array(missing)), figure8(), limits, 0.02)
 
     @jax.jit
     def run():
@@ -58,21 +58,21 @@ def final_clock(missing=0.0, off=0.0, ticks=1500, limits=None):
     return run()
 
 
-def test_the_share_of_the_limits_grows_to_one_while_the_error_is_small():
+def test_share_of_limits_grows_to_one_while_error_is_small():
     memory, shares = final_clock()
     assert (np.diff(shares) >= 0.0).all()
     assert float(shares[0]) < 0.5
     assert float(memory.share) == 1.0
 
 
-def test_a_vehicle_far_from_the_path_flies_the_slow_lap():
+def test_displaced_vehicle_flies_slow_lap():
     memory, shares = final_clock(off=0.3)
     np.testing.assert_allclose(shares, shares[0])
     assert float(memory.clock.pace) < 0.8
 
 
-def test_missing_thrust_slows_the_flight():
-    """A vehicle that can barely hover brakes, until the thrust of its narrowest part is available."""
+def test_missing_thrust_slows_flight():
+    """A vehicle that can barely hover slows down until the thrust suffices for the most demanding part of the path."""
     limits = pace_limits(load("track/retrim"), small())
     weak = limits.__class__(jnp.array(14.0), limits.rates, limits.lag, limits.corner, limits.turning)
     full, sagging = (final_clock(missing=share, limits=weak)[0] for share in (0.0, 0.2))
@@ -92,7 +92,7 @@ def pilots(setup, n):
     return [setup.pilot(None, "indi") for _ in range(n)]
 
 
-def test_a_batch_has_the_phases_of_single_flights(setup):
+def test_batch_has_phases_of_single_flights(setup):
     starts = setup.flight_starts(2)
     logs = fly_together(plants(2), pilots(setup, 2), starts, ticks=TICKS)
     singles = [fly(*each, ticks=TICKS) for each in zip(plants(2), pilots(setup, 2), starts, strict=True)]
@@ -104,7 +104,7 @@ def test_a_batch_has_the_phases_of_single_flights(setup):
         assert (np.diff(log.phase) > 0.0).all()
 
 
-def test_the_score_compares_with_the_reference_at_the_phase(setup):
+def test_score_uses_reference_at_phase(setup):
     start = setup.flight_starts(1)[0]
     log = fly(plants(1)[0], pilots(setup, 1)[0], start, ticks=TICKS)
     flight = score_flight(setup, FlightSpec(Scenario(reference="figure8=max"), "indi", 0), log)
@@ -114,7 +114,7 @@ def test_the_score_compares_with_the_reference_at_the_phase(setup):
     assert fly(plants(1)[0], plain.pilot(None, "indi"), start, ticks=3).phase is None
 
 
-def test_the_live_pilot_has_the_same_pace(setup):
+def test_live_pilot_has_same_pace(setup):
     controller = setup.pilot(None, "indi").controller
     live, pilot = LivePilot(plain_source(setup, controller)), ControllerPilot(controller)
     plant = plants(1)[0]

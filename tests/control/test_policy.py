@@ -56,14 +56,14 @@ def test_fresh_policy_hovers(key):
 @pytest.mark.parametrize(
     "make", [lambda key: Policy.of(15, small(), key=key, hidden=(8,)), lambda key: DattNet.of(key=key)]
 )
-def test_a_fresh_network_has_the_types_of_a_trained_or_loaded_one(make, key):
-    """A weak type would have the same program compiled twice."""
+def test_fresh_network_has_types_of_trained_network(make, key):
+    """A weak type would compile the same program twice."""
     arrays = jax.tree.leaves(eqx.filter(make(key), eqx.is_array))
     assert arrays
     assert not any(leaf.weak_type for leaf in arrays)
 
 
-def test_zero_perturbations_change_nothing(key):
+def test_zero_perturbations_have_no_effect(key):
     policy: PolicyType = Policy.of(15, small(), key=key, hidden=(8, 8))
     policy = jax.tree.map(lambda leaf: leaf + 0.2, policy)
     o = random.normal(key, (15,))

@@ -1,4 +1,4 @@
-"""Controllers that need the state, flown from keypoints: they hold and reject a step, and see nothing but points."""
+"""Controllers that need the state, flown from keypoints: they hover, reject a step, and use the keypoints only."""
 
 import equinox as eqx
 import jax
@@ -29,14 +29,14 @@ def setup():
 
 
 def make(setup, name, **changes):
-    """The baseline as tables fly it from keypoints."""
+    """Return the baseline as result tables fly it from keypoints."""
     controller = MethodRequest(setup, None).by_state(BASELINES[name].controller(baseline_request(setup)))
     assert isinstance(controller, PoseFilteredController)
     return replace_fields(controller, observation=replace_fields(controller.observation, **changes))
 
 
 @pytest.mark.parametrize("name", ["geometric-i", "indi"])
-def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(setup, name):
+def test_hovers_and_rejects_step_from_keypoints(setup, name):
     controller, model = make(setup, name), LaggedModel(PointMass(DT), first_order(TAU))
     x0 = State(jnp.array([0.3, -0.2, 1.2]), jnp.eye(3), jnp.zeros(3))
 
@@ -51,13 +51,13 @@ def test_it_hovers_and_rejects_a_step_by_what_the_camera_sees(setup, name):
     start = (model.init(x0), x0, controller.init(x0), Command.hover(x0.p.dtype))
     path = jax.jit(lambda: lax.scan(tick, start, jnp.arange(600))[1])()
     off = np.linalg.norm(np.asarray(path.p) - np.array(GOAL), axis=1)
-    assert off[200:300].mean() < 0.02  # calm
-    assert 0.01 < off[300:400].max() < 0.3  # the step is felt
-    assert off[-100:].mean() < 0.02  # and rejected
+    assert off[200:300].mean() < 0.02  # before the step
+    assert 0.01 < off[300:400].max() < 0.3  # the step has an effect
+    assert off[-100:].mean() < 0.02  # the step is rejected
 
 
-def test_it_sees_nothing_but_points(setup):
-    """With no point seen, its commands follow from the filter and the clock, wherever the vehicle is."""
+def test_commands_depend_on_keypoints_only(setup):
+    """Without visible points, commands follow from the filter and the clock for any position of the vehicle."""
     blind, seeing = (make(setup, "geometric-i", dropout=jnp.array(error)) for error in (1.0, 0.0))
     memory = blind.init(HERE)
     call = eqx.filter_jit(lambda controller, x: controller(memory, jnp.array(0.0), x)[0].vector())
@@ -65,8 +65,8 @@ def test_it_sees_nothing_but_points(setup):
     assert np.any(np.asarray(call(seeing, HERE)) != np.asarray(call(seeing, ELSEWHERE)))
 
 
-def test_an_inertial_unit_does_not_tell_the_attitude(setup, key):
-    """The same reading in the body frame gives the same command, however the vehicle that it is on is turned."""
+def test_inertial_unit_does_not_reveal_attitude(setup, key):
+    """The same reading in the body frame gives the same command for any attitude of the vehicle."""
     blind = make(setup, "indi", dropout=jnp.array(1.0))
     memory, specific_force = blind.init(HERE), random.normal(key, (3,)) + jnp.array([0.0, 0.0, STANDARD_GRAVITY])
     gravity = jnp.array([0.0, 0.0, -STANDARD_GRAVITY])
@@ -78,7 +78,7 @@ def test_an_inertial_unit_does_not_tell_the_attitude(setup, key):
     assert np.any(np.abs(np.asarray(call(2.0 * omega, gravity, HERE)) - np.asarray(one)) > 1e-3)
 
 
-def test_accepted_commands_and_ages_reach_the_controller_inside(setup):
+def test_inner_controller_receives_accepted_commands_and_ages(setup):
     controller = make(setup, "geometric-i")
     _, memory = eqx.filter_jit(controller)(controller.init(HERE), jnp.array(0.0), HERE)
     u = Command(jnp.array(7.0), jnp.array([1.0, -2.0, 0.5]))
@@ -89,7 +89,7 @@ def test_accepted_commands_and_ages_reach_the_controller_inside(setup):
     assert float(controller.with_age(0.015).inner.prediction.age) == pytest.approx(0.015)
 
 
-def test_without_a_filter_there_is_no_state():
+def test_controller_without_filter_is_refused():
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset("vision/ideal")
     with pytest.raises(

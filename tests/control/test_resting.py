@@ -1,4 +1,4 @@
-"""A policy shifted at each tick commands hover where it rests, in every frame and with every belief."""
+"""A policy that is shifted at each tick commands hover at its rest point, in every frame and for every belief."""
 
 import equinox as eqx
 import jax
@@ -35,16 +35,16 @@ def command(controller, x):
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, -3.0])
 @pytest.mark.parametrize("model", [0.0, 0.4, 1.0])
-def test_at_rest_it_commands_hover(controller, heading, model):
+def test_commands_hover_at_rest(controller, heading, model):
     belief = PathBelief.between(-model * jnp.ones(4), model * jnp.ones(4))
     message = eqx.tree_at(lambda c: c.observation.belief, controller, belief)
     x = State(jnp.array(GOAL), so3.rotz(jnp.array(heading)), jnp.zeros(3))
     np.testing.assert_allclose(command(message, x), Command.hover().vector(), atol=1e-6)
     plain = PolicyController(message.observation, message.policy)
-    assert np.abs(command(plain, x) - Command.hover().vector()).max() > 0.01  # or the test shows nothing
+    assert np.abs(command(plain, x) - Command.hover().vector()).max() > 0.01  # otherwise the test is vacuous
 
 
-def test_it_turns_with_its_home(controller):
+def test_resting_policy_is_equivariant(controller):
     frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5]))
     in_frame, x = controller.in_frame(frame), random_state(random.key(1))
     home = frame.state(State.at(jnp.array(GOAL)))

@@ -21,14 +21,14 @@ SMALL = {
 
 
 def make_untrained(setup, seed=0):
-    """In place of minutes of training."""
+    """Return an untrained policy, which replaces minutes of training."""
     from jax import random
 
     return setup.new_policy(random.key(seed))
 
 
 def run(page: Path) -> str | None:
-    """Run a page; return a traceback if a block fails, and say so if there is no block at all."""
+    """Run a page; return a traceback if a block fails, and an error if there is no block."""
     blocks = list(BLOCK.finditer(page.read_text()))
     for block in blocks:
         if block["title"]:

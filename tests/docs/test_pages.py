@@ -1,4 +1,4 @@
-"""What the documentation shows runs, and what it lists is complete."""
+"""The code in the documentation runs, and its lists are complete."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ TOML = re.compile(r'^```toml title="(?P<title>[^"]+)"\n(?P<code>.*?)^```', re.M 
 
 @pytest.fixture(scope="module")
 def tracebacks(tmp_path_factory):
-    """Traceback, or None, of each page; one process for all, since most of the time is compiling."""
+    """Return the traceback of each page, or None; one process runs all pages, since most of the time is compilation."""
     folder = tmp_path_factory.mktemp("reader")
     words = [sys.executable, str(Path(__file__).with_name("run_pages.py")), *map(str, PAGES)]
     process = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=900)
@@ -42,17 +42,17 @@ def tracebacks(tmp_path_factory):
 
 @pytest.mark.documentation
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_blocks_of_a_page_run(tracebacks, page):
+def test_blocks_of_page_run(tracebacks, page):
     assert tracebacks[str(page)] is None, tracebacks[str(page)]
 
 
 @pytest.mark.parametrize(("page", "kind"), [("vehicle", VehicleSpec), ("sweep", Sweep)])
-def test_a_page_lists_every_key_and_no_other(page, kind):
+def test_page_lists_exactly_the_keys(page, kind):
     listed_rows = re.findall(r"^\| `(\w+)` \|", (DOCS / "how-to" / f"{page}.md").read_text(), re.M)
     assert sorted(listed_rows) == sorted(field.name for field in dataclasses.fields(kind))
 
 
-def test_the_page_of_sweeps_tells_the_defaults():
+def test_sweep_page_states_defaults():
     message = dict(re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", (DOCS / "how-to" / "sweep.md").read_text(), re.M))
     plain = Sweep()
     assert set(message) == {field.name for field in dataclasses.fields(Sweep)} - {"seconds", "overlay"}
@@ -61,7 +61,7 @@ def test_the_page_of_sweeps_tells_the_defaults():
         assert json.loads(text) == (list(value) if isinstance(value, tuple) else value), key
 
 
-def test_the_page_of_replay_tells_the_limits_and_every_map():
+def test_replay_page_states_limits_and_maps():
     page = (DOCS / "how-to" / "replay.md").read_text()
     rows = re.findall(r"^\| ([^|]+?) \| (-?\d* ?%?) ?\| (\d+) % \|$", page, re.M)
     for name, words in WORDS.items():
@@ -74,7 +74,7 @@ def test_the_page_of_replay_tells_the_limits_and_every_map():
         assert name in command
 
 
-def test_the_first_page_tells_every_figure_of_the_results():
+def test_first_page_states_figures_of_results():
     plain = summary([record(flight(0.1))])
     tracking = summary(
         [record(flight(0.1, cross=np.full(501, 0.1))), failed_record(flight(0.1).spec, "small", "e", "no")]
@@ -84,7 +84,7 @@ def test_the_first_page_tells_every_figure_of_the_results():
     assert (plain | tracking).keys() - {*CONDITIONS, "metric"} <= message
 
 
-def test_toml_files_of_pages_are_accepted(tmp_path):
+def test_toml_files_of_pages_are_valid(tmp_path):
     readers = {
         "my_quad": read_vehicle,
         "slow": read_vehicle,

@@ -1,4 +1,4 @@
-"""The site leads to every page, and shows what the command line and the result pages state."""
+"""The site links every page, and shows the content of the command line and the result pages."""
 
 import importlib.util
 import re
@@ -20,12 +20,12 @@ def load_hook(name):
 
 
 @pytest.mark.parametrize(("index", "folder"), [("how-to/index.md", "how-to"), ("reference/index.md", "reference")])
-def test_an_index_leads_to_every_page_of_its_folder(index, folder):
+def test_index_links_every_page_of_its_folder(index, folder):
     pages = {path.name for path in (DOCS / folder).glob("*.md")} - {"index.md", "commands.md"}
     assert pages <= set(LINK.findall((DOCS / index).read_text()))
 
 
-def test_the_index_of_results_has_one_row_for_each_page_with_its_commit():
+def test_index_of_results_has_one_row_per_page_with_its_commit():
     rows = re.findall(
         r"^\| \[.*\]\((results/[^)]+)\) \|.*\| (?:code )?`(\w+)` \|$", (DOCS / "results.md").read_text(), re.M
     )
@@ -38,12 +38,12 @@ def test_the_index_of_results_has_one_row_for_each_page_with_its_commit():
         assert commit not in text, page
 
 
-def test_the_navigation_is_short():
+def test_navigation_is_short():
     nav = (DOCS.parent / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
     assert len(re.findall(r"^ *- ", nav, re.M)) <= 45
 
 
-def test_a_result_page_begins_with_the_answer_of_the_index():
+def test_result_page_begins_with_answer_of_index():
     hook = load_hook("result_answers")
     rows = hook.read_index(DOCS)
     assert len(rows) == len(list((DOCS / "results").rglob("*.md")))
@@ -60,7 +60,7 @@ def test_a_result_page_begins_with_the_answer_of_the_index():
     assert page.index(row.question) < page.index(row.answer) < page.index("Made by")
 
 
-def test_the_page_of_commands_has_every_option():
+def test_command_page_has_every_option():
     hook = load_hook("command_options")
     page = hook.describe_commands()
     for name in commands():
@@ -70,7 +70,7 @@ def test_the_page_of_commands_has_every_option():
         assert printed <= set(re.findall(r"^\| `(--[\w-]+)", section, re.M))
 
 
-def test_options_of_help_have_default_and_meaning():
+def test_options_have_default_and_meaning():
     parse = load_hook("command_options").parse_help
     text = (
         "usage: retrim x [-h] [OPTIONS] PATH\n\nDo it.\n\n"

@@ -1,4 +1,4 @@
-"""The camera: the double-sphere model by hand, its inverse, its borders; where it looks."""
+"""The camera: the double-sphere model, its inverse, its borders, and its viewing direction."""
 
 import math
 
@@ -25,8 +25,11 @@ bearing = eqx.filter_jit(lambda camera, pixels: jax.vmap(camera.bearing)(pixels)
 slope = eqx.filter_jit(lambda camera, P: jax.vmap(jax.jacobian(lambda q: camera.project(q).pixel))(P))
 
 
-def test_centre_and_neighbourhood_by_hand(camera):
-    """On the axis: the principal point. Close to it a pinhole with focal length f / (1 + xi), for d1 = d2 = z."""
+def test_projection_near_axis_is_pinhole(camera):
+    """The axis maps to the principal point.
+
+    Near it, the camera is a pinhole of focal length f / (1 + xi), as d1 = d2 = z.
+    """
     result = project(camera, jnp.array([[0.0, 0.0, 2.0], [0.002, 0.0, 2.0], [0.0, -0.002, 2.0]]))
     centre = 2.0 * np.array([632.1317557 / 1280.0, 388.2472267 / 720.0]) - 1.0
     np.testing.assert_allclose(result.pixel[0], centre, atol=1e-9)
@@ -37,7 +40,7 @@ def test_centre_and_neighbourhood_by_hand(camera):
 
 
 def test_looks_down_with_x_to_the_right():
-    """Camera x is body -y, camera y is body -x: what is ahead is up in the image, what is left is left."""
+    """Camera x is body -y and camera y is body -x: forward is up in the image, and left is left."""
     x = State.at(jnp.array([0.0, 0.0, 3.0]))
     points = in_camera(x, jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
     np.testing.assert_allclose(points, [[0.0, -1.0, 3.0], [-1.0, 0.0, 3.0], [0.0, 0.0, 3.0]], atol=1e-12)
@@ -55,7 +58,7 @@ def test_bearing_is_the_inverse_of_project(camera):
     assert result.visible.all()
 
 
-def test_about_120_degrees_across(camera):
+def test_field_of_view_is_about_120_degrees(camera):
     ends = np.asarray(bearing(camera, jnp.array([[-1.0, 0.0], [1.0, 0.0]])))
     assert math.degrees(math.acos(ends[0] @ ends[1])) == pytest.approx(120.0, abs=5.0)
 
@@ -66,7 +69,7 @@ ODD = [
 ]  # fmt: skip
 
 
-def test_finite_and_unseen_far_off_axis_and_behind(camera):
+def test_points_behind_are_finite_and_invisible(camera):
     points = jnp.array(ODD)
     result = project(camera, points)
     slopes = slope(camera, points)
@@ -76,8 +79,8 @@ def test_finite_and_unseen_far_off_axis_and_behind(camera):
     assert not result.visible[8]
 
 
-def test_the_border_decides(camera):
-    """Just inside is seen, just outside is not; values and gradients are finite on the border itself."""
+def test_border_limits_visibility(camera):
+    """A point just inside is visible, and one just outside is not; values and gradients are finite on the border."""
     for axis in (0, 1):
         for side in (-1.0, 1.0):
             rays = bearing(camera, jnp.asarray(np.outer([0.999, 1.0, 1.001], side * np.eye(2)[axis])))
@@ -87,6 +90,6 @@ def test_the_border_decides(camera):
             assert np.isfinite(slope(camera, rays)[1]).all()
 
 
-def test_the_projection_does_not_depend_on_distance(camera, key):
+def test_projection_is_independent_of_distance(camera, key):
     rays = random.normal(key, (20, 3)).at[:, 2].set(1.0)
     np.testing.assert_allclose(project(camera, 7.0 * rays).pixel, project(camera, rays).pixel, atol=1e-9)

@@ -1,4 +1,4 @@
-"""The disturbance observer: exact without noise, told nothing of the noise that slows it down."""
+"""The disturbance observer is exact without noise, and estimates the noise that determines its bandwidth."""
 
 import equinox as eqx
 import jax
@@ -16,10 +16,10 @@ DT, D = 0.02, jnp.array([1.5, -1.0, 2.0])
 
 
 def observe(observer, key, *, ticks=200, noise=0.0, late=0, turning=1.0, d=D, thrust_tau=None):
-    """Estimates while a vehicle tumbles under random commands that act ``late`` ticks after they were issued.
+    """Return estimates while a vehicle tumbles under random commands that act ``late`` ticks after they were issued.
 
-    It turns ``turning`` times as fast as it is told to, its thrust follows by ``thrust_tau`` [s], and its velocity is
-    measured with ``noise`` [m/s].
+    The vehicle turns ``turning`` times as fast as commanded, its thrust has the lag ``thrust_tau`` [s], and its
+    velocity is measured with ``noise`` [m/s].
     """
     thrust_tau = None if thrust_tau is None else jnp.array(thrust_tau)
     return _observe(observer, key, ticks, jnp.array(noise), late, jnp.array(turning), d, thrust_tau)
@@ -61,16 +61,16 @@ def make(*, tau=0.05, wander=4.0, limit=9.0, thrust_tau=None, limits=None, delay
 
 
 @pytest.mark.parametrize(("late", "turning"), [(0, 1.0), (2, 1.0), (0, 0.5)])
-def test_without_noise_it_is_a_low_pass_of_what_acts(late, turning, key):
-    """Whatever is commanded, however late, and whether the vehicle turns as it is told or not."""
+def test_estimate_without_noise_is_low_pass_of_disturbance(late, turning, key):
+    """This holds for all commands and delays, and if the vehicle turns at a different rate than commanded."""
     result, _ = observe(make(delay_ticks=late, wander=np.inf), key, ticks=60, late=late, turning=turning)
     expected = np.asarray(D) * (1.0 - np.exp(-DT / 0.05 * np.arange(1, 61)))[:, None]
     np.testing.assert_allclose(result, expected, atol=2e-3 if turning == 1.0 else 2e-2)
 
 
 @pytest.mark.parametrize("late", [0, 2])
-def test_thrust_that_follows_late_is_no_disturbance(late, key):
-    """As long as the lag is declared; otherwise each change of thrust passes for one."""
+def test_declared_thrust_lag_is_not_disturbance(late, key):
+    """With an undeclared lag, each change of thrust appears as a disturbance."""
     calm = {"late": late, "thrust_tau": 0.04, "ticks": 60, "d": jnp.zeros(3)}
     message, _ = observe(make(delay_ticks=late, wander=np.inf, thrust_tau=0.04), key, **calm)
     untold, _ = observe(make(delay_ticks=late, wander=np.inf), key, **calm)
@@ -78,8 +78,8 @@ def test_thrust_that_follows_late_is_no_disturbance(late, key):
     assert float(jnp.abs(untold).max()) > 0.3
 
 
-def test_while_a_command_at_a_limit_acts_the_estimate_is_held(key):
-    """A mixer that lifts the vehicle although it is told to idle is not the wind."""
+def test_estimate_is_held_while_command_at_limit_acts(key):
+    """A mixer that lifts the vehicle at idle thrust is not wind."""
     limits = Command(jnp.array(0.2), -10.0 * jnp.ones(3)), Command(jnp.array(40.0), 10.0 * jnp.ones(3))
     observer, model, hover = make(limits=limits), PointMass(DT), Command.hover(jnp.float64)
     idle = Command(jnp.array(0.3), jnp.array([9.9, 0.0, 0.0]))
@@ -106,21 +106,21 @@ def test_while_a_command_at_a_limit_acts_the_estimate_is_held(key):
     assert int(at_limit.sum()) == 20
 
 
-def test_the_estimated_noise_is_that_of_the_velocities(key):
+def test_noise_estimate_equals_velocity_noise(key):
     for noise in (0.003, 0.03):
         _, result = observe(make(), key, ticks=1000, noise=noise)
         assert float(result[300:].mean()) == pytest.approx(noise, rel=0.1)
 
 
-def test_noise_makes_it_slower_and_leaves_it_true(key):
+def test_noise_slows_estimate_without_bias(key):
     fast, _ = observe(make(wander=np.inf), key, ticks=1000, noise=0.03)
     wise, _ = observe(make(), key, ticks=1000, noise=0.03)
     assert wise[500:].std(axis=0).max() < 0.5 * fast[500:].std(axis=0).min()
     np.testing.assert_allclose(wise[500:].mean(axis=0), D, atol=0.05)
 
 
-def test_it_follows_a_wandering_disturbance_about_as_well_as_the_best_constant_filter(key):
-    """The filter that is optimal for this noise and this wander, found by trying time constants."""
+def test_error_is_close_to_best_constant_filter(key):
+    """The best filter for this noise and this random walk is found by a search over time constants."""
     walk = jnp.cumsum(4.0 * DT**0.5 * random.normal(random.fold_in(key, 3), (1500, 3)), axis=0)
     observation = jnp.cumsum(DT * walk, axis=0) + 0.02 * random.normal(random.fold_in(key, 4), walk.shape)
 
@@ -139,8 +139,8 @@ def test_it_follows_a_wandering_disturbance_about_as_well_as_the_best_constant_f
     assert error(make(tau=1e-3, limit=99.0)) < 1.02 * constant
 
 
-def test_what_a_vehicle_gained_by_another_time_than_a_tick_is_no_disturbance():
-    """Not at the first measurement, of which nothing came before, and not over a tick that was missed."""
+def test_irregular_intervals_are_not_disturbance():
+    """The first measurement has no predecessor, and an interval with a missed tick has a different length."""
     observer, model, u = make(wander=np.inf), PointMass(DT), Command(jnp.array(12.0), jnp.array([0.5, 0.0, 0.0]))
     x = State(jnp.zeros(3), so3.exp(jnp.array([0.3, -0.3, 0.0])), jnp.array([1.0, 0.0, 0.0]))
     step = jax.jit(lambda s, t, x: observer.issued(observer(s, t, x), u))

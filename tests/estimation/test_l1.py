@@ -1,4 +1,4 @@
-"""The L1 estimator converges to a constant as its law says, whatever the vehicle does meanwhile."""
+"""The L1 estimator converges to a constant with its stated law, for any motion of the vehicle."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ DT = 0.02
 
 
 def estimates(estimator, d, key, ticks=400):
-    """Estimates of a vehicle that tumbles under random thrust and a disturbance ``d``, by tick."""
+    """Return estimates by tick for a vehicle that tumbles under random thrust and a disturbance ``d``."""
 
     def tick(carry, xs):
         (x, memory), (k, t) = carry, xs
@@ -31,25 +31,26 @@ def estimates(estimator, d, key, ticks=400):
 
 @pytest.mark.parametrize("pole", [-0.01, -0.2, -2.0])
 @pytest.mark.parametrize("tau", [0.2, 2.0])
-def test_it_converges_to_a_constant_with_its_time_constant(pole, tau, key):
+def test_converges_to_constant_with_its_time_constant(pole, tau, key):
     d = jnp.array([2.0, -0.5, 1.0])
     estimator = L1Estimator(jnp.array(pole), jnp.exp(jnp.array(-DT / tau)), DT)
     result = np.asarray(jax.jit(lambda: estimates(estimator, d, key))())
     t = DT * np.arange(1, len(result) + 1)
     expected = np.asarray(d) * (1.0 - np.exp(-t / tau))[:, None]
-    np.testing.assert_allclose(result, expected, atol=2.0 * DT * abs(pole) * 1.1 + 1e-3)  # the law is exact to A_s dt
+    # the law is exact up to A_s dt
+    np.testing.assert_allclose(result, expected, atol=2.0 * DT * abs(pole) * 1.1 + 1e-3)
     np.testing.assert_allclose(result[0] / result[-1], -np.expm1(-DT / tau) / -np.expm1(-t[-1] / tau), rtol=0.05)
 
 
-def test_it_is_linear_in_the_disturbance(key):
+def test_estimate_is_linear_in_disturbance(key):
     estimator = L1Estimator(jnp.array(-0.2), jnp.array(0.95), DT)
     one, other = jnp.array([1.0, 0.0, -2.0]), jnp.array([0.0, 3.0, 0.5])
     a, b, both = (estimates(estimator, d, key, ticks=50) for d in (one, other, one + 2.0 * other))
     np.testing.assert_allclose(both, a + 2.0 * b, atol=1e-9)
 
 
-def test_what_a_vehicle_gained_by_another_time_than_a_tick_is_no_disturbance():
-    """Not at the first measurement, and not over ticks that were missed; then it goes on as its law says."""
+def test_irregular_intervals_are_not_disturbance():
+    """This applies to the first measurement and to missed ticks; afterwards the law continues to hold."""
     d, thrust = jnp.array([1.0, -0.5, 0.3]), jnp.array([2.0, 0.0, 11.0])
     estimator = L1Estimator(jnp.array(-0.2), jnp.exp(jnp.array(-DT / 0.1)), DT)
     gain = DT * (thrust + jnp.array([0.0, 0.0, -9.81]) + d)

@@ -1,4 +1,4 @@
-"""An old measurement says where the vehicle is now."""
+"""An old measurement is predicted to the present."""
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,8 @@ from retrim.physics import Command, PointMass
 
 
 @pytest.mark.parametrize("age", [0.0, 0.005, 0.02])
-def test_it_is_a_tick_of_the_model(age, key):
-    """Without turning exactly, under any command to third order in the age."""
+def test_prediction_is_step_of_model(age, key):
+    """The prediction is exact without rotation, and otherwise of third order in the age."""
     kx, ku = random.split(key)
     x, u, d = random_state(kx), random_command(ku), jnp.array([1.0, -2.0, 0.5])
     after = jax.jit(lambda u: ahead(x, u, d, jnp.array(age)))

@@ -1,4 +1,4 @@
-"""The filter of a hidden load: it finds direction, mass and length, and nothing where there is no load."""
+"""The load filter estimates direction, mass and length of a hidden load, and zero mass without a load."""
 
 import dataclasses
 
@@ -31,7 +31,7 @@ def directions(s):
 
 
 @pytest.mark.parametrize(("share", "length"), [(0.1, 0.5), (0.2, 0.3), (0.3, 0.5), (0.4, 1.0), (0.5, 0.7)])
-def test_mass_length_and_direction_are_found_in_seconds(share, length, key):
+def test_mass_length_and_direction_converge_in_seconds(share, length, key):
     rows = flight(share, length, key=key, noise=0.1)
     s = estimates(rows)
     end = Load.of(s.z[-1])
@@ -42,10 +42,10 @@ def test_mass_length_and_direction_are_found_in_seconds(share, length, key):
     assert np.degrees(errors[300:]).mean() < 3.0
     assert float(end.drag) == pytest.approx(0.3, abs=0.1)
     deviation = np.sqrt(np.asarray(s.P[-1, 7, 7]))
-    assert abs(float(end.share) - share) < 4.0 * deviation  # and it states how well
+    assert abs(float(end.share) - share) < 4.0 * deviation  # the stated uncertainty is consistent
 
 
-def test_without_a_load_its_mass_is_zero_and_all_numbers_stay_finite(key):
+def test_mass_is_zero_and_finite_without_load(key):
     rows = flight(1e-6, key=key, noise=0.1, ticks=3000)
     s = estimates(rows)
     assert float(s.z[-1, 7]) < 0.01
@@ -57,7 +57,7 @@ def test_without_a_load_its_mass_is_zero_and_all_numbers_stay_finite(key):
     np.testing.assert_allclose(s.z[-1, 4:6], [0.3, -0.2], atol=0.15)
 
 
-def test_a_release_and_a_pick_up_are_noticed_within_a_second():
+def test_release_and_pick_up_are_detected_within_a_second():
     s = estimates(flight(0.3, picked=4.0, dropped=8.0, ticks=600))
     share, t = np.asarray(s.z[:, 7]), DT * np.arange(1, 601)
     assert share[t < 4.0][-1] < 0.03
@@ -65,7 +65,7 @@ def test_a_release_and_a_pick_up_are_noticed_within_a_second():
     assert share[t > 9.0].max() < 0.06
 
 
-def test_turning_the_world_about_the_vertical_turns_the_estimate(key):
+def test_estimate_is_equivariant_to_heading(key):
     rows = flight(0.3, key=key, noise=0.1, ticks=100)
     turn = so3.rotz(jnp.array(0.8))
     about = lambda a: a @ turn.T  # noqa: E731
@@ -81,7 +81,7 @@ def test_turning_the_world_about_the_vertical_turns_the_estimate(key):
     np.testing.assert_allclose(other.z[:, 7:], one.z[:, 7:], atol=1e-7)
 
 
-def test_the_model_is_the_motion_of_the_load_and_its_pull_that_of_the_cable():
+def test_model_equals_simulated_load_and_cable_force():
     rows = flight(0.3, ticks=20, push=(0.0, 0.0, 0.0), drag=0.0)
     q = np.asarray(rows.direction)
     rate = (q[9] - q[7]) / (2.0 * DT)
@@ -95,7 +95,7 @@ def test_the_model_is_the_motion_of_the_load_and_its_pull_that_of_the_cable():
         np.testing.assert_allclose(load.direction, q[k], atol=0.002)
 
 
-def test_the_step_is_of_second_order_and_a_free_swing_keeps_its_energy():
+def test_step_is_second_order_and_free_swing_conserves_energy():
     load = Load(jnp.array([0.5, 0.1]), jnp.array([0.3, -1.0]), *map(jnp.asarray, (np.zeros(3), 0.3, 0.5, 0.0, 0.0)))
     still = jnp.zeros(3)
 
@@ -116,7 +116,7 @@ def test_the_step_is_of_second_order_and_a_free_swing_keeps_its_energy():
     assert float(energy(after)) == pytest.approx(float(energy(load)), abs=1e-4)
 
 
-def test_a_cable_does_not_push_and_numbers_stay_within_their_bounds():
+def test_cable_does_not_push_and_estimates_stay_bounded():
     down = Load(jnp.zeros(2), jnp.zeros(2), *map(jnp.asarray, (np.zeros(3), 0.3, 0.5, 0.0, 0.0)))
     np.testing.assert_allclose(down.pull(jnp.zeros(3)), 0.3 * G)
     np.testing.assert_array_equal(
@@ -138,7 +138,7 @@ def test_a_cable_does_not_push_and_numbers_stay_within_their_bounds():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(bad))
 
 
-def test_a_tick_that_does_not_count_changes_nothing_but_the_forecast():
+def test_missed_tick_changes_only_prediction():
     s = LoadEstimate.start(jnp.zeros(()).dtype).predict(jnp.array([1.0, 0.0, 0.0]), DT)
     missed = jnp.array([5.0, 5.0, 5.0])
     after = s.correct(missed, missed, missed, missed, jnp.array(0.0), jnp.array(False), DT)

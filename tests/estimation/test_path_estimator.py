@@ -1,4 +1,4 @@
-"""The posterior of the command path is exact, covers what it says, and counts only what belongs to it."""
+"""The posterior of the command path is exact and calibrated, and uses only the data of its own vehicle."""
 
 import dataclasses
 from functools import cache
@@ -72,7 +72,7 @@ def one_vehicle(**changes):
 
 @pytest.mark.parametrize(("lag", "damping"), [(0.1, 0.4), (0.05, 0.7), (0.08, 1.0), (0.03, 1.2), (0.05, 20.0)])
 @pytest.mark.parametrize("width", [0.0, 0.02])
-def test_a_step_response_solves_its_differential_equation(lag, damping, width):
+def test_step_response_solves_its_differential_equation(lag, damping, width):
     natural, times = 2.0 * damping / lag, np.linspace(0.0, 0.4, 4001)
 
     def A(t, y):
@@ -103,7 +103,7 @@ def measured(channel, features, value, kinds):
 
 
 def _linear_channel(kind, kinds, sigma, n=60):
-    """Return a channel with the sums of a linear vehicle, and what went into them."""
+    """Return a channel with the sums of a linear vehicle, and the data behind the sums."""
     rng, prior = np.random.default_rng(3), dataclasses.replace(estimator().yaw, cells=(11, 11, 7))
     channel, history = channel_before(1, prior, DT), CommandHistory.at_hover(DT)
     cell = jnp.array([[0.03, np.log(0.07), ringing_of(0.8)]])
@@ -143,7 +143,7 @@ def _brute_force(cells, kind, channel, prior, rows, values):
 
 
 @pytest.mark.parametrize(("kinds", "kind", "sigma"), [(noise.DIRECT, 0, 0.05), (noise.DIFFERENCE, 0, 0.1)])
-def test_it_is_the_exact_posterior_of_a_linear_vehicle(kinds, kind, sigma):
+def test_posterior_of_linear_vehicle_is_exact(kinds, kind, sigma):
     channel, prior, rows, values = _linear_channel(kind, kinds, sigma)
     result = path_posterior(channel, prior)
     choice = kinds[int(result.kind)]
@@ -168,19 +168,16 @@ def test_it_is_the_exact_posterior_of_a_linear_vehicle(kinds, kind, sigma):
 
 
 @pytest.fixture(scope="module")
-def many():
-    """Fifty random vehicles, excited for a second, with the sensors ``onboard``.
-
-    As beside a live flight, every fifth tick has a new estimate.
-    """
+def many_vehicles():
+    """Return estimates for 50 random vehicles, excited for a second, with the sensors ``onboard``."""
     rng = np.random.default_rng(20)
     vehicles = random_vehicles(rng, 50)
     flights = fly(rng, vehicles, LEVELS["onboard"], 1.0, doublets)
     return vehicles, [estimate(flights, i, every=5) for i in range(50)]
 
 
-def test_fifty_vehicles_are_identified_within_a_second(many):
-    vehicles, result = many
+def test_fifty_vehicles_are_identified_within_a_second(many_vehicles):
+    vehicles, result = many_vehicles
     delay, lag, gain = (
         np.array([getattr(each, name).mean[-1] for each in result]) for name in ("delay", "rate_lag", "thrust_gain")
     )
@@ -190,15 +187,15 @@ def test_fifty_vehicles_are_identified_within_a_second(many):
 
 
 @pytest.mark.parametrize("name", ["delay", "rate_lag", "yaw_lag", "thrust_gain", "thrust_lag"])
-def test_intervals_cover_what_they_state(many, name):
-    vehicles, result = many
+def test_intervals_have_stated_coverage(many_vehicles, name):
+    vehicles, result = many_vehicles
     low, high = (np.array([getattr(getattr(each, name), end)[-1] for each in result]) for end in ("low", "high"))
     truth = getattr(vehicles, name)
     assert 0.82 <= np.mean((low <= truth) & (truth <= high)) <= 1.0
     assert all(getattr(each, name).excited[-1] for each in result)
 
 
-def test_roll_and_pitch_may_change_places_and_clocks_may_start_anywhere():
+def test_estimate_is_invariant_to_axis_swap_and_clock_offset():
     flights = fly(np.random.default_rng(1), one_vehicle(), LEVELS["mocap"], 1.0, doublets)
     plain, later = estimate(flights), estimate(flights, start=37.0)
     u, omega = flights.u[0].copy(), flights.omega[0].copy()
@@ -210,7 +207,7 @@ def test_roll_and_pitch_may_change_places_and_clocks_may_start_anywhere():
         assert abs(one.mean[-1] - three.mean[-1]) < 0.05 * one.deviation[-1]
 
 
-def test_nothing_is_compiled_for_other_values():
+def test_new_values_need_no_compilation():
     """Neither of vehicles, sensors and times, nor of the memory after some ticks."""
     estimate(fly(np.random.default_rng(2), one_vehicle(delay=0.01), LEVELS["ideal"], 0.2, doublets))
     program = len(TRACES)
@@ -220,8 +217,8 @@ def test_nothing_is_compiled_for_other_values():
 
 
 @pytest.mark.parametrize("inertial", [True, False])
-def test_a_vehicle_at_rest_says_nothing(inertial):
-    """A constant push at hover is not mistaken for a gain of the thrust."""
+def test_vehicle_at_rest_is_not_informative(inertial):
+    """A constant push at hover is not mistaken for a thrust gain."""
     rng, n = np.random.default_rng(4), 150
     R = np.tile(np.eye(3), (n, 1, 1))
     u = np.tile([8.0, 0.0, 0.0, 0.0], (n, 1))
@@ -235,7 +232,7 @@ def test_a_vehicle_at_rest_says_nothing(inertial):
     assert "not excited" in describe_path(jax.tree.map(lambda leaf: leaf[-1], result))
 
 
-def test_wrong_measurements_do_not_move_it():
+def test_wrong_measurements_do_not_change_estimate():
     flights = fly(np.random.default_rng(5), one_vehicle(), LEVELS["mocap"], 1.6, doublets)
     p, R, v, omega, a = (np.array(x[0]) for x in flights[:5])
     omega[[55, 62, 70]] += [8.0, -6.0, 5.0]
@@ -249,7 +246,7 @@ def test_wrong_measurements_do_not_move_it():
         assert two.deviation[-1] < 1.4 * one.deviation[-1], name
 
 
-def test_it_follows_a_change_of_the_vehicle():
+def test_estimate_follows_change_of_vehicle():
     def excite(t):
         return doublets(t % 1.0)
 
@@ -260,7 +257,7 @@ def test_it_follows_a_change_of_the_vehicle():
     assert result.rate_lag.mean[-1] == pytest.approx(0.1, rel=0.2)
 
 
-def test_the_line_that_reports_it():
+def test_report_line():
     flights = fly(np.random.default_rng(7), one_vehicle(), LEVELS["ideal"], 1.0, doublets)
     last = jax.tree.map(lambda leaf: leaf[-1], estimate(flights))
     assert describe_path(last, (0.02, 0.015)) == (
@@ -271,7 +268,7 @@ def test_the_line_that_reports_it():
     assert 0.5 < float(lag) / 0.06 < 0.8
 
 
-def test_excitation_is_bounded_returns_and_stops():
+def test_excitation_is_bounded_periodic_and_finite():
     excitation, s = Excitation.of(), estimator().init(State.at(jnp.zeros(3)))
     times = jnp.arange(0.0, 0.48, 0.004)
     c = jax.vmap(lambda t: excitation(t, s.estimate).c)(times)

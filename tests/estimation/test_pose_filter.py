@@ -1,4 +1,4 @@
-"""The pose filter: it converges, predicts while nothing is seen, and is never thrown by one stray point."""
+"""The pose filter converges, predicts without visible points, and tolerates an outlier."""
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ def pixels_at(x):
 
 @eqx.filter_jit
 def track(estimate, x, us, visible):
-    """The filter beside a point mass; ``visible`` (ticks x 7) says what it is shown."""
+    """Run the filter on a point mass; ``visible`` (ticks x 7) states which points it receives."""
     noise = 2.0 * 0.5 / CAMERA.size
 
     def tick(carry, step):
@@ -45,42 +45,42 @@ def correct(estimate, pixels, visible):
     return estimate.correct(CAMERA, GROUND, pixels, visible, 1.0 / CAMERA.size)
 
 
-def hovering(n):
+def hover_commands(n):
     return [Command.hover()] * n
 
 
-def gentle(key, n):
+def small_commands(key, n):
     return [Command(9.81 + 0.5 * random.normal(k, ()), 0.3 * random.normal(k, (3,))) for k in random.split(key, n)]
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_converges_from_its_hand_over(seed):
+def test_converges_from_initial_estimate(seed):
     x = State.at(jnp.array(GOAL))
     start = PoseFilter.near(x, random.key(seed))
     assert float(jnp.linalg.norm(start.x.p - x.p)) > 0.01
-    _, _, gaps, _ = track(start, x, stack_trees(hovering(40)), jnp.ones((40, 7), dtype=bool))
+    _, _, gaps, _ = track(start, x, stack_trees(hover_commands(40)), jnp.ones((40, 7), dtype=bool))
     assert float(gaps[15:, 0].max()) < 2e-3  # m
     assert float(gaps[15:, 1].max()) < 2e-3  # rad
     assert float(gaps[25:, 2].max()) < 0.02  # m/s
 
 
-def test_hand_over_is_as_uncertain_as_it_says():
+def test_initial_covariance_equals_initial_errors():
     x = State.at(jnp.array(GOAL))
     starts = jax.jit(jax.vmap(lambda k: PoseFilter.near(x, k)))(random.split(random.key(8), 2000))
     np.testing.assert_allclose((starts.x.p - x.p[None]).std(axis=0), 0.1, rtol=0.08)
     np.testing.assert_allclose(jax.vmap(so3.log)(starts.x.R).std(axis=0), 0.05, rtol=0.08)
     np.testing.assert_allclose(starts.x.v.std(axis=0), 0.2, rtol=0.08)
     np.testing.assert_allclose(np.diag(starts.P[0]), np.repeat([0.01, 0.0025, 0.04, 1.0], 3))
-    np.testing.assert_array_equal(starts.d, 0.0)  # nobody has felt anything yet
+    np.testing.assert_array_equal(starts.d, 0.0)  # no disturbance has been estimated yet
 
 
-def test_predicts_through_the_dark(key):
-    """15 ticks without any point, under commands that it knows: the error stays, the doubt grows."""
-    us = stack_trees(hovering(25) + [random_command(k) for k in random.split(key, 15)])
+def test_predicts_without_visible_points(key):
+    """After 15 ticks without any point, under known commands, the error stays small and the variance grows."""
+    us = stack_trees(hover_commands(25) + [random_command(k) for k in random.split(key, 15)])
     dark = jnp.arange(40)[:, None] < jnp.full((1, 7), 25)
     x0 = State.at(jnp.array(GOAL))
     _, x, gaps, P = track(PoseFilter.near(x0, key), x0, us, dark)
-    assert float(jnp.linalg.norm(x.v)) > 0.1  # it has moved
+    assert float(jnp.linalg.norm(x.v)) > 0.1  # the vehicle has moved
     assert float(gaps[-1, 0]) < 5e-3
     assert float(gaps[-1, 1]) < 5e-3
     doubt = jnp.trace(P[:, :3, :3], axis1=1, axis2=2)
@@ -88,8 +88,8 @@ def test_predicts_through_the_dark(key):
     assert float(doubt[-1]) > 10.0 * float(doubt[24])
 
 
-def test_one_point_corrects(key):
-    """Of whichever point: less doubt than without it; a hidden one changes nothing."""
+def test_each_point_reduces_covariance(key):
+    """A hidden point changes nothing."""
     x = State.at(jnp.array(GOAL))
     estimate = PoseFilter.near(x, key)
     pixels = pixels_at(x)
@@ -97,16 +97,16 @@ def test_one_point_corrects(key):
         after = correct(estimate, pixels, jnp.arange(7) == i)
         shrunk = np.linalg.eigvalsh(estimate.P - after.P)
         assert shrunk.min() > -1e-12
-        assert (shrunk > 1e-4).sum() == 2  # two numbers, two directions
+        assert (shrunk > 1e-4).sum() == 2  # two coordinates reduce the variance in two directions
         assert float(jnp.trace(after.P)) < float(jnp.trace(estimate.P))
     none = correct(estimate, pixels, jnp.zeros(7, dtype=bool))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), none, estimate)
 
 
-def test_covariance_stays_one(key):
-    """Symmetric and positive, whatever comes into estimate and goes."""
+def test_covariance_stays_symmetric_and_positive(key):
+    """Points appear and disappear at random."""
     kv, ku, ks = random.split(key, 3)
-    us = stack_trees(gentle(ku, 40))
+    us = stack_trees(small_commands(ku, 40))
     observation = random.uniform(kv, (40, 7)) < 0.3
     x0 = State.at(jnp.array(GOAL))
     _, _, gaps, P = track(PoseFilter.near(x0, ks), x0, us, observation)
@@ -115,17 +115,17 @@ def test_covariance_stays_one(key):
     assert float(gaps[20:, 0].max()) < 0.02
 
 
-def test_a_stray_point_does_not_throw_it(key):
+def test_outlier_is_rejected(key):
     x = State.at(jnp.array(GOAL))
-    estimate, *_ = track(PoseFilter.near(x, key), x, stack_trees(hovering(40)), jnp.ones((40, 7), dtype=bool))
+    estimate, *_ = track(PoseFilter.near(x, key), x, stack_trees(hover_commands(40)), jnp.ones((40, 7), dtype=bool))
     pixels = pixels_at(x).at[2].set(jnp.array([-0.9, -0.9]))
     after = correct(estimate, pixels, jnp.ones(7, dtype=bool))
     assert float(jnp.linalg.norm(after.x.p - x.p)) < 0.02
 
 
 @pytest.mark.parametrize("push", [(2.0, 2.0, 2.0), (-3.0, 1.0, -0.5)])
-def test_a_push_is_felt(push, key):
-    """A constant acceleration that no command explains is told from tilt, within a second."""
+def test_constant_push_is_estimated(push, key):
+    """A constant acceleration that no command explains is distinguished from tilt within a second."""
     x, estimate, noise = State.at(jnp.array(GOAL)), PoseFilter.near(State.at(jnp.array(GOAL)), key), 1.0 / CAMERA.size
     hold = Command.hover()
 
@@ -141,8 +141,8 @@ def test_a_push_is_felt(push, key):
     assert float(jnp.linalg.norm(estimate.x.v - x.v)) < 0.05
 
 
-def test_a_first_look_may_be_far_off():
-    """One look at seven points mends a pose that is 25 cm and 8 degrees off, to what a linear look would leave."""
+def test_first_correction_may_be_large():
+    """One correction from seven points removes an error of 25 cm and 8 degrees, up to the error of linearisation."""
     x = State.at(jnp.array([0.1, 0.2, 1.2]))
     estimate = PoseFilter.near(x, random.key(0))
     off = State(x.p + jnp.array([0.2, -0.1, 0.15]), so3.exp(jnp.array([0.1, -0.05, 0.08])), x.v)
@@ -152,8 +152,10 @@ def test_a_first_look_may_be_far_off():
 
 
 @pytest.mark.parametrize("tau", [0.03, 0.06])
-def test_it_knows_of_lag(tau, key):
-    """In the dark, under a command that jumps, it follows a vehicle with such actuators; not without knowing."""
+def test_prediction_includes_lag(tau, key):
+    """Without visible points, under a jump of the command, the filter follows a vehicle with lag only if it models the
+    lag.
+    """
     plant = LaggedModel(PointMass(DT), first_order(tau))
     x0 = State.at(jnp.array(GOAL))
     start = replace_fields(PoseFilter.near(x0, key), x=x0)

@@ -20,8 +20,8 @@ def prediction_of(lag, ticks):
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
-def test_it_is_what_the_lagged_model_does(delay, key):
-    """Commands under way act first, each for a tick; then the new one begins."""
+def test_prediction_equals_lagged_model(delay, key):
+    """Commands in transit act first, each for a tick; then the new one begins."""
     model, d = LaggedModel(PointMass(DT), first_order(TAU)), jnp.array([0.5, -1.0, 0.3])
     k_x, *keys = random.split(key, 9)
     s = model.init(random_state(k_x))
@@ -41,7 +41,7 @@ def test_it_is_what_the_lagged_model_does(delay, key):
         s = model.step(s, queue.pop(0), d)
 
 
-def test_what_the_plant_accepted_is_what_counts(key):
+def test_prediction_uses_accepted_commands(key):
     x, (k_a, k_b) = random_state(key), random.split(key)
     prediction = prediction_of(TAU, 1)
     commands, accepted_command = random_command(k_a), random_command(k_b)
@@ -51,19 +51,19 @@ def test_what_the_plant_accepted_is_what_counts(key):
         jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def test_an_old_measurement_is_brought_to_now(key):
-    """A vehicle in a steady turn, seen 20 ms late, is where it is."""
+def test_old_measurement_is_predicted_to_present(key):
+    """The predicted position of a vehicle in a steady turn, measured 20 ms late, is its true position."""
     x, u = random_state(key), random_command(key)
     prediction = prediction_of(0.0, 0)
     memory = prediction.issued(prediction.init(x), u)
     now = PointMass(DT).step(x, u, jnp.zeros(3))
     late, _ = prediction.with_age(DT)(memory, x, jnp.zeros(3))
     np.testing.assert_allclose(late.R, now.R, atol=1e-9)
-    np.testing.assert_allclose(late.p, now.p, atol=5e-3)  # its acceleration is taken as constant
+    np.testing.assert_allclose(late.p, now.p, atol=5e-3)  # the acceleration is assumed constant
 
 
-def test_a_delay_between_two_ticks_and_a_ringing_rate_loop(key):
-    """The model with the same path, simulated in 1 ms, is in the predicted state when the command begins to act."""
+def test_prediction_with_fractional_delay_and_underdamped_rate_loop(key):
+    """The same model in steps of 1 ms is in the predicted state when the command begins to act."""
     delay, fine = 0.033, 0.001
     response = ActuatorResponse.of(0.05, jnp.array([0.08, 0.1, 0.2]), inverse_damping=1.6)
     prediction, d = Prediction.of(CommandPath.of(delay, response), DT), jnp.array([0.5, -1.0, 0.3])

@@ -19,7 +19,7 @@ from retrim_paper.demo import demonstrate
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
-def test_the_camera_keeps_lines_straight_and_near_things_large():
+def test_camera_preserves_lines_and_enlarges_near_objects():
     ends = np.array([[1.0, -0.5, 0.3], [-0.8, 0.2, -0.6]])
     a, b, c = project(np.stack([ends[0], 0.3 * ends[0] + 0.7 * ends[1], ends[1]]))
     assert np.linalg.det([b - a, c - a]) == pytest.approx(0.0, abs=1e-12)
@@ -29,7 +29,7 @@ def test_the_camera_keeps_lines_straight_and_near_things_large():
     assert np.isnan(project(2.0 * DISTANCE * np.array([1.0, 1.0, 1.0]))).all()
 
 
-def test_an_animation_lasts_as_long_as_its_longest_flight():
+def test_animation_lasts_as_long_as_longest_flight():
     flights = [flight(0.1, seconds=2.0), flight(3.0, terminated=True, seconds=1.0)]
     setup = Setup.from_preset(tiny_preset())
     data = animate(flights[:1], setup, flights[0].spec.scenario, "title", {})
@@ -40,7 +40,7 @@ def test_an_animation_lasts_as_long_as_its_longest_flight():
     assert duration == pytest.approx(2.0 + HOLD_S, abs=0.1)
 
 
-def test_an_animation_needs_the_flights_that_it_shows(tmp_path):
+def test_animation_needs_its_flights(tmp_path):
     with pytest.raises(ConfigError, match="leave out --no-slow or --gif"):
         demonstrate(
             "hover/retrim",

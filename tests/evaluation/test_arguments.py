@@ -1,4 +1,4 @@
-"""What a command is asked for reaches the preset and the scenario; what does not fit is refused."""
+"""Command-line arguments determine the preset and the scenario, and inconsistent ones are refused."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ from retrim.io.policies import load_policy, save_policy
 SEVEN_INCH = Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml"
 
 
-def test_a_preset_is_that_of_the_task_with_what_was_asked_on_top(tmp_path):
+def test_preset_is_that_of_task_with_overrides(tmp_path):
     assert training_preset("hover") == load("hover/retrim")
     assert training_preset("hover", "hover/fast") == load("hover/fast")
     overlay = tmp_path / "a.toml"
@@ -38,7 +38,7 @@ def test_a_preset_is_that_of_the_task_with_what_was_asked_on_top(tmp_path):
         training_preset("hover", "track/paper")
 
 
-def test_the_reference_of_a_flight_is_one_that_the_policy_can_follow():
+def test_reference_must_suit_policy():
     family, blind = load("track/preview"), changed(load("track/blind"), track={"reference": "circle"})
     one = changed(family, track={"reference": "star"})
     assert reference_of_flight(load("hover/fast"), None) is None
@@ -54,7 +54,7 @@ def test_the_reference_of_a_flight_is_one_that_the_policy_can_follow():
             reference_of_flight(preset, name)
 
 
-def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
+def test_flight_cannot_change_training_settings():
     original = load("track/retrim")
     free = changed(original, adapt={"num_updates": 3}, delay_ticks=0)
     assert same_policy(original, free, Path("a.toml")) is free
@@ -69,7 +69,7 @@ def test_a_flight_changes_nothing_that_the_weights_were_trained_for():
             same_policy(original, dataclasses.replace(original, **_whole(original, changes)), Path("a.toml"))
 
 
-def test_a_flight_may_excite_a_vehicle_but_not_change_its_family():
+def test_flight_may_excite_vehicle_but_not_change_its_family():
     original = load("hover/any")
     excitation = changed(original, family={"excitation": True})
     assert same_policy(original, excitation, Path("a.toml")) is excitation
@@ -91,7 +91,7 @@ def _whole(preset, changes):
     }
 
 
-def test_a_residual_is_another_one_but_not_in_a_flight_that_goes_on(key):
+def test_residual_can_change_except_in_resumed_flight(key):
     preset = load("hover/fast")
     assert with_residual(preset, None, None) is preset
     assert with_residual(preset, "regression", None).adapt.residual == "regression"
@@ -102,7 +102,7 @@ def test_a_residual_is_another_one_but_not_in_a_flight_that_goes_on(key):
         with_residual(preset, "regression", state)
 
 
-def test_where_a_flight_takes_place_is_its_scenario():
+def test_flight_arguments_build_scenario():
     preset = load("track/preview")
     result = FlightArguments("wind=3", "simple", "figure8", "large", "mocap", 0.01, 0.04).scenario(preset)
     assert (result.disturbance, result.plant, result.reference) == ("wind=3", "simple", "figure8")
@@ -111,7 +111,7 @@ def test_where_a_flight_takes_place_is_its_scenario():
     assert FlightArguments(plant="mavlink:udp:127.0.0.1:14550").scenario(load("hover/fast")).disturbance == "none"
 
 
-def test_weights_are_of_a_policy_or_of_an_earlier_flight(tmp_path, key):
+def test_weights_come_from_policy_or_earlier_flight(tmp_path, key):
     preset = brief_preset()
     save_policy(tmp_path / "policy.safetensors", Setup.from_preset(preset).new_policy(key), preset)
     weights, result, state = load_inputs(tmp_path, None)
@@ -125,7 +125,7 @@ def test_weights_are_of_a_policy_or_of_an_earlier_flight(tmp_path, key):
         load_inputs(None, tmp_path, tmp_path)
 
 
-def test_a_mistake_in_a_module_of_ones_own_is_told_in_a_line(tmp_path, monkeypatch):
+def test_error_in_custom_module_is_reported_in_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine_that_fails.py").write_text("def wind():\n    return 1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)

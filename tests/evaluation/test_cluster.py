@@ -1,4 +1,4 @@
-"""Sweeps by a Dask scheduler: the same table as in one process, whatever is killed or cut on the way."""
+"""Sweeps on a Dask scheduler give the same table as one process, despite killed workers and cut connections."""
 
 import contextlib
 import json
@@ -44,13 +44,13 @@ seconds = 1.2
 
 
 def small():
-    """The preset that the sweep flies, so that all tests share their programs."""
+    """Return the preset of the sweep; all tests share its compiled programs."""
     return changed(load("hover/retrim"), **tomllib.loads(OVERLAY)["overlay"])
 
 
 @pytest.fixture(scope="module")
 def here(as_a_user):
-    """The address of a scheduler with two workers, which are threads of this process."""
+    """Return the address of a scheduler with two workers, which are threads of this process."""
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None, host="127.0.0.1"
     ) as result:
@@ -64,7 +64,7 @@ def fleet(as_a_user):
     return Fleet(preset, policy, [Scenario("small", plant="simple")], starts=2, seconds=1.2)
 
 
-def test_lots_that_travel_are_the_flights_of_one_process(here, fleet):
+def test_remote_flights_equal_local_flights(here, fleet):
     with Cluster(here) as there:
         assert there.workers == 2
         away = fleet.run(there, by_batch=True)
@@ -72,15 +72,15 @@ def test_lots_that_travel_are_the_flights_of_one_process(here, fleet):
     assert not away.failed
 
 
-def test_a_job_that_fails_is_told_and_the_others_land(here, fleet, monkeypatch):
+def test_failed_job_is_reported_and_others_finish(here, fleet, monkeypatch):
     fly = jobs.fly_batch
 
-    def failing(setup, policies, specs, *rest, **more):
+    def fail_job(setup, policies, specs, *rest, **more):
         if specs[0].method == "full":
             raise OSError("the disk\nis full")
         return fly(setup, policies, specs, *rest, **more)
 
-    monkeypatch.setattr(jobs, "fly_batch", failing)
+    monkeypatch.setattr(jobs, "fly_batch", fail_job)
     monkeypatch.setattr("retrim.evaluation.batches.lanes", lambda: 1)
     with Cluster(here) as there:
         flights = fleet.run(there, by_batch=True)
@@ -90,7 +90,7 @@ def test_a_job_that_fails_is_told_and_the_others_land(here, fleet, monkeypatch):
     assert flights.interrupted
 
 
-def test_a_failed_flight_is_a_row_with_its_error():
+def test_failed_flight_is_a_row_with_its_error():
     flight = {**failed_record(FlightSpec(Scenario(), "full", 0), "small", "m", ""), "error": 0.01, "failed": None}
     gap = failed_record(FlightSpec(Scenario(), "full", 1), "small", "m", "OSError: gone")
     row = summary([flight, gap])
@@ -100,41 +100,41 @@ def test_a_failed_flight_is_a_row_with_its_error():
     assert cell(summary([gap])) == "1 of 1 failed"
 
 
-def test_a_table_with_holes_is_not_made(here, tmp_path, monkeypatch):
-    def failing(*_, **__):
+def test_incomplete_table_is_not_written(here, tmp_path, monkeypatch):
+    def fail_job(*_, **__):
         raise OSError("the disk is full")
 
-    monkeypatch.setattr(jobs, "fly_batch", failing)
+    monkeypatch.setattr(jobs, "fly_batch", fail_job)
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
     words = "--presets", "hover/fast", "--methods", "base", "--seeds", "0", "--starts", "4", "--seconds", "1"
     text = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
     assert "flights failed elsewhere, the first by OSError: the disk is full" in text
 
 
-def test_a_training_that_fails_costs_no_other(here, tmp_path, monkeypatch):
+def test_failed_training_does_not_affect_others(here, tmp_path, monkeypatch):
     train = training.train
 
-    def failing(setup, seed):
+    def fail_job(setup, seed):
         if seed == 1:
             raise MemoryError("too large")
         return train(setup, seed)
 
-    monkeypatch.setattr(training, "train", failing)
+    monkeypatch.setattr(training, "train", fail_job)
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
     text = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
     assert "1 of 2 trainings of hover/retrim failed: seed 1: too large" in text
     assert [path.stem[-5:] for path in (tmp_path / "s/policies").iterdir()] == ["seed0"]
 
 
-def test_a_flight_that_fails_leaves_the_others_and_an_exit_code(here, tmp_path, monkeypatch):
+def test_failed_flight_keeps_others_and_sets_exit_code(here, tmp_path, monkeypatch):
     fly = jobs.fly_batch
 
-    def failing(setup, policies, specs, *rest, **more):
+    def fail_job(setup, policies, specs, *rest, **more):
         if specs[0].method == "indi":
             raise OSError("gone")
         return fly(setup, policies, specs, *rest, **more)
 
-    monkeypatch.setattr(jobs, "fly_batch", failing)
+    monkeypatch.setattr(jobs, "fly_batch", fail_job)
     monkeypatch.setattr("retrim.evaluation.batches.lanes", lambda: 1)
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"full"', '"indi"'))
     text = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
@@ -147,14 +147,14 @@ def test_a_flight_that_fails_leaves_the_others_and_an_exit_code(here, tmp_path, 
     assert [row.get("failures") for row in rows(tmp_path / "s")] == [None, None]
 
 
-def test_a_scheduler_that_is_gone_ends_it(here):
+def test_lost_scheduler_ends_sweep(here):
     there = Cluster(here)
     there.shutdown()
     with pytest.raises(JobError, match=r"no job can be given to the scheduler at tcp://"):
         there.submit(int).result()
 
 
-def test_what_cannot_come_back_is_told_and_what_is_given_up_stays_so(here):
+def test_unpicklable_result_is_reported_and_cancelled_job_stays_cancelled(here):
     with Cluster(here) as there:
         with pytest.raises(ZeroDivisionError):
             there.submit(divmod, 1, 0).result(30)
@@ -167,12 +167,12 @@ def test_what_cannot_come_back_is_told_and_what_is_given_up_stays_so(here):
 @pytest.mark.parametrize(
     "address", ["127.0.0.1:8786", "tcp://127.0.0.1", "http://127.0.0.1:8786", "tcp://127.0.0.1:99999", "tls://:8786"]
 )
-def test_what_is_no_address_is_named(address):
+def test_invalid_address_is_refused(address):
     with pytest.raises(ConfigError, match=r"expected tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler"):
         Cluster(address)
 
 
-def test_nobody_there_is_named():
+def test_missing_scheduler_is_reported():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -180,7 +180,7 @@ def test_nobody_there_is_named():
         Cluster(f"tcp://127.0.0.1:{port}")
 
 
-def test_other_versions_are_refused_before_the_first_job(here, monkeypatch):
+def test_different_versions_are_refused_before_first_job(here, monkeypatch):
     with pytest.raises(ConfigError, match=r"a worker has other versions: jax 0\.1, here"):
         cluster.check_alike({**cluster.ours(), "jax": "0.1"}, "a worker")
     with pytest.raises(ConfigError, match="who sent this job"):
@@ -190,8 +190,8 @@ def test_other_versions_are_refused_before_the_first_job(here, monkeypatch):
         Cluster(here)
 
 
-def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(here, tmp_path, monkeypatch):
-    """The policies are trained by the workers, too."""
+def test_remote_sweep_gives_same_table_and_repeats_failed_flights(here, tmp_path, monkeypatch):
+    """The workers also train the policies."""
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1))
     text = retrim("sweep", "study.toml", "--on", here, "--out", "there", cwd=tmp_path)
     assert f"2 workers at {here}" in text
@@ -206,10 +206,10 @@ def test_a_sweep_elsewhere_is_the_same_table_and_flies_again_what_had_failed(her
 
 
 @pytest.mark.parametrize("gap", range(cluster.ATTEMPTS + 1))
-def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(gap):
-    """Its result is there unless it was lost as often as it may be."""
+def test_lost_job_is_resubmitted_a_limited_number_of_times(gap):
+    """The result arrives unless the job is lost more often than the limit."""
 
-    class Gone:
+    class LostFuture:
         def __init__(self, status):
             self.status = status
 
@@ -226,7 +226,7 @@ def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(gap
 
     def submit():
         calls.append("lost" if len(calls) < gap else "finished")
-        return Gone(calls[-1])
+        return LostFuture(calls[-1])
 
     Cluster.__new__(Cluster)._start(outer, submit, cluster.ATTEMPTS)
     assert len(calls) == min(gap + 1, cluster.ATTEMPTS)
@@ -237,7 +237,7 @@ def test_a_job_that_is_lost_is_given_to_the_scheduler_again_but_not_for_ever(gap
             outer.result(0)
 
 
-def test_a_table_grows_by_its_command(tmp_path, monkeypatch):
+def test_table_grows_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
     words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "1"
     text = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
@@ -302,7 +302,7 @@ class Wire:
 
 @contextlib.contextmanager
 def processes(folder):
-    """A scheduler and three workers, each a process of its own; yields its port and the workers."""
+    """Start a scheduler and three workers in separate processes; yield the port and the workers."""
     dask = [sys.executable, "-m", "dask"]
     place = ["--no-dashboard", "--scheduler-file", str(folder / "scheduler.json")]
     quiet = {"cwd": folder, "stdout": subprocess.DEVNULL, "stderr": (folder / "dask.log").open("w")}
@@ -325,7 +325,7 @@ def processes(folder):
 
 
 @pytest.mark.slow
-def test_a_killed_worker_and_a_cut_connection_change_nothing(tmp_path):
+def test_killed_worker_and_cut_connection_change_nothing(tmp_path):
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=16))
     flights = tmp_path / "there" / "flights.jsonl"
     with processes(tmp_path) as (port, workers), ThreadPoolExecutor(1) as beside:

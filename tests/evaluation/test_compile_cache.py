@@ -1,4 +1,4 @@
-"""Programs are kept for other processes, and given back before a process has too many memory maps."""
+"""Compiled programs are cached for other processes, and released before a process has too many memory maps."""
 
 import os
 import sys
@@ -12,7 +12,7 @@ from retrim.runkit import compile_cache
 
 
 @pytest.mark.skipif(not compile_cache.MAPS.exists(), reason="the system does not list memory maps")
-def test_programs_are_given_back_above_a_number_of_maps():
+def test_programs_are_released_above_number_of_maps():
     traces = []
 
     @jax.jit
@@ -29,7 +29,7 @@ def test_programs_are_given_back_above_a_number_of_maps():
     assert len(traces) == 2
 
 
-def test_a_system_without_the_list_keeps_them(monkeypatch, tmp_path):
+def test_programs_are_kept_without_list_of_maps(monkeypatch, tmp_path):
     monkeypatch.setattr(compile_cache, "MAPS", tmp_path / "none")
     assert not compile_cache.release_programs(0)
 
@@ -63,8 +63,8 @@ def test_a_user_without_a_home_compiles_each_time(config, monkeypatch):
 
 
 @pytest.mark.parametrize("off", ["", "0"])
-def test_programs_are_kept_in_the_user_s_cache_unless_it_is_off(off, config, tmp_path, monkeypatch):
-    """And a folder that cannot be made is a warning."""
+def test_programs_are_cached_unless_cache_is_off(off, config, tmp_path, monkeypatch):
+    """If the folder cannot be created, a warning is issued."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("RETRIM_COMPILE_CACHE", off)
     result = compile_cache.enable_compile_cache()

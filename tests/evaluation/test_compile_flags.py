@@ -1,4 +1,4 @@
-"""Short commands compile quickly, and only where the compiler is known to understand how."""
+"""Short commands compile quickly, if the compiler is known to support the flags."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ EMITTERS, LEVEL = compile_flags.QUICK
 
 @pytest.fixture
 def flags_of(monkeypatch):
-    """What ``XLA_FLAGS`` says after a command has begun."""
+    """Return a function that gives ``XLA_FLAGS`` after the start of a command."""
     monkeypatch.setattr(compile_flags, "enable_compile_cache", lambda: None)
 
     def begin(command, flags="", *, jaxlib="0.10.1", plugins=()):
@@ -26,7 +26,7 @@ def flags_of(monkeypatch):
     return begin
 
 
-def test_a_short_command_compiles_quickly_and_the_user_s_flags_stand(flags_of):
+def test_short_command_compiles_quickly_and_keeps_user_flags(flags_of):
     assert flags_of("fly") == [EMITTERS, LEVEL]
     assert flags_of("demo", "--xla_dump_to=x") == ["--xla_dump_to=x", EMITTERS, LEVEL]
     assert flags_of("demo", "--xla_backend_optimization_level=3") == ["--xla_backend_optimization_level=3", EMITTERS]
@@ -36,12 +36,12 @@ def test_a_short_command_compiles_quickly_and_the_user_s_flags_stand(flags_of):
     ("command", "about"),
     [(name, {}) for name in compile_flags.LONG] + [("fly", {"jaxlib": "0.11.0"}), ("fly", {"plugins": ("cuda",)})],
 )
-def test_nothing_changes_for_long_commands_unknown_compilers_and_accelerators(flags_of, command, about):
+def test_flags_are_unchanged_for_long_commands_unknown_compilers_and_accelerators(flags_of, command, about):
     assert flags_of(command, "--xla_dump_to=x", **about) == ["--xla_dump_to=x"]
 
 
-def test_the_installed_compiler_knows_the_flags():
-    """One that does not ends the process."""
+def test_installed_compiler_supports_flags():
+    """A compiler without a flag ends the process."""
     code = (
         "from retrim.runkit.compile_flags import compile_for; compile_for('fly')\n"
         "import jax; print(jax.jit(lambda x: x + 1)(2))"

@@ -1,4 +1,4 @@
-"""The likely cause of a crash is the fault that a made-up plant has, with its number."""
+"""The reported cause of a crash is the fault of the simulated plant, with its size."""
 
 import re
 
@@ -13,7 +13,7 @@ DT, G = 0.02, 9.80665
 
 
 def fly_once(*, n=100, delay=1, lag=0.03, sign=1.0, ringing=None, thrust=1.0, down=False, velocity=1.0, seed=0):
-    """A log of a point that turns and accelerates as it is told, but for its faults."""
+    """Return the log of a point that turns and accelerates as commanded, except for its faults."""
     rng = np.random.default_rng(seed)
     knots = rng.normal(size=(n // 10 + 2, 4)) * np.array([1.5, 1.2, 1.2, 0.3])
     u = np.array([[np.interp(k / 10, np.arange(len(knots)), knots[:, i]) for i in range(4)] for k in range(n + 1)])
@@ -42,7 +42,7 @@ def fly_once(*, n=100, delay=1, lag=0.03, sign=1.0, ringing=None, thrust=1.0, do
     return Log(DT * np.arange(n + 1), States(p, R, v), States(p, R, velocity * v), u, DT, True)
 
 
-def test_a_vehicle_without_a_fault_has_no_cause():
+def test_vehicle_without_fault_has_no_cause():
     for seed in range(5):
         assert likely_cause(fly_once(seed=seed), 0.05) is None
 
@@ -60,7 +60,7 @@ def test_a_vehicle_without_a_fault_has_no_cause():
         ({"velocity": 0.5}, r"the velocity is 0\.5\d? times the derivative"),
     ],
 )  # fmt: skip
-def test_a_fault_is_told_with_its_number(fault, text):
+def test_fault_is_reported_with_size(fault, text):
     for seed in range(3):
         result = likely_cause(fly_once(seed=seed, **fault), 0.05)
         assert result is not None
@@ -81,7 +81,7 @@ def test_numbers_clock_and_rotation():
     assert "the attitude is no rotation: R' R differs from 1 by 0.44" in likely_cause(wide, 0.05)
 
 
-def test_body_rates_are_those_of_the_attitudes():
+def test_body_rates_follow_from_attitudes():
     w = np.array([0.4, -2.0, 1.1])
     R = np.array([Rotation.from_rotvec(DT * k * w).as_matrix() for k in range(5)])
     np.testing.assert_allclose(body_rates(R, DT), np.tile(w, (4, 1)), rtol=1e-9)

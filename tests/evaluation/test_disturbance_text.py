@@ -1,4 +1,4 @@
-"""Disturbances in words."""
+"""Descriptions of disturbances in words."""
 
 import jax.numpy as jnp
 import pytest
@@ -17,16 +17,16 @@ HOME = jnp.array([0.0, 0.0, 1.0])
         ("gusts", "changes all the time"),
     ],
 )
-def test_a_disturbance_states_its_effects(name, text):
+def test_text_states_effects(name, text):
     assert describe_disturbance(name, HOME, 30.0) == text
 
 
-def test_a_disturbance_that_changes_states_the_times():
+def test_text_states_times_of_changes():
     text = describe_disturbance("reversing", HOME, 60.0)
     assert text.startswith("pushed by +0.5 m/s² per axis, from 15.0 s pushed by -0.5 m/s² per axis")
     assert text.endswith(", and so on")
     assert "and so on" not in describe_disturbance("reversing", HOME, 20.0)
 
 
-def test_a_disturbance_that_begins_later_has_nothing_before():
+def test_text_states_later_start():
     assert describe_disturbance("step", HOME, 30.0).startswith("from ")

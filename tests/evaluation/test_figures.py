@@ -1,4 +1,4 @@
-"""Pictures of flights, and what they say of the disturbance."""
+"""Plots of flights, and their marks of the disturbance."""
 
 import dataclasses
 
@@ -16,14 +16,14 @@ from retrim.viz.panels import bars
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
-def test_a_picture_with_crashes_and_without_adapted_flights(tmp_path):
+def test_plot_with_crashes_and_without_adapted_flights(tmp_path):
     result = [flight(0.1), flight(3.0, terminated=True, seconds=1.0)]
     setup = picture(result, Setup.from_preset(tiny_preset()), result[0].spec.scenario, tmp_path)
     assert [path.name for path in setup] == ["hover_large.png", "hover_large.svg"]
     assert all(path.stat().st_size > 5_000 for path in setup)
 
 
-def test_a_picture_shows_the_flights_of_its_scenario_only(tmp_path):
+def test_plot_shows_only_flights_of_its_scenario(tmp_path):
     scenario = Scenario("wind=3+payload=0.1")
     swap = Event(3.0, "policy", "cost 1 against 2")
     adapted_policy = flight(0.02, spec=FlightSpec(scenario, "full", 0), events=[swap])
@@ -37,8 +37,8 @@ def test_a_picture_shows_the_flights_of_its_scenario_only(tmp_path):
     assert dataclasses.asdict(scenario)["disturbance"] in again[1].read_text()
 
 
-def test_a_picture_calls_methods_what_they_are(tmp_path):
-    """A controller that learns nothing is not called adapted."""
+def test_plot_labels_methods(tmp_path):
+    """A controller that learns nothing is not labelled as adapted."""
     scenario, setup = Scenario("large"), Setup.from_preset(tiny_preset())
     display = [flight(error, spec=FlightSpec(scenario, name, 0)) for name, error in (("base", 0.3), ("indi", 0.1))]
     text = picture(display, setup, scenario, tmp_path)[1].read_text()
@@ -51,7 +51,7 @@ def test_a_picture_calls_methods_what_they_are(tmp_path):
     assert _colours(["indi"]) == {"indi": 1}
 
 
-def test_what_a_person_did_is_marked_where_it_was_done(tmp_path):
+def test_manual_disturbances_are_marked_at_their_times(tmp_path):
     acts = [
         Event(2.0, "asked", "method lora $x_$"),
         Event(4.0, "knobs", "push 1 0 0"),
@@ -80,14 +80,14 @@ def test_spans_of_disturbances():
 
 
 @pytest.mark.parametrize("methods", [["base", "full", "lora"], ["full", "lora"], ["indi", "base", "base-do", "full"]])
-def test_bars_of_methods_have_colours_of_their_own(methods):
+def test_bars_of_methods_have_distinct_colours(methods):
     figure = bars("Error", {"none": {name: [0.1] for name in methods}, "large": {name: [np.inf] for name in methods}})
     pictures = [handle.patches[0].get_facecolor() for handle in figure.axes[0].containers]
     assert len(set(pictures)) == len(methods)
 
 
 @pytest.mark.parametrize("last", [np.nan, np.inf])
-def test_a_crash_into_nowhere_is_marked_where_the_vehicle_was_last_seen(tmp_path, last):
+def test_crash_is_marked_at_last_finite_position(tmp_path, last):
     scenario, setup = Scenario("large"), Setup.from_preset(tiny_preset())
     error = np.append(np.full(500, 0.5), last)
     display = [flight(error, spec=FlightSpec(scenario, "base", 0), terminated=True)]

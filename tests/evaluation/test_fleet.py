@@ -1,4 +1,4 @@
-"""Fleets: the same rows on any executor, progress, and what an interruption keeps."""
+"""Fleets: equal rows on any executor, progress, and finished flights after an interruption."""
 
 import dataclasses
 import multiprocessing
@@ -32,7 +32,7 @@ SCENARIOS = [Scenario("small", plant="simple"), Scenario("gusts", plant="simple"
 
 @pytest.fixture(scope="module")
 def fleet(as_a_user):
-    """Eight flights, too short to crash, of two policies that were never trained."""
+    """Return eight flights of two untrained policies, too short for a crash."""
     preset = brief_preset()
     setup = Setup.from_preset(preset)
     policies = {seed: setup.new_policy(jax.random.key(seed)) for seed in (0, 5)}
@@ -40,14 +40,14 @@ def fleet(as_a_user):
 
 
 def two_batches(fleet):
-    """Flights of two programs: of those that adapt, and of those whose world and measurements are random."""
+    """Return flights of two programs: adapting flights, and flights with random disturbances and measurements."""
     expected = {("small", "full"), ("gusts", "base")}
     return [spec for spec in fleet.specs if (spec.scenario.disturbance, spec.method) in expected]
 
 
 @pytest.fixture(scope="module")
 def programs(fleet):
-    """Programs that were compiled in the fleet's first flights, after its warm-up."""
+    """Return the programs that were compiled in the fleet's first flights, after its warm-up."""
     result = list[str]()
 
     def note(name, seconds, **about):
@@ -67,12 +67,12 @@ def flights(programs):
     return programs[0]
 
 
-def test_nothing_of_a_tick_is_compiled_after_the_warm_up(programs, fleet):
-    """What scores a flight may be; it is compiled once, after the first flights have landed."""
+def test_tick_is_not_compiled_after_warm_up(programs, fleet):
+    """The score of a flight is compiled once, after the first flights."""
     assert len(programs[1]) <= 3
 
 
-def test_every_combination_is_flown_once_and_in_order(fleet, flights):
+def test_every_combination_is_flown_once_in_order(fleet, flights):
     assert [flight.spec for flight in flights.flights] == fleet.specs
     assert len(set(fleet.specs)) == 8
     assert not flights.interrupted
@@ -86,7 +86,7 @@ def test_every_combination_is_flown_once_and_in_order(fleet, flights):
     assert all(flight.events == () for flight in flights.flights if flight.spec.method == "base")
 
 
-def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
+def test_one_thread_and_two_processes_give_same_flights(fleet, flights):
     with ThreadPoolExecutor(1) as pool:
         assert fleet.run(pool).rows() == flights.rows()
     context, part = multiprocessing.get_context("spawn"), [fleet.specs[5], fleet.specs[7]]
@@ -104,8 +104,8 @@ def test_one_thread_and_two_processes_fly_the_same(fleet, flights):
 
 @pytest.mark.parametrize("cores", [1, 2, 3, 8, 16, 64])
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 7, 8, 9, 24, 65])
-def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
-    """However many cores there are: Python steps a single flight, and that uses one of them."""
+def test_single_flight_does_not_get_its_own_lot(monkeypatch, n, cores):
+    """This holds for any number of cores: Python steps a single flight, and that uses one core."""
     monkeypatch.setattr(batching, "lanes", lambda: cores)
     group = [FlightSpec(Scenario("small"), "base", start) for start in range(n)]
     result = batching.in_batches([group], lambda specs: "program")
@@ -116,7 +116,7 @@ def test_no_flight_of_a_program_is_left_by_itself(monkeypatch, n, cores):
     assert [len(batch.specs) for batch in batching.in_batches([group], lambda specs: None)] == [1] * n
 
 
-def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_landed(monkeypatch):
+def test_other_lots_wait_for_compilation_not_for_landing(monkeypatch):
     preset = brief_preset()
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     fleet = Fleet(preset, policy, SCENARIOS[:1], methods=("base",), starts=4, seconds=2.0)
@@ -140,15 +140,15 @@ def test_other_lots_of_a_program_wait_until_it_is_compiled_not_until_it_has_land
     assert order[:2] == ["first", "other"]
 
 
-def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch):
-    """Two flights of a scenario and a method are one program; a third one is left for itself."""
+def test_lots_equal_single_flights_up_to_rounding(fleet, flights, monkeypatch):
+    """Two flights of a scenario and a method run as one program; a third one runs alone."""
     monkeypatch.setattr(batching, "CPU_LIMIT", 2)
     monkeypatch.setattr(batching, "lanes", lambda: 1)
     assert [len(batch.specs) for batch in fleet.make_batches(fleet.specs)] == [2, 2, 2, 2]
     assert [len(batch.specs) for batch in fleet.make_batches(fleet.specs[:3])] == [2, 1]
     assert [batch.compiles for batch in fleet.make_batches(fleet.specs)] == [
         True
-    ] * 4  # other disturbances: other programs
+    ] * 4  # different disturbances need different programs
     on_result, message = [], []
     together = fleet.run(
         only=two_batches(fleet), on_result=on_result.append, progress=lambda done, n: message.append(done)
@@ -165,7 +165,7 @@ def test_lots_fly_the_same_to_rounding_and_land_once(fleet, flights, monkeypatch
         assert (flight.learner_state is None) == (other.learner_state is None)
 
 
-def test_flights_that_are_forgotten_have_landed(fleet, flights, monkeypatch):
+def test_discarded_flights_have_finished(fleet, flights, monkeypatch):
     monkeypatch.setattr(batching, "CPU_LIMIT", 2)
     monkeypatch.setattr(batching, "lanes", lambda: 1)
     on_result = []
@@ -175,8 +175,8 @@ def test_flights_that_are_forgotten_have_landed(fleet, flights, monkeypatch):
     assert {flight.spec for flight in on_result} == set(two_batches(fleet))
 
 
-def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
-    """A vehicle that is pushed to the ground is cut off at the same tick as when it flies alone."""
+def test_lot_terminates_each_flight_at_its_tick(fleet):
+    """A vehicle that is pushed to the ground is terminated at the same tick as in a single flight."""
     scenario = Scenario("push=-8", plant="simple")
     down = Fleet(fleet.preset, fleet.policies, [scenario], methods=("base",), starts=2, seconds=2.0)
     with ThreadPoolExecutor(1) as pool:
@@ -188,14 +188,14 @@ def test_a_lot_ends_each_flight_where_it_is_terminated(fleet):
         assert len(flight.log.t) == len(other.log.t) == len(flight.error) == len(flight.log.u)
 
 
-def test_a_lot_with_an_odd_flight_is_flown_one_by_one(fleet, flights, monkeypatch):
-    """The first two of a lot look alike; all of them are looked at before they fly."""
+def test_lot_with_different_flight_is_flown_one_by_one(fleet, flights, monkeypatch):
+    """The first two of a lot are alike; all of them are compared before the flight."""
 
     look = []
 
     def alike(plants, pilots):
         look.append(len(plants))
-        return len(look) == 1  # when it is planned, not when it is flown
+        return len(look) == 1  # during planning, not during the flight
 
     monkeypatch.setattr(batching, "lanes", lambda: 1)
     monkeypatch.setattr(flying, "can_fly_together", alike)
@@ -208,7 +208,7 @@ def test_a_lot_with_an_odd_flight_is_flown_one_by_one(fleet, flights, monkeypatc
         np.testing.assert_array_equal(flight.log.p, alone[flight.spec].log.p)
 
 
-def test_progress_counts_the_flights_that_are_over(fleet):
+def test_progress_counts_finished_flights(fleet):
     message = []
     part = fleet.specs[:3]
     with ThreadPoolExecutor(1) as pool:
@@ -217,7 +217,7 @@ def test_progress_counts_the_flights_that_are_over(fleet):
     assert [flight.spec for flight in flight.flights] == part
 
 
-def test_progress_of_a_lot_is_told_before_it_lands(fleet, monkeypatch):
+def test_progress_of_lot_is_reported_in_flight(fleet, monkeypatch):
     monkeypatch.setattr(gathering, "OFTEN", 0.001)
     monkeypatch.setattr(batching, "lanes", lambda: 1)
     message = []
@@ -229,7 +229,7 @@ def test_progress_of_a_lot_is_told_before_it_lands(fleet, monkeypatch):
 
 
 @pytest.mark.parametrize("by", ["event", "ctrl-c"])
-def test_an_interruption_keeps_what_was_flown(fleet, by):
+def test_interruption_keeps_finished_flights(fleet, by):
     stop = threading.Event()
 
     def progress(done, n):
@@ -246,7 +246,7 @@ def test_an_interruption_keeps_what_was_flown(fleet, by):
     assert fleet.run(stop=stop).flights == []
 
 
-def test_a_plant_that_fails_ends_the_fleet(fleet, monkeypatch):
+def test_failing_plant_ends_fleet(fleet, monkeypatch):
     def break_policy(setup, policy, spec, *rest, **more):
         raise PlantError(f"no plant for {spec.method}")
 
@@ -268,14 +268,14 @@ def test_a_plant_that_fails_ends_the_fleet(fleet, monkeypatch):
         ({"seed": 2**32}, "seed 4294967296: must be 0 to"),
     ],
 )
-def test_a_fleet_that_cannot_fly_is_refused(fleet, change, message):
+def test_invalid_fleet_is_refused(fleet, change, message):
     policy = next(iter(fleet.policies.values()))
     scenarios, seed = change.pop("scenarios", SCENARIOS), change.pop("seed", 0)
     with pytest.raises(ConfigError, match=message):
         Fleet(load("hover/fast"), {seed: policy}, scenarios, **change)
 
 
-def test_a_process_builds_a_set_up_once_for_a_fleet():
+def test_process_builds_setup_once_per_fleet():
     text = dump(dataclasses.replace(tiny_preset(), name="once"))
     assert setup_for(text, None, "a") is setup_for(text, None, "a")
     assert setup_for(text, None, "a") is not setup_for(text, None, "b")
@@ -289,8 +289,8 @@ def test_a_process_builds_a_set_up_once_for_a_fleet():
         ((-4.99, 0.0, 0.0), r"^5\.\d\d m off, out of the task's bounds, at \(-5\.\d\d, 0\.00, 1\.00\) m$"),
     ],
 )
-def test_a_crash_says_why(fleet, off, why):
-    """As the last event of the flight, alone or in a lot."""
+def test_crash_event_states_cause(fleet, off, why):
+    """The cause is the last event of the flight, alone or in a lot."""
     setup, policy, spec = fleet.setups[None], fleet.policies[0], fleet.specs[0]
     x0 = State(jnp.array(fleet.preset.goal) + jnp.array(off), jnp.eye(3), 3.0 * jnp.array(off))
     alone = flying.fly_one(setup, policy, spec, x0, 0.4)
@@ -304,8 +304,8 @@ def test_a_crash_says_why(fleet, off, why):
         assert re.search(why, flight.events[-1].note)
 
 
-def test_what_was_learnt_before_reaches_every_flight(monkeypatch):
-    """Flown by itself, in a lot, or as a job elsewhere."""
+def test_every_flight_receives_initial_learner_state(monkeypatch):
+    """The flights run alone, in a lot, or as a remote job."""
     preset, message = brief_preset(), []
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(jax.random.key(0))

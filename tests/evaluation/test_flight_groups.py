@@ -1,4 +1,4 @@
-"""Flights of a table that was killed: stored, to the last bit, until the table is made."""
+"""Flights of an interrupted table are stored bit for bit until the table is complete."""
 
 import jax
 import numpy as np
@@ -26,7 +26,7 @@ def study():
 
 
 def fly_once(study, folder, *, methods=("base", "indi"), reporter=None, starts=2):
-    """Fly in a folder as a new run; return the flights, and how many groups were there before."""
+    """Fly in a folder as a new run; return the flights, and the number of stored groups before."""
     run = Run("test", folder)
     message = Silent() if reporter is None else reporter
     flights = fly_all(study, [CALM, PUSH], run, message, methods=methods, starts=starts, seconds=1.0)
@@ -34,7 +34,7 @@ def fly_once(study, folder, *, methods=("base", "indi"), reporter=None, starts=2
 
 
 def bits(flights):
-    """All that is in flights but what they learnt, arrays as bytes."""
+    """Return all data of flights except the learner states, with arrays as bytes."""
     parts = [(f.spec, f.vehicle, f.metric, f.steady_seconds, f.log, f.error, f.cross, f.target) for f in flights]
     return [leaf.tobytes() if isinstance(leaf, np.ndarray) else leaf for leaf in jax.tree.leaves(parts)]
 
@@ -44,7 +44,7 @@ def whole(study, tmp_path_factory):
     return fly_once(study, tmp_path_factory.mktemp("whole"))[0].flights
 
 
-def test_a_file_of_flights_is_the_flights(whole, tmp_path):
+def test_flights_survive_file(whole, tmp_path):
     specs, path = [flight.spec for flight in whole], tmp_path / "flights.npz"
     flight_codec(specs).write(path, whole)
     assert bits(flight_codec(specs).read(path)) == bits(whole)
@@ -52,7 +52,7 @@ def test_a_file_of_flights_is_the_flights(whole, tmp_path):
         flight_codec(specs[1:]).read(path)
 
 
-def test_an_interrupted_table_flies_what_is_left_and_is_the_same(study, whole, tmp_path):
+def test_interrupted_table_is_completed_and_equal(study, whole, tmp_path):
     stop = Run("test", tmp_path)
     watching = Watching(lambda share: share >= 0.5 and stop.stop.set())
     some = fly_all(study, [CALM, PUSH], stop, watching, methods=("base", "indi"), starts=2, seconds=1.0)
@@ -70,7 +70,7 @@ def test_an_interrupted_table_flies_what_is_left_and_is_the_same(study, whole, t
     assert bits(flights.flights) == bits(whole)
 
 
-def test_only_the_same_is_taken_and_nothing_once_it_is_forgotten(study, tmp_path, monkeypatch):
+def test_stored_flights_are_reused_only_for_same_study(study, tmp_path, monkeypatch):
     extract = lambda study=study, **how: fly_once(study, tmp_path, **how)[1]  # noqa: E731
     assert extract(methods=("base",)) == 0
     assert extract(methods=("indi", "base")) == 2

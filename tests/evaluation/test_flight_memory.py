@@ -31,7 +31,7 @@ def policy(setup):
 
 @pytest.fixture(scope="module")
 def state(setup, policy):
-    """A learner state whose map has one bump at the goal."""
+    """Return a learner state whose map has one bump at the goal."""
     fresh = setup.learner.init(policy, random.key(1))
     place_map, dtype = fresh.residual.map, fresh.residual.agreement.dtype
     weight, information = jnp.array([0.0, 0.0, -2.0]), 1000.0
@@ -49,7 +49,7 @@ def state(setup, policy):
 
 
 def flight(learner_state, terminated=False):
-    """A flight of two rows with a learner state at its end."""
+    """Return a flight of two rows with a learner state at its end."""
     states = States(np.zeros((2, 3)), np.stack([np.eye(3)] * 2), np.zeros((2, 3)))
     log = Log(np.array([0.0, 0.02]), states, states, np.zeros((2, 4)), 0.02, terminated)
     return Flight(
@@ -61,7 +61,7 @@ def at_goal(setup, state):
     return np.asarray(setup.learner.residual_model.at_place(state.residual, jnp.array(GOAL)))
 
 
-def test_the_next_flight_starts_with_the_map(tmp_path, setup, policy, state):
+def test_next_flight_starts_with_map(tmp_path, setup, policy, state):
     memory = FlightMemory(tmp_path / "hall", "small")
     assert memory.state(setup, policy, "full", 0) is None
     assert "no earlier flight" in memory.describe(setup)
@@ -75,7 +75,7 @@ def test_the_next_flight_starts_with_the_map(tmp_path, setup, policy, state):
 
 
 @pytest.mark.parametrize("method", ["full", "lora"])
-def test_the_state_has_the_shapes_of_a_new_one(tmp_path, setup, policy, state, method):
+def test_restored_state_has_shapes_of_fresh_state(tmp_path, setup, policy, state, method):
     memory = FlightMemory(tmp_path, "small")
     memory.write([flight(state)], setup, [])
     recalled = memory.state(setup, policy, method, 0)
@@ -88,7 +88,7 @@ def test_each_vehicle_has_its_own_memory(tmp_path, setup, policy, state):
     assert FlightMemory(tmp_path, "large").state(setup, policy, "full", 0) is None
 
 
-def test_a_map_without_evidence_remains_unused(setup, state):
+def test_map_without_evidence_is_unused(setup, state):
     model = setup.learner.residual_model
     doubtful = dataclasses.replace(state.residual, agreement=jnp.zeros_like(state.residual.agreement))
     assert float(model.recall(doubtful).share) == 0.0
@@ -101,21 +101,21 @@ def test_lost_flights_leave_no_memory(tmp_path, setup, state):
     assert "unchanged" in faults[0]
 
 
-def test_a_folder_that_cannot_be_written_is_a_fault_after_the_flight(tmp_path, setup, state):
+def test_unwritable_folder_is_reported_after_flight(tmp_path, setup, state):
     (tmp_path / "hall").touch()
     faults = []
     assert FlightMemory(tmp_path / "hall", "small").write([flight(state)], setup, faults) == []
     assert "cannot be written" in faults[0]
 
 
-def test_a_file_instead_of_a_folder_is_refused_before_the_flight(tmp_path, setup, policy):
+def test_file_instead_of_folder_is_refused_before_flight(tmp_path, setup, policy):
     (tmp_path / "hall").touch()
     with pytest.raises(ConfigError, match="must be a folder"):
         recall_flight(tmp_path / "hall", setup, Scenario(), policy, None, "full", 0, print)
 
 
 @pytest.mark.parametrize("factor", [100.0, -1e3])
-def test_a_map_with_impossible_accelerations_is_refused(tmp_path, setup, policy, state, factor):
+def test_map_with_impossible_accelerations_is_refused(tmp_path, setup, policy, state, factor):
     """The numbers are finite and the checksum is right."""
     place_map = state.residual.map
     changes = {"moment": 1e3 * place_map.moment} if factor > 0 else {"precision": factor * place_map.precision}
@@ -127,7 +127,7 @@ def test_a_map_with_impossible_accelerations_is_refused(tmp_path, setup, policy,
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-9], lambda data: b"MZ" + data[2:], lambda data: b""])
-def test_a_damaged_memory_is_refused_in_one_line(tmp_path, setup, policy, state, damage):
+def test_damaged_memory_is_refused_in_one_line(tmp_path, setup, policy, state, damage):
     memory = FlightMemory(tmp_path, "small")
     (file,) = memory.write([flight(state)], setup, [])
     file.write_bytes(damage(file.read_bytes()))
@@ -136,22 +136,22 @@ def test_a_damaged_memory_is_refused_in_one_line(tmp_path, setup, policy, state,
     assert "\n" not in str(error.value)
 
 
-def test_a_model_with_a_short_memory_is_refused(tmp_path, policy):
+def test_model_with_short_memory_is_refused(tmp_path, policy):
     setup = Setup.from_preset(tiny_preset(adapt={"residual": "regression"}))
     with pytest.raises(ConfigError, match="--residual place"):
         FlightMemory(tmp_path, "small").state(setup, policy, "full", 0)
 
 
-def test_a_method_that_does_not_learn_is_refused(tmp_path, setup, policy):
+def test_method_without_learning_is_refused(tmp_path, setup, policy):
     with pytest.raises(ConfigError, match="'base' does not"):
         FlightMemory(tmp_path, "small").state(setup, policy, "base", 0)
 
 
-def test_vehicles_whose_file_names_are_equal_do_not_share_a_map(tmp_path, setup, policy, state):
+def test_vehicles_with_equal_file_names_do_not_share_map(tmp_path, setup, policy, state):
     FlightMemory(tmp_path, "my quad").write([flight(state)], setup, [])
     with pytest.raises(CheckpointError, match="'my quad', expected 'my-quad'"):
         FlightMemory(tmp_path, "my-quad").state(setup, policy, "full", 0)
 
 
-def test_names_of_vehicles_cannot_leave_the_folder(tmp_path, setup):
+def test_vehicle_names_cannot_leave_folder(tmp_path, setup):
     assert FlightMemory(tmp_path, "../../other").path(setup).parent == tmp_path

@@ -1,4 +1,4 @@
-"""Tables of flights: the error at the end, the worst moment and the settling time, in millimetres."""
+"""Tables of flights: the final error, the worst moment and the settling time, in millimetres."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_two_methods_with_small_errors_differ():
     assert (small, smaller) == ("0.010", "0.005")
 
 
-def test_the_worst_moment_and_the_settling_time_stand_beside_the_error():
+def test_table_has_worst_moment_and_settling_time():
     error = np.full(501, 0.001)
     error[:100], error[300] = 0.5, 0.03  # 2 s to the goal, and a push at 6 s
     assert figure_cells(rows([flight(error)])[0]) == ("1.0", "30.0", "2.0")
@@ -39,7 +39,7 @@ def test_the_worst_moment_and_the_settling_time_stand_beside_the_error():
     assert crashes == ("crashed, 1 of 1", "-", "-")
 
 
-def test_the_columns_state_the_time_of_the_worst_moment():
+def test_columns_state_time_of_worst_moment():
     assert figure_columns()[1] == figure_columns(30.0)[1] == "worst after 5 s [mm]"
     assert figure_columns(3.0)[1] == "worst after 1.5 s [mm]"
     assert figure_columns()[2] == "below 50 mm from [s]"

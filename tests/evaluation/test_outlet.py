@@ -1,4 +1,4 @@
-"""What cannot be written where it should be is written elsewhere, and is told."""
+"""A file that cannot be written to its folder is written to a different folder, with a message."""
 
 import errno
 import os
@@ -18,14 +18,14 @@ def outlet(tmp_path):
     return setup
 
 
-def test_what_can_be_written_is_where_it_should_be(outlet):
+def test_writable_file_is_in_its_folder(outlet):
     assert outlet.write("a file", lambda folder: write_whole(folder / "a", "1")) is None
     assert (outlet.folder / "a").read_text() == "1"
     assert outlet.faults == []
     assert not any(folder.exists() for folder in outlet.spare)
 
 
-def test_a_full_disk_loses_nothing_and_each_file_is_told_with_its_folder(outlet):
+def test_full_disk_writes_to_other_folder_with_message(outlet):
     def put(folder):
         if folder.name != "spare":
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -40,7 +40,7 @@ def test_a_full_disk_loses_nothing_and_each_file_is_told_with_its_folder(outlet)
     assert os.stat(outlet.spare[1]).st_mode & 0o077 == 0
 
 
-def test_what_can_be_written_nowhere_is_told_and_does_not_end_the_rest(outlet):
+def test_unwritable_file_is_reported_and_others_are_written(outlet):
     def put(folder):
         raise OSError(errno.EIO, "Input/output error")
 
@@ -50,7 +50,7 @@ def test_what_can_be_written_nowhere_is_told_and_does_not_end_the_rest(outlet):
     ]
 
 
-def test_results_in_a_temporary_folder_tell_why_they_are_there(outlet):
+def test_results_in_temporary_folder_state_reason(outlet):
     run = Run("fly", outlet.folder)
     outlet.folder.parent.mkdir(exist_ok=True)
     outlet.folder.write_text("a file of that name")
@@ -62,7 +62,7 @@ def test_results_in_a_temporary_folder_tell_why_they_are_there(outlet):
         Run("fly", outlet.folder)
 
 
-def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+def test_full_disk_error_names_file(tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -1,4 +1,4 @@
-"""Files that a run leaves of its flights: events, logs, and what the first whole one learnt."""
+"""Files that a run writes: events, logs, and the learner state of the first complete flight."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ def weights(policy):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(policy.params)]
 
 
-def test_events_are_lines_that_tell_their_flight(tmp_path):
+def test_event_lines_identify_flight(tmp_path):
     flights = [
         flight(0.1, spec=spec, events=[Event(1.23456789, "policy", f"note {k}"), Event(2.0, "skipped", "")])
         for k, spec in enumerate(SPECS)
@@ -49,8 +49,10 @@ def test_events_are_lines_that_tell_their_flight(tmp_path):
     assert (rows[2]["t"], rows[2]["note"]) == (1.234568, "note 1")
 
 
-def test_a_recording_shows_the_command_that_followed_a_measurement(tmp_path):
-    """Row i of a log has the command of the tick that ended there; a recording has that which began there."""
+def test_recording_pairs_measurement_with_next_command(tmp_path):
+    """Row i of a log has the command of the tick that ended there; a recording has the command of the tick that began
+    there.
+    """
     t = DT * np.arange(6)
     trajectory = log(t=t)
     u = np.arange(24.0).reshape(6, 4)
@@ -68,8 +70,8 @@ def test_a_recording_shows_the_command_that_followed_a_measurement(tmp_path):
     assert result.terminated
 
 
-def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
-    """Not of one that crashed, nor of one that does not learn; a low-rank policy leaves its delta."""
+def test_learner_state_of_first_complete_flight_is_saved(setup, tmp_path):
+    """Flights that crashed or do not learn are excluded; a low-rank policy also saves its delta."""
     states = [make_learner_state(setup, seed) for seed in range(4)]
     brief = partial(flight, 0.1, seconds=0.2)
     flights = [
@@ -100,13 +102,13 @@ def test_what_the_first_whole_flight_learnt_is_kept(setup, tmp_path):
     ]
     assert [path.name for path in (tmp_path / "logs").glob("*.npz")] == [
         "full_seed4_start1.npz"
-    ]  # none of earlier ones
+    ]  # no files of earlier runs
     outputs.write_flights(flights[:1], setup.preset, tmp_path)
     assert not list(tmp_path.glob("*.safetensors"))
     assert (tmp_path / "events.jsonl").read_text() == ""
 
 
-def test_a_trained_policy_is_written_with_its_results(setup, tmp_path):
+def test_trained_policy_is_written_with_results(setup, tmp_path):
     policy = setup.new_policy(jax.random.key(7))
     for error, more in ((None, {}), (0.25, {"nominal_error_m": 0.25})):
         path = outputs.write_trained_policy(
@@ -122,8 +124,8 @@ def test_a_trained_policy_is_written_with_its_results(setup, tmp_path):
     np.testing.assert_array_equal(weights(loaded_policy)[0], weights(policy)[0])
 
 
-def test_notes_tell_crashes_and_that_nothing_took_effect(setup):
-    """With the time at which the first update could have."""
+def test_notes_report_crashes_and_missing_updates(setup):
+    """The note states the earliest possible time of an update."""
     last = Event(3.0, "terminated", "below -0.5 m")
     crashes = flight(3.0, spec=SPECS[1], terminated=True, seconds=3.0, events=[last])
     assert notes([flight(0.1), crashes], setup.preset) == ["crashed: base, start 1, after 3.00 s: below -0.5 m"]
@@ -135,7 +137,7 @@ def test_notes_tell_crashes_and_that_nothing_took_effect(setup):
     assert notes([dataclasses.replace(swap, learner_state=idle.learner_state), idle], setup.preset) == []
 
 
-def test_a_flight_whose_job_failed_is_counted_and_says_nothing_of_the_method():
+def test_failed_job_is_counted_and_not_scored():
     gap = failed_record(SPECS[0], "small", "steady_error_m", "OSError: gone")
     assert (gap["method"], gap["start"], gap["seed"], gap["vehicle"]) == ("base", 0, 4, "small")
     assert (gap["crashed"], gap["failed"], gap["error"]) == (False, "OSError: gone", None)

@@ -1,4 +1,4 @@
-"""A run trains each policy once; what it has trained can be flown."""
+"""A run trains each policy once; finished policies can be flown."""
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from retrim.runkit.training import TrainingResult
 
 @pytest.fixture
 def requests(monkeypatch):
-    """What was trained, in place of training it: preset and seed."""
+    """Return the list of (preset, seed) for which training was requested; no training takes place."""
     result = []
 
     def train(setup, seed, *, reporter, stop):
@@ -27,18 +27,18 @@ def requests(monkeypatch):
     return result
 
 
-def same(one, other):
+def assert_identical(one, other):
     return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
 
 
-def test_a_policy_is_trained_once_for_a_folder(tmp_path, requests, monkeypatch):
+def test_policy_is_trained_once_per_folder(tmp_path, requests, monkeypatch):
     preset = tiny_preset()
     first = train_policies(preset, (3, 0), Run("test", tmp_path / "a", policy_folder=tmp_path), Silent())
     again = train_policies(preset, (0, 1, 3), Run("test", tmp_path / "b", policy_folder=tmp_path), Silent())
     assert (list(first), list(again)) == ([3, 0], [0, 1, 3])
     assert requests == [(preset.name, seed) for seed in (3, 0, 1)]
-    assert all(same(first[seed], again[seed]) for seed in first)
-    assert not same(again[0], again[1])
+    assert all(assert_identical(first[seed], again[seed]) for seed in first)
+    assert not assert_identical(again[0], again[1])
     train_policies(tiny_preset(pretrain={"learning_rate": 0.5}), (0,), Run("test", tmp_path), Silent())
     monkeypatch.setattr(provenance, "code", lambda: "changed")
     train_policies(preset, (0,), Run("test", tmp_path), Silent())
@@ -46,22 +46,22 @@ def test_a_policy_is_trained_once_for_a_folder(tmp_path, requests, monkeypatch):
     assert len(list((tmp_path / "policies").glob("*-seed0.safetensors"))) == 3
 
 
-def test_what_is_kept_is_flown_with_its_preset_and_what_is_damaged_is_trained_again(tmp_path, requests):
+def test_stored_policy_keeps_preset_and_damaged_one_is_retrained(tmp_path, requests):
     preset, run, reporter, text = tiny_preset(), Run("test", tmp_path), Silent(), []
     reporter.say = text.append
     trained_policies = train_policies(preset, (0,), run, reporter)
     (path,) = (tmp_path / "policies").iterdir()
     policy, flight = load_policy(path)
     assert flight == preset
-    assert same(policy, trained_policies[0])
+    assert assert_identical(policy, trained_policies[0])
     path.write_bytes(path.read_bytes()[:-40])
-    assert same(train_policies(preset, (0,), run, reporter)[0], policy)
-    assert same(load_policy(path)[0], policy)
+    assert assert_identical(train_policies(preset, (0,), run, reporter)[0], policy)
+    assert assert_identical(load_policy(path)[0], policy)
     assert len(requests) == 2
     assert sum("made again" in line for line in text) == 1
 
 
-def test_an_interruption_keeps_what_was_complete(tmp_path, requests, monkeypatch):
+def test_interruption_keeps_finished_policies(tmp_path, requests, monkeypatch):
     preset, run, whole = tiny_preset(), Run("test", tmp_path), policies.train
 
     def stop_run(setup, seed, *, reporter, stop):

@@ -1,4 +1,4 @@
-"""What a results file says of the command that made it, and of its time."""
+"""Provenance in a results file: the command and its duration."""
 
 import importlib.metadata
 import json
@@ -28,30 +28,31 @@ from retrim.runkit.stopwatch import Stopwatch
         ("demo --out", "demo"),
     ],
 )
-def test_no_place_on_this_machine_is_recorded(words, rest, tmp_path):
+def test_no_local_path_is_recorded(words, rest, tmp_path):
     assert command_line(words.format(here=tmp_path).split()) == f"retrim {rest}"
 
 
-def test_a_shell_reads_the_same_words():
+def test_command_line_survives_shell():
     words = ["reproduce", "where_learning_pays", "--columns", "geometric + I", "INDI, wrong by two"]
     assert shlex.split(command_line(words)) == ["retrim", *words]
 
 
-def test_versions_are_those_of_what_is_installed():
+def test_versions_are_installed_versions():
     result = versions()
     assert {"retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python"} <= result.keys()
     for name in result.keys() - {"python"}:
         assert importlib.metadata.version(name) == result[name]
 
 
-def test_programs_traced_inside_others_count_once():
+def test_nested_compilations_count_once():
     watch = Stopwatch()
-    for start, end in ((1.0, 2.0), (1.5, 2.5), (4.0, 4.5), (3.5, 5.0), (7.0, 8.0)):  # by their ends, as they come
+    # sorted by their ends, as they arrive
+    for start, end in ((1.0, 2.0), (1.5, 2.5), (4.0, 4.5), (3.5, 5.0), (7.0, 8.0)):
         watch.compiled(start, end)
     assert watch.compile_s == pytest.approx(1.5 + 1.5 + 1.0)
 
 
-def test_a_run_leaves_no_folder_until_it_writes(tmp_path, monkeypatch):
+def test_run_creates_folder_at_first_write(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["retrim", "demo", "--out", str(tmp_path)])
     run = Run("demo", tmp_path / "a" / "b")
     assert not list(tmp_path.iterdir())
@@ -74,7 +75,7 @@ def test_a_run_leaves_no_folder_until_it_writes(tmp_path, monkeypatch):
     assert not list(folder.iterdir())
 
 
-def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
+def test_ctrl_c_is_deferred_until_allowed(tmp_path):
     run = Run("demo", tmp_path / "never")
     with run.interruptible():
         raise KeyboardInterrupt
@@ -90,7 +91,7 @@ def test_ctrl_c_is_remembered_and_raises_where_it_may(tmp_path):
         signal.raise_signal(signal.SIGINT)
 
 
-def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
+def test_commit_of_checkout_states_local_changes(monkeypatch):
     status = "status --porcelain -- :/src :/pyproject.toml"
     text = {"rev-parse --short=12 HEAD": "abc", status: ""}
 
@@ -107,7 +108,7 @@ def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
     text[status] = " M file"
     assert calls() == "abc-dirty"
     text["elsewhere"] = ""
-    assert calls() == "unknown"  # a checkout of something else around an installed package
+    assert calls() == "unknown"  # an unrelated checkout around an installed package
 
     def nothing(*_, **__):
         raise FileNotFoundError("git")
@@ -116,8 +117,8 @@ def test_a_commit_is_that_of_the_checkout_and_tells_local_changes(monkeypatch):
     assert calls() == "unknown"
 
 
-def test_code_is_told_apart_wherever_it_lies(tmp_path, monkeypatch):
-    """By what is in its files and by their names, not by a version, a commit, or what Python left beside them."""
+def test_code_digest_depends_on_files_only(tmp_path, monkeypatch):
+    """The digest depends on names and contents of files, not on a version, a commit, or Python's cache files."""
     here = tmp_path / "retrim" / "runkit"
     here.mkdir(parents=True)
     monkeypatch.setattr(provenance, "__file__", str(here / "provenance.py"))
@@ -137,7 +138,7 @@ def test_code_is_told_apart_wherever_it_lies(tmp_path, monkeypatch):
     assert len(result | {code()}) == 4
 
 
-def test_a_page_says_what_it_was_made_by(monkeypatch):
+def test_page_states_its_command(monkeypatch):
     monkeypatch.setattr(provenance, "commit", lambda: "abc-dirty")
     assert provenance.describe_code() == "Commit abc-dirty"
     monkeypatch.setattr(provenance, "commit", lambda: "unknown")

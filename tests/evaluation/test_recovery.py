@@ -1,4 +1,4 @@
-"""When the world changes, and how soon a flight has recovered."""
+"""Times of changes in the conditions, and recovery times of flights."""
 
 import json
 
@@ -35,12 +35,12 @@ def find(error, changes, limit, **more):
         ("battery", 30.0, []),
     ],
 )
-def test_changes_of_the_world(name, seconds, expected):
+def test_times_of_changes(name, seconds, expected):
     np.testing.assert_allclose(change_times(name, HOME, seconds), expected)
 
 
-def test_recovery_is_from_the_last_time_outside():
-    """Outside until 1 s, and once more at 1.5 s; then a change at 2 s that lasts for half a second."""
+def test_recovery_starts_at_last_excess():
+    """The error exceeds the limit until 1 s and again at 1.5 s; then a change at 2 s lasts for half a second."""
     error = np.zeros(200)
     error[:50] = error[75] = error[100:125] = 0.1
     np.testing.assert_allclose(find(error, [0.0, 2.0], 0.05), [1.52, 0.5])
@@ -48,13 +48,13 @@ def test_recovery_is_from_the_last_time_outside():
     np.testing.assert_allclose(find(error, [], 0.05), [2.5])
 
 
-def test_who_stays_outside_or_crashes_has_not_recovered():
+def test_crash_or_lasting_excess_is_not_recovery():
     assert find(np.full(100, 0.1), [0.0, 1.0], 0.05) == [np.inf, np.inf]
     assert find(np.zeros(100), [0.5], 0.05, terminated=True) == [np.inf]
-    assert find(np.zeros(10), [5.0], 0.05) == [np.inf]  # the flight ended before
+    assert find(np.zeros(10), [5.0], 0.05) == [np.inf]  # the flight ended earlier
 
 
-def test_the_gauntlet_by_its_command(tmp_path, as_a_user, monkeypatch):
+def test_gauntlet_by_its_command(tmp_path, as_a_user, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", brief_preset())
     words = "--only", "wind/simple", "wind/mujoco", "--methods", "base", "full", "--starts", "1", "--seconds", "6"
     out = retrim("gauntlet", *words, "--out", "g", cwd=tmp_path)

@@ -1,4 +1,4 @@
-"""A store: a value is made once for its key; a file that is damaged or foreign is refused, and the value made again."""
+"""A store computes a value once per key; a damaged or foreign file is refused, and the value is computed again."""
 
 import json
 import pickle
@@ -34,7 +34,7 @@ OTHERS = {
 
 
 def leaves(value):
-    """Contents of a value, with arrays and keys as bytes."""
+    """Return the contents of a value, with arrays and keys as bytes."""
     if isinstance(value, TableSection):
         return value
     if isinstance(value, tuple | list) and any(isinstance(each, TableSection) for each in value):
@@ -51,7 +51,7 @@ def leaves(value):
 
 @pytest.fixture
 def case(request, tmp_path):
-    """A codec and a value of each kind."""
+    """Return a codec and a value of each kind."""
     picture = tmp_path / "x.png"
     picture.write_bytes(b"drawn")
     preset = tiny_preset()
@@ -76,7 +76,7 @@ every_kind = pytest.mark.parametrize("case", list(OTHERS), indirect=True)
 
 
 @every_kind
-def test_a_value_is_made_once_and_is_the_same_to_the_bit(case, tmp_path):
+def test_value_is_computed_once_and_restored_exactly(case, tmp_path):
     codec, value = case
     store, text = store_in(tmp_path / "store")
     first = store.get_or_make("folder/key", lambda: value, codec)
@@ -90,13 +90,13 @@ def test_a_value_is_made_once_and_is_the_same_to_the_bit(case, tmp_path):
     assert store.get("folder/key", codec) is None
 
 
-class Executed:
+class RunsOnLoad:
     def __reduce__(self):
         return (pytest.fail, ("a file was executed",))
 
 
 @every_kind
-def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_made_again(case, tmp_path, request):
+def test_damaged_or_foreign_file_is_refused_and_replaced(case, tmp_path, request):
     codec, value = case
     store, text = store_in(tmp_path / "store")
     store.put("key", value, codec)
@@ -104,9 +104,9 @@ def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_made_again(case, t
     whole = path.read_bytes()
     middle = len(whole) // 2
     npz = tmp_path / "objects.npz"
-    np.savez(npz, about=np.array([Executed()], dtype=object))
+    np.savez(npz, about=np.array([RunsOnLoad()], dtype=object))
     flipped = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
-    for data in (whole[:-9], whole[:40], b"", flipped, pickle.dumps(Executed()), npz.read_bytes(), b"\xff\xfe{}\n"):
+    for data in (whole[:-9], whole[:40], b"", flipped, pickle.dumps(RunsOnLoad()), npz.read_bytes(), b"\xff\xfe{}\n"):
         path.write_bytes(data)
         text.clear()
         assert leaves(store.get_or_make("key", lambda: value, codec)) == leaves(value)
@@ -123,7 +123,7 @@ def test_a_damaged_or_foreign_file_is_refused_in_one_line_and_made_again(case, t
     assert len(text) == 1
 
 
-def test_a_section_is_made_again_if_its_picture_is_another(tmp_path):
+def test_section_is_recomputed_if_its_plot_changed(tmp_path):
     picture, codec = tmp_path / "x.png", section_codec(tmp_path)
     picture.write_bytes(b"drawn")
     store, text = store_in(tmp_path)
@@ -136,7 +136,7 @@ def test_a_section_is_made_again_if_its_picture_is_another(tmp_path):
     assert len(text) == 2
 
 
-def test_what_a_stop_leaves_incomplete_is_returned_but_not_stored(tmp_path):
+def test_incomplete_value_is_returned_but_not_stored(tmp_path):
     stop, called = threading.Event(), []
     store, _ = store_in(tmp_path, stop)
     codec = json_codec("note")
@@ -155,7 +155,7 @@ def test_what_a_stop_leaves_incomplete_is_returned_but_not_stored(tmp_path):
     assert called == ["stored", "reused"]
 
 
-def test_a_folder_of_an_earlier_version_is_no_obstacle(tmp_path):
+def test_files_of_earlier_versions_are_tolerated(tmp_path):
     """Files with other names stay; a file with the name of a key is refused."""
     for name in ("sections/0123456789abcdef.json", "sections/0123456789abcdef.done", "sections/flights/k.npz"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -169,7 +169,7 @@ def test_a_folder_of_an_earlier_version_is_no_obstacle(tmp_path):
                                                                          "0123456789abcdef.done"}  # fmt: skip
 
 
-def test_rows_are_lines_for_other_programs_and_a_torn_line_leaves_the_others(tmp_path):
+def test_rows_are_json_lines_and_incomplete_line_is_skipped(tmp_path):
     store, _ = store_in(tmp_path)
     rows = [{"key": "a", "error": 0.1}, {"key": "b", "error": None}]
     store.put("flights", rows, rows_codec())

@@ -1,4 +1,4 @@
-"""Sweeps: a killed one goes on to the rows of one that ran through."""
+"""A killed sweep continues to the same rows as an uninterrupted one."""
 
 import json
 import signal
@@ -33,7 +33,7 @@ seconds = 1.2
     + OVERLAY
 )
 COMBINATIONS = [(name, method) for name in ("none", "wind=3") for method in ("base", "indi")]
-# A power cut right after the first flight was kept.
+# A power cut right after the first flight was stored.
 KILLED = """
 import os, signal
 from retrim.evaluation.sweep import _FlightRows
@@ -44,7 +44,7 @@ _FlightRows.add = lambda self, rows: add(self, rows) or os.kill(os.getpid(), sig
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, as_a_user):
-    """A folder with a sweep of two seeds, two disturbances and two methods that ran through."""
+    """Return a folder with a finished sweep of two seeds, two disturbances and two methods."""
     here = tmp_path_factory.mktemp("user")
     (here / "sweep.toml").write_text(SWEEP)
     retrim("sweep", "sweep.toml", "--out", "whole", cwd=here)
@@ -56,7 +56,7 @@ def fly_once(folder):
     return path.read_text().splitlines() if path.exists() else []
 
 
-def test_a_sweep_leaves_a_table_json_a_picture_policies_and_rows(folder):
+def test_sweep_writes_table_json_plot_policies_and_rows(folder):
     result = results(folder / "whole", "sweep.json")
     assert [(row["disturbance"], row["method"], row["n"]) for row in result["rows"]] == [
         (*each, 2) for each in COMBINATIONS
@@ -73,7 +73,7 @@ def test_a_sweep_leaves_a_table_json_a_picture_policies_and_rows(folder):
     assert len(fly_once(folder / "whole")) == 8
 
 
-def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
+def test_killed_sweep_continues_to_same_rows(folder):
     process = start_process(("sweep", "sweep.toml", "--out", "cut"), folder, KILLED)
     out, _ = process.communicate(timeout=180)
     rows_so_far = fly_once(folder / "cut")
@@ -89,11 +89,11 @@ def test_a_killed_sweep_goes_on_to_the_same_rows(folder):
     assert {path: path.stat().st_mtime_ns for path in (folder / "cut" / "policies").iterdir()} == policies
     assert results(folder / "cut", "sweep.json")["rows"] == results(folder / "whole", "sweep.json")["rows"]
     again = fly_once(folder / "cut")
-    assert again[: len(rows_so_far)] == rows_so_far  # not flown twice
+    assert again[: len(rows_so_far)] == rows_so_far  # not repeated
     assert sorted(again) == sorted(fly_once(folder / "whole"))
 
 
-def test_a_sweep_that_is_done_flies_nothing_and_a_smaller_one_reports_its_own_flights(folder):
+def test_finished_sweep_flies_nothing_and_smaller_one_reports_its_flights(folder):
     before = results(folder / "whole", "sweep.json")["rows"]
     out = retrim("sweep", "sweep.toml", "--out", "whole", cwd=folder)
     assert "flying" not in out
@@ -111,8 +111,8 @@ def test_a_sweep_that_is_done_flies_nothing_and_a_smaller_one_reports_its_own_fl
     assert result[0]["mean"] == pytest.approx(mine)
 
 
-def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_path, monkeypatch):
-    """Those of other code, or of a file that has changed since, are made again."""
+def test_changed_code_or_files_repeat_training_and_flights(tmp_path, monkeypatch):
+    """Policies and flights of different code, or of a file that has changed since, are not reused."""
     monkeypatch.chdir(tmp_path)
     overlay = tomllib.loads(OVERLAY)["overlay"]
     calls = Sweep(methods=("indi",), disturbances=("none",), plants=("simple",), seconds=1.0, overlay=overlay)
@@ -137,7 +137,7 @@ def test_policies_and_flights_are_of_the_code_and_the_files_that_made_them(tmp_p
     assert fly() == (1, 3)
 
 
-def test_a_vehicle_file_is_looked_up_beside_that_of_the_sweep(tmp_path):
+def test_vehicle_file_is_relative_to_sweep_file(tmp_path):
     studies = tmp_path / "studies"
     studies.mkdir()
     text = (Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml").read_text()
@@ -151,15 +151,15 @@ def test_a_vehicle_file_is_looked_up_beside_that_of_the_sweep(tmp_path):
         read_sweep(studies / "s.toml")
 
 
-def test_a_sweep_is_every_combination():
+def test_sweep_contains_every_combination():
     sweep = Sweep(disturbances=("none", "wind"), plants=("bem", "simple"), sensors=("ideal", "mocap"))
     result = sweep.scenarios()
     assert len(set(result)) == 8
     assert Scenario("wind", "simple", None, "mocap") in result
 
 
-def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_path, monkeypatch):
-    """Crashes are infinite in the bars and counted in the cells; a flight that failed elsewhere is in no bar."""
+def test_report_has_row_per_combination_and_bar_per_flight(tmp_path, monkeypatch):
+    """Crashes are infinite in the bars and counted in the cells; a flight that failed remotely has no bar."""
     display = []
 
     def draw(title, groups):
@@ -175,7 +175,7 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
                 spec = FlightSpec(scenario, method, k % 2, k // 2)
                 crashes = method == "base" and error is None
                 row = record(flight(0.1 if error is None else error, spec=spec, terminated=crashes))
-                row |= {"error": error}  # a mean is one to rounding
+                row |= {"error": error}  # a mean is equal to one up to rounding
                 if method == "indi" and error is None:
                     row |= {"failed": "OSError: gone"}
                 rest.append({"preset": "p", **row})
@@ -199,11 +199,11 @@ def test_a_report_has_a_row_for_each_combination_and_bars_for_each_flight(tmp_pa
     run.reused = 3
     sweep._report(calls, one, run, Silent())
     assert "An earlier run had made 3 of the parts" in (tmp_path / "sweep.md").read_text()
-    assert list(display[1]) == ["large"]  # where nothing varies, the disturbance is the label
+    assert list(display[1]) == ["large"]  # if nothing varies, the disturbance is the label
 
 
-def test_what_failed_elsewhere_is_kept_and_flown_again(tmp_path, monkeypatch):
-    """The others of a sweep land; the run's exit code says that some did not."""
+def test_failed_remote_flights_are_recorded_and_repeated(tmp_path, monkeypatch):
+    """The other flights of a sweep finish, and the exit code reports the failure."""
     preset, text = brief_preset(), []
     policies = {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}
     fleet = Fleet(preset, policies, [Scenario(plant="simple")], methods=("base",), starts=2, seconds=1.2)

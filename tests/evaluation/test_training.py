@@ -1,4 +1,4 @@
-"""Training with progress, here and elsewhere, and the error of a policy in its own model."""
+"""Training with progress, local and remote, and the error of a policy in its own model."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -26,7 +26,7 @@ def setup(as_a_user):
     return Setup.from_preset(brief_preset(pretrain={"num_updates": 30}))
 
 
-def test_progress_is_told_by_chunks_and_a_stop_keeps_what_was_reached(setup):
+def test_progress_is_reported_and_stop_keeps_last_state(setup):
     reporter = Watching()
     whole = training.train(setup, 4, reporter=reporter)
     assert {title for title, *_ in reporter.messages} == {"pretraining, 30 x 2 x 20"}
@@ -49,7 +49,7 @@ def test_progress_is_told_by_chunks_and_a_stop_keeps_what_was_reached(setup):
     assert cut.losses == part.losses
 
 
-def test_the_error_in_the_own_model_is_that_of_the_last_half_second_of_six(setup):
+def test_model_error_is_over_last_half_second_of_six(setup):
     policy, n = setup.new_policy(jax.random.key(0)), 3
     env = training._long(setup).env
     assert env.task.horizon == 300
@@ -61,17 +61,15 @@ def test_the_error_in_the_own_model_is_that_of_the_last_half_second_of_six(setup
     assert result != training.nominal_error(setup, policy, n=n, seed=8)
     nothing = setup.learner.init(policy, jax.random.key(1)).residual
     residual = training.FittedResidual(setup.learner.residual_model, nothing)
-    assert training.model_error(setup, policy, residual, n=n, seed=7) == pytest.approx(
-        result, rel=1e-4
-    )  # nothing is learnt
+    assert training.model_error(setup, policy, residual, n=n, seed=7) == pytest.approx(result, rel=1e-4)  # no learning
 
 
-def test_seeds_are_trained_elsewhere_at_once_and_come_back_in_order(setup, monkeypatch):
+def test_remote_training_is_parallel_and_ordered(setup, monkeypatch):
     calls, on_result, gate = [], [], threading.Barrier(2)
 
     def job(preset, seed):
         calls.append((preset, seed))
-        gate.wait(20.0)  # both are at work
+        gate.wait(20.0)  # both run at the same time
         return setup.new_policy(jax.random.key(seed))
 
     monkeypatch.setattr(training, "train_job", job)
@@ -88,7 +86,7 @@ def test_seeds_are_trained_elsewhere_at_once_and_come_back_in_order(setup, monke
     assert reporter.messages[-1][1:] == (1.0, "2 of 2 seeds")
 
 
-def test_a_training_that_fails_elsewhere_is_told_once_the_others_have_come(setup, monkeypatch):
+def test_failed_remote_training_is_reported_after_others(setup, monkeypatch):
     on_result, stop = [], threading.Event()
 
     def job(preset, seed):
@@ -114,7 +112,7 @@ def test_a_training_that_fails_elsewhere_is_told_once_the_others_have_come(setup
         assert training.train_elsewhere(setup.preset, (0,), pool, reporter=Silent(), stop=stop) == {}
 
 
-def test_a_job_trains_what_it_is_told(setup, monkeypatch):
+def test_job_trains_its_preset_and_seed(setup, monkeypatch):
     calls = []
 
     def train(setup, seed):
@@ -128,7 +126,7 @@ def test_a_job_trains_what_it_is_told(setup, monkeypatch):
 
 
 @pytest.mark.parametrize(("z", "warned"), [(1.0, False), (0.0, False), (-1.5, True)])
-def test_a_goal_below_the_ground_is_reported(z, warned):
+def test_goal_below_ground_is_reported(z, warned):
     setup = Setup.from_preset(changed(tiny_preset(), goal=(0.0, 0.0, z)))
     assert (training.ground_warning(setup) is not None) == warned
     if warned:
