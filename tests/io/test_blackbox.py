@@ -1,4 +1,4 @@
-"""Blackbox logs of several firmware versions, whole and damaged: each is read exactly, or refused with one line."""
+"""Blackbox logs of several firmware versions, intact and damaged: each is read exactly, or refused with one line."""
 
 import contextlib
 from importlib.resources import files
@@ -40,8 +40,8 @@ def read(tmp_path, data, name="flight.bbl", **calls):
     return log
 
 
-def is_the_flight(log, flight=FLIGHT):
-    """Rates to the rounding of a degree per second, and motors to that of DSHOT, tick by tick."""
+def assert_is_flight(log, flight=FLIGHT):
+    """Assert equality tick by tick: rates within a degree per second, and motors within the resolution of DSHOT."""
     n = len(log.t)
     assert log.dt == pytest.approx(0.001 * EVERY)
     np.testing.assert_allclose(log.command[:n], flight.command[:n], atol=0.009)
@@ -51,8 +51,8 @@ def is_the_flight(log, flight=FLIGHT):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_every_number_of_every_code_is_read(version):
-    """Frames with differences have the numbers of the writer, to the last bit."""
+def test_every_number_of_every_encoding_is_read(version):
+    """Decoded frames with differences equal the numbers of the writer exactly."""
     data = blackbox(FLIGHT, version)
     header = read_header(Path("log"), data, 0)
     frames = FrameDecoder(data, header, len(data)).decode(header.names)
@@ -64,7 +64,7 @@ def test_every_number_of_every_code_is_read(version):
 
 
 @pytest.mark.parametrize("code", sorted(fake_blackbox.CODES))
-def test_a_code_is_the_inverse_of_its_writer(code):
+def test_decoding_inverts_encoding(code):
     rng, (write, most) = np.random.default_rng(code), fake_blackbox.CODES[code]
     ((decode, count),) = decoding_plan((code,) * most)
     for size in (0, 1, 2, 3, 5, 7, 8, 12, 15):
@@ -84,26 +84,26 @@ def test_a_code_is_the_inverse_of_its_writer(code):
 @pytest.mark.parametrize("version", VERSIONS)
 def test_firmware_from_4_3_to_4_6(version, tmp_path):
     log = read(tmp_path, blackbox(FLIGHT, version))
-    is_the_flight(log)
+    assert_is_flight(log)
     assert log.notes == (f"the log is that of Betaflight {version[0]}.{version[1]}.0 (0a1b2c3d) STM32F7X2",)
     assert log.warnings == ()
     assert log.agreement["turning"] > 0.9
 
 
-def test_numbers_of_high_resolution_and_the_filter_of_the_accelerometer(tmp_path):
+def test_high_resolution_and_accelerometer_filter(tmp_path):
     log = read(tmp_path, blackbox(FLIGHT, fine=True, acc_lpf_hz=2500))
-    is_the_flight(log)
+    assert_is_flight(log)
     assert log.filter_lag == pytest.approx(2.0 / (2.0 * np.pi * 25.0 * 1.554))
     assert any("filter of 25 Hz is accounted for" in note for note in log.notes)
 
 
-def test_a_decoded_log_is_the_log(tmp_path):
-    """By Blackbox Explorer with settings, and by blackbox_decode without them."""
+def test_decoded_csv_equals_log(tmp_path):
+    """Blackbox Explorer writes settings, and blackbox_decode does not."""
     settings = [("Product", "Blackbox"), ("Firmware revision", "Betaflight 4.5.0"), ("acc_1G", 2048),
                 ("motorOutput", "158,2047"), ("blackbox_high_resolution", 0)]  # fmt: skip
-    is_the_flight(read(tmp_path, decoded_csv(FLIGHT, settings=settings), "explorer.csv"))
+    assert_is_flight(read(tmp_path, decoded_csv(FLIGHT, settings=settings), "explorer.csv"))
     log = read(tmp_path, decoded_csv(FLIGHT), "decoded.csv")
-    is_the_flight(log)
+    assert_is_flight(log)
     assert any("no settings; the units of motors and accelerometer follow" in note for note in log.notes)
 
 
@@ -163,7 +163,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_what_cannot_be_read_is_refused_with_one_line(kind, tmp_path):
+def test_unreadable_log_is_refused_with_one_line(kind, tmp_path):
     make, text = REFUSED[kind]
     with pytest.raises(LogError, match=f"flight.bbl: .*{text}") as error:
         read(tmp_path, make())
@@ -171,7 +171,7 @@ def test_what_cannot_be_read_is_refused_with_one_line(kind, tmp_path):
     assert len(str(error.value)) < 1500
 
 
-def test_rates_in_another_unit_are_named(tmp_path):
+def test_rates_in_unknown_unit_are_refused(tmp_path):
     text = files("retrim.io.logs") / "maps" / "betaflight.toml"
     (tmp_path / "map.toml").write_text(text.read_text().replace('"setpoint[2]"]\nunit = "deg/s"', '"setpoint[2]"]'))
     with pytest.raises(LogError, match=r'does not turn as it is told .*; with rates.unit = "deg/s" it would'):
@@ -180,8 +180,8 @@ def test_rates_in_another_unit_are_named(tmp_path):
 
 def test_flights_are_chosen_by_number(tmp_path):
     both = blackbox(SHORTER) + LOG + blackbox(brief(0.4))
-    is_the_flight(read(tmp_path, both, flight=1), SHORTER)
-    is_the_flight(read(tmp_path, both, flight=2))
+    assert_is_flight(read(tmp_path, both, flight=1), SHORTER)
+    assert_is_flight(read(tmp_path, both, flight=2))
     with pytest.raises(LogError, match=r"--flight 4: the flights in this file are 1 of 1.3 s, 2 of 2.2 s, 3 of 0.4 s"):
         read(tmp_path, both, flight=4)
     with pytest.raises(LogError, match=r"--flight 1: only .bbl, .bfl, .bin files can contain several flights"):
@@ -195,14 +195,14 @@ def _csv(tmp_path):
     return tmp_path / "flight.csv"
 
 
-def test_a_log_that_is_cut_is_read_up_to_the_cut(tmp_path):
+def test_truncated_log_is_read_to_its_end(tmp_path):
     log = read(tmp_path, LOG[: len(LOG) * 3 // 4])
-    is_the_flight(log)
+    assert_is_flight(log)
     assert 1.4 < log.seconds < 1.9
     assert any("ends without its end mark" in note for note in log.notes)
 
 
-def test_a_damaged_frame_costs_the_frames_up_to_the_next_main_frame(tmp_path):
+def test_damaged_frame_loses_frames_until_next_intra_frame(tmp_path):
     data = bytearray(LOG)
     data[len(data) // 2 : len(data) // 2 + 800] = bytes(800)
     log = read(tmp_path, bytes(data))
@@ -212,7 +212,7 @@ def test_a_damaged_frame_costs_the_frames_up_to_the_next_main_frame(tmp_path):
     np.testing.assert_allclose(log.command[log.valid], FLIGHT.command[: len(log.t)][log.valid], atol=0.009)
 
 
-def test_what_a_log_lacks_is_said_and_the_rest_is_read(tmp_path):
+def test_missing_fields_are_reported_and_others_read(tmp_path):
     log = read(tmp_path, blackbox(FLIGHT, without=("acc", "setpoint")))
     assert log.command is None
     assert log.specific_force is None
@@ -222,14 +222,16 @@ def test_what_a_log_lacks_is_said_and_the_rest_is_read(tmp_path):
     np.testing.assert_allclose(log.motors[:, 0], FLIGHT.motors.mean(axis=1)[: len(log.t)], atol=1e-3)
 
 
-def test_it_is_no_flight_with_positions(tmp_path):
+def test_blackbox_is_not_a_flight_with_positions(tmp_path):
     (tmp_path / "flight.bfl").write_bytes(LOG)
     with pytest.raises(LogError, match=r"no attitudes and velocities; retrim.io.logs.read_log reads it"):
         read_flight_log(tmp_path / "flight.bfl")
 
 
-def test_bytes_of_any_kind_are_a_flight_or_one_line(tmp_path):
-    """Cut, spoilt in the header, spoilt in the frames: nothing but a RetrimError, and finite numbers."""
+def test_damaged_bytes_give_flight_or_one_line(tmp_path):
+    """Logs are truncated, or damaged in the header or in the frames; the only error is RetrimError, and numbers are
+    finite.
+    """
     rng, short = np.random.default_rng(0), blackbox(brief(1.5))
     end = short.index(b"resolution:0\n") + 13
     for k in range(18):
@@ -247,11 +249,11 @@ def test_bytes_of_any_kind_are_a_flight_or_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "loopIteration\n", '"Product","x"\nloopIteration, time (us)\n1, 2\n'])
-def test_decoded_logs_that_are_not_whole_are_refused(text, tmp_path):
+def test_incomplete_decoded_logs_are_refused(text, tmp_path):
     with pytest.raises(LogError) as error:
         read(tmp_path, text, "flight.csv")
     assert "\n" not in str(error.value)
 
 
-def test_the_end_of_a_log_is_what_a_board_writes():
+def test_end_marker_equals_that_of_firmware():
     assert LOG.endswith(DISARM + END)

@@ -1,4 +1,4 @@
-"""Policies as files that need no preset: round trips, and everything that must be refused, by name."""
+"""Policy files without a preset: round trips, and every refusal by name."""
 
 import contextlib
 import json
@@ -33,7 +33,7 @@ def file(tmp_path, policy):
 
 
 def edit(file, change=None, **header):
-    """Rewrite the file with other tensors or another header, without the checksum's consent."""
+    """Rewrite the file with changed tensors or header, without an update of the checksum."""
     tensors, data = load_file(file), file.read_bytes()
     save_file(change(tensors) if change else tensors, file, metadata=message._header(data, "test") | header)
 
@@ -55,7 +55,7 @@ def test_header_is_plain_json(file):
     assert header["kind"] == "policy"
 
 
-def test_missing(tmp_path):
+def test_missing_file_is_refused(tmp_path):
     with pytest.raises(CheckpointError, match=r"nothing: no such file; `retrim pretrain hover"):
         read_policy(tmp_path / "nothing")
     with pytest.raises(CheckpointError, match=r"policy\.safetensors: no such file"):
@@ -65,13 +65,13 @@ def test_missing(tmp_path):
 
 
 @pytest.mark.parametrize("keep", [0, 5, 100, 5000, -1])
-def test_truncated(file, keep):
+def test_truncated_file_is_refused(file, keep):
     file.write_bytes(file.read_bytes()[:keep])
     with pytest.raises(CheckpointError, match=r"policy\.safetensors: not a whole safetensors file"):
         read_policy(file)
 
 
-def test_another_kind_of_file(file):
+def test_file_of_other_kind_is_refused(file):
     file.write_bytes(b"this is not a policy at all, but a long enough line of text")
     with pytest.raises(CheckpointError, match="not a whole safetensors file"):
         read_policy(file)
@@ -80,7 +80,7 @@ def test_another_kind_of_file(file):
         read_policy(file)
 
 
-def test_another_kind_of_message(file):
+def test_message_of_other_kind_is_refused(file):
     file.write_bytes(wire.pack({"a": jnp.zeros(3)}, kind="residual", about={}))
     with pytest.raises(CheckpointError, match="holds a 'residual', expected a 'policy'"):
         read_policy(file)
@@ -89,19 +89,19 @@ def test_another_kind_of_message(file):
 @pytest.mark.parametrize(
     "sizes", ["", "23-32-32", "23-4", "23-32-32-5", "23-0-32-4", "23-x-4", "-".join(["9"] * 40), "23-99999999-4"]
 )
-def test_architectures_that_are_none(file, sizes):
+def test_invalid_architectures_are_refused(file, sizes):
     edit(file, architecture=sizes)
     with pytest.raises(CheckpointError, match=rf"architecture '{sizes}', expected sizes as 15-512-512-4"):
         read_policy(file)
 
 
-def test_wrong_shape_is_named_with_both_shapes(file):
+def test_wrong_shape_is_refused_with_both_shapes(file):
     edit(file, lambda t: t | {"layers.1.weight": np.zeros((32, 31))})
     with pytest.raises(CheckpointError, match=r"'layers\.1\.weight' has shape \(32, 31\), expected \(32, 32\)"):
         read_policy(file)
 
 
-def test_missing_and_unexpected_tensors(file):
+def test_missing_and_unexpected_tensors_are_refused(file):
     edit(file, lambda t: {k: v for k, v in t.items() if k != "layers.2.bias"})
     with pytest.raises(CheckpointError, match=r"tensor 'layers\.2\.bias' is missing"):
         read_policy(file)
@@ -111,7 +111,7 @@ def test_missing_and_unexpected_tensors(file):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_weights_that_are_not_finite(tmp_path, policy, value):
+def test_nonfinite_weights_are_refused(tmp_path, policy, value):
     bad = eqx.tree_at(lambda p: p.layers[0].bias, policy, policy.layers[0].bias.at[7].set(value))
     write_policy(tmp_path / "p.safetensors", bad, {})
     with pytest.raises(CheckpointError, match=r"'layers\.0\.bias' has 1 weights that are not finite"):
@@ -124,8 +124,8 @@ def test_integers_are_refused(file):
         read_policy(file)
 
 
-def test_limits_that_do_not_enclose_hover(tmp_path, policy):
-    """A sound file in itself; its policy could not hover."""
+def test_limits_without_hover_are_refused(tmp_path, policy):
+    """The file is valid, but its policy could not hover."""
     for limit, value in (("u_min", 10.0), ("u_max", 9.0)):
         wrong = eqx.tree_at(lambda p, limit=limit: getattr(p, limit).c, policy, jnp.array(value))
         write_policy(tmp_path / "p.safetensors", wrong, {})
@@ -133,7 +133,7 @@ def test_limits_that_do_not_enclose_hover(tmp_path, policy):
             read_policy(tmp_path / "p.safetensors")
 
 
-def test_a_changed_weight_or_header_breaks_the_checksum(file):
+def test_changed_weight_or_header_breaks_checksum(file):
     whole = file.read_bytes()
     edit(file, lambda t: t | {"layers.0.bias": t["layers.0.bias"] + 1e-3})
     with pytest.raises(CheckpointError, match="checksum does not match"):
@@ -146,8 +146,8 @@ def test_a_changed_weight_or_header_breaks_the_checksum(file):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_flipped_bytes_never_load_silently(file, policy, data):
-    """Whatever byte is damaged: either a clear refusal, or the very same weights."""
+def test_flipped_byte_is_refused_or_harmless(file, policy, data):
+    """A damaged byte leads to a refusal or to equal weights."""
     whole = bytearray(file.read_bytes())
     place = data.draw(st.integers(0, len(whole) - 1))
     whole[place] ^= data.draw(st.integers(1, 255))
@@ -167,7 +167,7 @@ def test_float32_files_load_in_double_precision_and_back(tmp_path, policy):
     jax.tree.map(np.testing.assert_array_equal, result, jax.tree.map(lambda leaf: leaf.astype(jnp.float64), single))
 
 
-def test_an_interrupted_write_leaves_the_old_file(file, policy, monkeypatch):
+def test_interrupted_write_keeps_old_file(file, policy, monkeypatch):
     whole = file.read_bytes()
     monkeypatch.setattr("os.fsync", lambda fd: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):

@@ -1,4 +1,4 @@
-"""Dataflash logs of ArduPilot, whole and damaged: the flight in retrim's frames, or one line."""
+"""Dataflash logs of ArduPilot, intact and damaged: the flight in retrim's frames, or one line."""
 
 import contextlib
 import struct
@@ -24,8 +24,8 @@ def write(tmp_path, data, name="flight.bin"):
     return tmp_path / name
 
 
-def is_the_flight(log, flight=FLIGHT):
-    """Position, velocity, attitude, rates and thrust, in east-north-up and forward-left-up."""
+def assert_is_flight(log, flight=FLIGHT):
+    """Assert equality of position, velocity, attitude, rates and thrust, in east-north-up and forward-left-up."""
     assert isinstance(log, FlightLog)
     at = [np.argmin(np.abs(flight.t - t)) for t in log.t]
     np.testing.assert_allclose(log.p, flight.p[at], atol=2e-3)
@@ -37,17 +37,17 @@ def is_the_flight(log, flight=FLIGHT):
     assert np.abs(np.asarray(rows_of(log).a_res)[log.valid]).max() < 0.2
 
 
-def test_a_flight_with_positions(tmp_path):
-    """The estimator's states, of its first instance; the thrust map is that of the parameter."""
+def test_flight_with_positions(tmp_path):
+    """The states are those of the first estimator instance, and the thrust map is that of the parameter."""
     path = write(tmp_path, LOG)
     log = read_flight_log(path)
-    is_the_flight(log)
+    assert_is_flight(log)
     assert min(log.agreement.values()) > 0.95
     hover = float(next(note for note in log.notes if "hover at" in note).split()[-1])
     assert hover == pytest.approx(parameters_of(path)["MOT_THST_HOVER"], rel=0.1)
 
 
-def test_numbers_are_those_of_pymavlink(tmp_path):
+def test_numbers_equal_pymavlink(tmp_path):
     reader = pytest.importorskip("pymavlink.DFReader")
     path = write(tmp_path, LOG, "flight.BIN")
     log, rows = reader.DFReader_binary(str(path)), []
@@ -65,8 +65,8 @@ def test_numbers_are_those_of_pymavlink(tmp_path):
         np.testing.assert_allclose(series[kind].values, theirs, rtol=1e-6, atol=1e-9)
 
 
-def test_motors_and_another_instance(tmp_path):
-    """Four pulse widths instead of a thrust; and the second accelerometer, which is 50 m/s^2 off."""
+def test_motors_and_second_instance(tmp_path):
+    """The log has four pulse widths instead of a thrust; the second accelerometer has an offset of 50 m/s^2."""
     text = (read_text("ardupilot")).replace(
         'fields = ["RATE.AOut|CTUN.ThO"]\nunit = "share"',
         'fields = ["RCOU.C1", "RCOU.C2", "RCOU.C3", "RCOU.C4"]\nunit = "share"\nzero = 1000.0\nfull = 2000.0',
@@ -85,8 +85,8 @@ def read_text(name):
     return (files("retrim.io.logs") / "maps" / f"{name}.toml").read_text()
 
 
-def test_a_rate_loop_alone(tmp_path):
-    """Without an estimator's states the log is one of rates; axes are turned from forward-right-down."""
+def test_rate_loop_only(tmp_path):
+    """Without estimator states the log contains rates only; axes are converted from forward-right-down."""
     whole = fly_body(3.0, Truth(curve=0.0))
     flight = BodyFlight(*(getattr(whole, name)[::5] for name in ("t", "command", "rates", "motors", "force")))
     log = read_log(write(tmp_path, dataflash(body_messages(flight), without=("XKF1",))))
@@ -98,25 +98,25 @@ def test_a_rate_loop_alone(tmp_path):
     assert log.agreement["turning"] > 0.9
 
 
-def test_two_flights_between_arming_and_disarming(tmp_path):
+def test_flights_are_split_by_arming(tmp_path):
     other = fly_once(4.0, dt=0.01, seed=3)
     path = write(tmp_path, dataflash(MESSAGES, flight_messages(other, start=60.0)))
     with pytest.raises(
         LogError, match=r"2 flights are in this file: 1 of 6.0 s, 2 of 4.0 s; choose one, as --flight 1"
     ):
         read_log(path)
-    is_the_flight(read_flight_log(path, flight=1))
-    is_the_flight(read_flight_log(path, flight=2), other)
+    assert_is_flight(read_flight_log(path, flight=1))
+    assert_is_flight(read_flight_log(path, flight=2), other)
 
 
-def test_a_clock_that_begins_again_begins_another_flight(tmp_path):
-    """Two starts of the board in one file, without arming; a damaged time alone is no start."""
+def test_restarted_clock_begins_new_flight(tmp_path):
+    """The board starts twice in one file without arming; a single damaged time is not a start."""
     other = fly_once(4.0, dt=0.01, seed=3)
     parts = flight_messages(FLIGHT, events=False), flight_messages(other, start=1.0, events=False)
     path = write(tmp_path, dataflash(*parts))
     with pytest.raises(LogError, match=r"2 flights are in this file: 1 of 9.0 s, 2 of 4.0 s"):
         read_log(path)
-    is_the_flight(read_flight_log(path, flight=2), other)
+    assert_is_flight(read_flight_log(path, flight=2), other)
     data = bytearray(dataflash(parts[0]))
     at = data.index(HEAD + b"\x43", len(data) // 2) + 3
     data[at : at + 8] = struct.pack("<Q", 10**12)
@@ -124,13 +124,13 @@ def test_a_clock_that_begins_again_begins_another_flight(tmp_path):
     assert log.seconds > 5.0
 
 
-def torn(data):
+def damage(data):
     return data[: len(data) * 2 // 3 + 7]
 
 
-def test_a_log_that_is_cut_or_has_gaps_is_read(tmp_path):
-    log = read_flight_log(write(tmp_path, torn(LOG)))
-    is_the_flight(log)
+def test_truncated_log_with_gaps_is_read(tmp_path):
+    log = read_flight_log(write(tmp_path, damage(LOG)))
+    assert_is_flight(log)
     assert 3.0 < log.seconds < 5.0
     data = bytearray(LOG)
     data[len(data) // 2 : len(data) // 2 + 300] = bytes(300)
@@ -160,7 +160,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_what_cannot_be_read_is_refused_with_one_line(kind, tmp_path):
+def test_unreadable_log_is_refused_with_one_line(kind, tmp_path):
     make, text = REFUSED[kind]
     with pytest.raises(LogError, match=f"flight.bin: .*{text}") as error:
         read_log(write(tmp_path, make()))
@@ -168,7 +168,7 @@ def test_what_cannot_be_read_is_refused_with_one_line(kind, tmp_path):
     assert len(str(error.value)) < 1500
 
 
-def test_bytes_of_any_kind_are_a_flight_or_one_line(tmp_path):
+def test_damaged_bytes_give_flight_or_one_line(tmp_path):
     rng, short = np.random.default_rng(0), dataflash(flight_messages(fly_once(1.5, dt=0.01)))
     head = len(formats())
     for k in range(40):

@@ -1,6 +1,7 @@
-"""Files and messages of strangers, with valid checksums: nothing of them runs, and each is one line of an error.
+"""Malicious files and messages with valid checksums: none of their content is executed, and each gives one line of an
+error.
 
-A part of them in every run; ``pytest -n 0 -m slow tests/io/test_hostile_files.py`` reads all.
+Every run reads a part of them; ``pytest -n 0 -m slow tests/io/test_hostile_files.py`` reads all.
 """
 
 import io
@@ -38,7 +39,7 @@ def watch(tmp_path_factory):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """The current folder, with a module that a stranger has put there."""
+    """Return the current folder, which contains a foreign module."""
     for name in ("mine_of_a_stranger", "calendar", "numpy", "x"):
         (tmp_path / f"{name}.py").write_text("open('OWNED', 'w')\ndef run(*_): pass\n")
     monkeypatch.chdir(tmp_path)
@@ -47,7 +48,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def outcome(case, watch):
-    """What a case came to: ``refused``, ``read``, or a fault in words."""
+    """Return the outcome of a case: ``refused``, ``read``, or a description of a fault."""
     watch.events.clear()
     watch.on = True
     try:
@@ -65,7 +66,7 @@ def outcome(case, watch):
 
 
 def read_all(folder, watch, every):
-    """Read each ``every``-th case twice: what is imported the first time, once and for all, is not the case's doing."""
+    """Read each ``every``-th case twice, since the first read imports modules for reasons other than the case."""
     maker, result = Maker(folder), list[str]()
 
     def choose(each):
@@ -85,18 +86,18 @@ def read_all(folder, watch, every):
     return Counter(result)
 
 
-def test_some_hostile_files_run_nothing_and_are_one_line_each(folder, watch):
+def test_some_hostile_files_run_nothing_and_give_one_line(folder, watch):
     result = read_all(folder, watch, FEW)
     assert result["refused"] > result["read"]
 
 
 @pytest.mark.slow
-def test_all_hostile_files_run_nothing_and_are_one_line_each(folder, watch):
+def test_all_hostile_files_run_nothing_and_give_one_line(folder, watch):
     result = read_all(folder, watch, 1)
     assert result["refused"] >= 10_000
 
 
-# ---- files that are large, or unpack to much
+# ---- large files, and files that unpack to a large size
 
 
 def archive_of(path, **arrays):
@@ -104,7 +105,7 @@ def archive_of(path, **arrays):
     return path
 
 
-def test_an_array_that_no_map_names_is_not_unpacked(folder):
+def test_array_outside_map_is_not_unpacked(folder):
     n, zeros = 100, np.zeros((100, 3))
     fine = {"t": 0.02 * np.arange(n), "p": zeros, "v": zeros, "R": np.tile(np.eye(3), (n, 1, 1)), "c": zeros[:, :1]}
     path = archive_of(folder / "log.npz", **fine, unused=np.zeros(2**23))
@@ -117,7 +118,7 @@ def test_an_array_that_no_map_names_is_not_unpacked(folder):
     assert peak < 2**20
 
 
-def test_sizes_are_looked_at_before_a_file_is_read(folder, monkeypatch):
+def test_size_is_checked_before_reading(folder, monkeypatch):
     path = archive_of(folder / "log.npz", t=np.zeros(10_000))
     monkeypatch.setattr(npz_members, "MAX_MEMBER", 1000)
     with pytest.raises(LogError, match="array 't' has 80128 bytes, more than the 1000 that are accepted"):
@@ -131,7 +132,7 @@ def test_sizes_are_looked_at_before_a_file_is_read(folder, monkeypatch):
     }
     for name, read in (logs | others).items():
         with (folder / name).open("wb") as file:
-            file.truncate(3 * 2**30)  # a hole: it takes no space
+            file.truncate(3 * 2**30)  # a sparse file takes no space
         with pytest.raises(RetrimError, match="accepted"):
             read(folder / name)
         (folder / name).unlink()
@@ -140,7 +141,7 @@ def test_sizes_are_looked_at_before_a_file_is_read(folder, monkeypatch):
             read(folder / name)
 
 
-def test_a_head_that_promises_more_than_is_there_takes_no_memory(folder):
+def test_excessive_size_in_header_takes_no_memory(folder):
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
     with zipfile.ZipFile(folder / "log.npz", "w") as archive:
@@ -153,7 +154,7 @@ def test_a_head_that_promises_more_than_is_there_takes_no_memory(folder):
             load_policy(folder / "p.safetensors")
 
 
-def test_rows_of_a_sweep_that_are_none_are_flown_again(folder):
+def test_invalid_rows_of_sweep_are_repeated(folder):
     row = dict.fromkeys((*sweep.GROUP, *sweep.FIGURES, "metric")) | {"key": "good", "metric": "m", "error": 0.1}
     wrong = [{**row, "key": "a", "error": "x"}, {**row, "key": "b", "plant": 3}, {"key": "c"}, {**row, "key": 4}, [], 1]
     lines = [json.dumps(each).encode() for each in (*wrong, row)]
@@ -164,7 +165,7 @@ def test_rows_of_a_sweep_that_are_none_are_flown_again(folder):
     assert text == [f"{folder / 'flights.jsonl'}: unusable lines, 8; their flights are flown again"]
 
 
-def test_a_host_that_cannot_be_is_one_line():
+def test_invalid_host_gives_one_line():
     for host in ("a\x1b[2J", "a\x00b", 300 * "a" + ".b", "\ud800", "..", "é" * 100):
         with pytest.raises(ConfigError, match="neither an address nor the name of a host") as error:
             free_port(host, 8080)
@@ -172,11 +173,11 @@ def test_a_host_that_cannot_be_is_one_line():
         assert len(str(error.value)) < LONGEST
 
 
-# ---- formats whose reader makes code of what a file says of its messages
+# ---- formats whose reader generates code from message definitions in the file
 
 
 @pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
-def test_types_of_messages_in_a_bag_are_no_code(folder, encoding):
+def test_message_types_in_bag_are_not_executed(folder, encoding):
     writer, _ = pytest.importorskip("mcap.writer"), pytest.importorskip("rosbags")
     run = "open('OWNED', 'w')"
     names = [
@@ -204,7 +205,7 @@ def test_types_of_messages_in_a_bag_are_no_code(folder, encoding):
         assert not (folder / "OWNED").exists(), name
 
 
-def test_true_is_no_number_of_a_map(folder):
+def test_boolean_is_not_a_number_in_map(folder):
     for table in ("[part]\nstart = true", "[part]\nend = true", "thrust.mass = true"):
         (folder / "map.toml").write_text(table)
         with pytest.raises(ConfigError, match=r"(part|thrust).(start|end|mass): Input should be a valid number"):

@@ -16,10 +16,10 @@ FLIGHT = fly_once(6.0)
 N = len(FLIGHT.t)
 
 
-def agrees(log, places=1e-6):
+def assert_agrees(log, places=1e-6):
     shift = round((log.t[0] - 0.0) / 0.02)
-    for result, true in ((log.p, FLIGHT.p), (log.R, FLIGHT.R), (log.v, FLIGHT.v), (log.c, FLIGHT.c)):
-        np.testing.assert_allclose(result, true[shift : shift + len(result)], atol=places)
+    for result, true_state in ((log.p, FLIGHT.p), (log.R, FLIGHT.R), (log.v, FLIGHT.v), (log.c, FLIGHT.c)):
+        np.testing.assert_allclose(result, true_state[shift : shift + len(result)], atol=places)
     np.testing.assert_allclose(log.command, FLIGHT.omega[: len(log.command)], atol=places)
     assert log.valid[3:-3].all()
 
@@ -31,15 +31,15 @@ def recording():
     return Recording(FLIGHT.t, states, states, np.zeros(N), command, np.zeros(N))
 
 
-def test_our_own_arrays(recording, tmp_path):
+def test_retrim_npz_log(recording, tmp_path):
     write_npz(tmp_path / "flight.npz", recording)
-    agrees(read_flight_log(tmp_path / "flight.npz"))
+    assert_agrees(read_flight_log(tmp_path / "flight.npz"))
 
 
-def test_our_own_recording(recording, tmp_path):
+def test_retrim_mcap_recording(recording, tmp_path):
     pytest.importorskip("rosbags")
     write_mcap(tmp_path / "flight.mcap", recording)
-    agrees(read_flight_log(tmp_path / "flight.mcap"))
+    assert_agrees(read_flight_log(tmp_path / "flight.mcap"))
 
 
 @pytest.mark.parametrize("write", [write_npz, write_mcap])
@@ -47,8 +47,8 @@ def test_our_own_recording(recording, tmp_path):
     ("ms", "ages"), [(20, (15,)), (20, (25,)), (20, (30,)), (10, (15,)), (10, (25,)), (10, (30,)), (10, (15, 25)),
                      (20, (10, 30)), (10, (5, 30))]
 )  # fmt: skip
-def test_our_own_recordings_of_old_states(write, ms, ages, tmp_path):
-    """Older than a tick, logged twice, or come late; and what says how old is wrong by tenths of a millisecond."""
+def test_retrim_recording_of_delayed_states(write, ms, ages, tmp_path):
+    """States are older than a tick, repeated or late, and the stated age is wrong by tenths of a millisecond."""
     if write is write_mcap:
         pytest.importorskip("rosbags")
     fine, before = fly_once(6.0, dt=1e-3), 100  # ms of flight before the recording
@@ -64,22 +64,22 @@ def test_our_own_recordings_of_old_states(write, ms, ages, tmp_path):
     assert log.valid[3:-3].all()
     assert any("not newer than the one before" in note for note in log.notes) == (len(ages) > 1)
 
-    def true(start):
-        """Position, velocity and thrust at the times of a log that begins then."""
+    def true_state(start):
+        """Return position, velocity and thrust at the times of a log that begins at ``start``."""
         columns = np.concatenate([fine.p, fine.v, fine.c[:, None]], axis=1).T
         return np.stack([np.interp(start + log.t[5:-5], fine.t, column) for column in columns], axis=1)
 
-    # The log's clock begins with its first state, and nobody tells when that was.
+    # The clock of the log begins with its first state; the log does not state the time of this state.
     result = np.concatenate([log.p, log.v, log.c[:, None]], axis=1)[5:-5]
-    error = min((np.abs(result - true(1e-3 * start)).max(axis=0) for start in range(50, 200)), key=np.sum)
+    error = min((np.abs(result - true_state(1e-3 * start)).max(axis=0) for start in range(50, 200)), key=np.sum)
     assert error[:3].max() < 3e-3
     assert error[3:6].max() < 0.03
     assert error[6] < 0.1
 
 
 @pytest.mark.parametrize("name", ["flight.bag", "flight.db3", "flight"])
-def test_bags_of_ros(name, tmp_path):
-    """Odometry as MAVROS publishes it, velocities in body axes, thrust as a share."""
+def test_ros_bags(name, tmp_path):
+    """Odometry as from MAVROS: velocities in body axes, and thrust as a fraction."""
     rosbags = pytest.importorskip("rosbags.typesys")
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
@@ -138,7 +138,7 @@ def test_bags_of_ros(name, tmp_path):
     elif not one:
         path = tmp_path / "whole"
     log = read_flight_log(path, read_map("mavros"))
-    agrees(log, 3e-3)
+    assert_agrees(log, 3e-3)
     assert log.full_thrust == pytest.approx(G[2] / 0.45, rel=1e-3)
     with pytest.raises(LogError, match=r"no field '/odom'; there are /mavros/local_position/odom"):
         read_flight_log(path, read_map_with(tmp_path, "/odom.pose.pose.position"))
@@ -160,7 +160,7 @@ def read_map_with(folder, position):
 
 
 def ulog(flight):
-    """A ULog as PX4 writes it: NED, forward-right-down, each topic at its own rate."""
+    """Return a ULog in PX4's form: NED, forward-right-down, each topic at its own rate."""
     ned = turned_frames(flight)
     q = np.roll(Rotation.from_matrix(ned.R).as_quat(), 1, axis=1)
     thrust = -0.5 * flight.c / G[2]
@@ -189,17 +189,17 @@ def ulog(flight):
     return b"".join(out)
 
 
-def test_a_log_of_px4(tmp_path):
+def test_px4_ulog(tmp_path):
     pytest.importorskip("pyulog")
     path = tmp_path / "flight.ulg"
     path.write_bytes(ulog(FLIGHT))
     log = read_flight_log(path)
-    agrees(log, 1e-2)
+    assert_agrees(log, 1e-2)
     np.testing.assert_allclose(log.rates, FLIGHT.omega, atol=1e-5)
     assert log.full_thrust == pytest.approx(2.0 * G[2], rel=1e-3)
 
 
-def test_a_ulog_that_is_cut_or_spoilt_gives_a_flight_or_one_line(tmp_path):
+def test_damaged_ulog_gives_flight_or_one_line(tmp_path):
     pytest.importorskip("pyulog")
     whole, rng = ulog(FLIGHT), np.random.default_rng(0)
     path = tmp_path / "flight.ulg"
@@ -214,7 +214,7 @@ def test_a_ulog_that_is_cut_or_spoilt_gives_a_flight_or_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["mcap", "npz"])
-def test_a_recording_that_is_cut_or_spoilt_gives_a_flight_or_one_line(recording, kind, tmp_path):
+def test_damaged_recording_gives_flight_or_one_line(recording, kind, tmp_path):
     pytest.importorskip("rosbags")
     path, rng = tmp_path / f"flight.{kind}", np.random.default_rng(0)
     (write_mcap if kind == "mcap" else write_npz)(path, recording)

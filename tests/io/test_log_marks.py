@@ -1,4 +1,4 @@
-"""What an autopilot says of its own estimates is heard, and what it does not say is seen: resets, ground, validity."""
+"""Resets, ground contact and invalid estimates are read from the autopilot's marks, or detected without marks."""
 
 import dataclasses
 
@@ -14,8 +14,8 @@ from retrim.replay import rows_of
 FLIGHT = fly_once(16.0)
 
 
-def miss(log):
-    """Root mean square and largest error of the residual, whose true value is zero."""
+def residual_errors(log):
+    """Return the root mean square and the largest error of the residual, whose true value is zero."""
     wrong = np.abs(np.asarray(rows_of(log).a_res)[log.valid])
     return float(np.sqrt(np.mean(wrong**2))), float(wrong.max())
 
@@ -26,7 +26,7 @@ def read_ulog(tmp_path, topics, stamps):
     return read_flight_log(tmp_path / "flight.ulg")
 
 
-def test_samples_that_px4_calls_invalid_are_left_out(tmp_path):
+def test_samples_marked_invalid_by_px4_are_excluded(tmp_path):
     topics, stamps = px4_topics(FLIGHT)
     place = topics["vehicle_local_position"]
     holds = np.ones(len(stamps))
@@ -37,12 +37,12 @@ def test_samples_that_px4_calls_invalid_are_left_out(tmp_path):
     log = read_ulog(tmp_path, topics, stamps)
     assert "velocity was not valid for 6.0 s, which are left out" in log.notes
     assert not any("jumps" in note for note in log.notes)
-    assert miss(log)[1] < 0.03
+    assert residual_errors(log)[1] < 0.03
     assert log.seconds == pytest.approx(10.0, abs=0.3)
     assert log.full_thrust == pytest.approx(2.0 * G[2], rel=0.05)
 
 
-def test_a_velocity_that_is_never_valid_says_so(tmp_path):
+def test_velocity_that_is_never_valid_is_reported(tmp_path):
     topics, stamps = px4_topics(FLIGHT)
     topics["vehicle_local_position"]["v_z_valid"] = ("bool", np.zeros(len(stamps)))
     with pytest.raises(LogError, match=r"0.00 s of flight are left.*velocity was not valid for 16.0 s"):
@@ -51,8 +51,8 @@ def test_a_velocity_that_is_never_valid_says_so(tmp_path):
 
 @pytest.mark.parametrize("counter", [True, False])
 @pytest.mark.parametrize("step", [0.12, 0.8])
-def test_resets_of_the_velocity_are_left_out(counter, step, tmp_path):
-    """With a counter, however small; without, where no vehicle accelerates so."""
+def test_velocity_resets_are_excluded(counter, step, tmp_path):
+    """With a counter, any reset is found; without one, a reset beyond the acceleration of a vehicle is found."""
     topics, stamps = px4_topics(FLIGHT)
     place = topics["vehicle_local_position"]
     off = (FLIGHT.t > 6.0) & (FLIGHT.t < 6.5)
@@ -62,24 +62,24 @@ def test_resets_of_the_velocity_are_left_out(counter, step, tmp_path):
     log = read_ulog(tmp_path, topics, stamps)
     (note,) = [note for note in log.notes if "jumps" in note]
     assert f"velocity jumps 2 times ({2 * counter} resets by its counter)" in note
-    assert miss(log)[1] < 0.03
+    assert residual_errors(log)[1] < 0.03
     assert log.seconds > 15.5
 
 
-def test_isolated_wrong_velocities_are_left_out(tmp_path):
-    """As motion capture gives them that swaps two markers."""
+def test_isolated_wrong_velocities_are_excluded(tmp_path):
+    """Motion capture that swaps two markers reports such velocities."""
     table = columns(FLIGHT)
     table["vy"][100::50] += 1.5
     path = write_csv(tmp_path / "log.csv", table)
     log = read_flight_log(path, read_map(write_map(tmp_path / "map.toml")))
-    assert miss(log)[1] < 0.05
+    assert residual_errors(log)[1] < 0.05
     assert log.seconds > 11.0
 
 
-def test_a_reset_of_the_heading_is_left_out(tmp_path):
+def test_heading_reset_is_excluded(tmp_path):
     topics, stamps = px4_topics(FLIGHT)
     q = topics["vehicle_attitude"]["q"][1].copy()
-    half = 0.15  # rad: half of the step
+    half = 0.15  # rad; half of the step
     turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
     w, x, y, z = q[400:].T
     q[400:] = np.stack([turn[0] * w - turn[3] * z, turn[0] * x - turn[3] * y, turn[0] * y + turn[3] * x,
@@ -91,7 +91,7 @@ def test_a_reset_of_the_heading_is_left_out(tmp_path):
 
 
 def with_ground(flight, seconds, lift):
-    """A flight, before and after which the vehicle stands for some time with a share of the thrust of hover."""
+    """Return a flight with time on the ground before and after it, at a fraction of the hover thrust."""
     n = round(seconds / 0.02)
 
     def around(x, first, last):
@@ -113,27 +113,27 @@ def with_ground(flight, seconds, lift):
 
 @pytest.mark.parametrize("unit", ["m/s^2", "share"])
 @pytest.mark.parametrize("lift", [0.95, 0.6, 0.4])
-def test_standing_on_the_ground_is_no_flight(unit, lift, tmp_path):
-    """With the thrust of spinning propellers; the scale of the thrust is found from the flight alone."""
+def test_time_on_ground_is_not_flight(unit, lift, tmp_path):
+    """The propellers spin on the ground, and the thrust scale is estimated from the flight only."""
     whole, n = with_ground(FLIGHT, 4.0, lift), 200
     table = columns(whole)
     table["c"] = table["c"] * (0.5 / G[2] if unit == "share" else 1.0)
     for name in ("vx", "vy", "vz"):
         for k in (n, len(table["t"]) - n):
-            table[name][k - 3 : k + 3] = np.nan  # take-off and landing at speed are not part of the question
+            table[name][k - 3 : k + 3] = np.nan  # take-off and landing at speed are excluded from this test
     log = read_flight_log(
         write_csv(tmp_path / "log.csv", table), read_map(write_map(tmp_path / "m.toml", thrust__unit=f'"{unit}"'))
     )
     assert log.valid[: n - 3].sum() + log.valid[-n + 3 :].sum() == 0
     assert log.valid[n + 10 : -n - 10].mean() > 0.97
     assert any("on the ground are left out" in note for note in log.notes)
-    assert miss(log)[0] < (0.05 if unit == "m/s^2" else 0.4)
+    assert residual_errors(log)[0] < (0.05 if unit == "m/s^2" else 0.4)
     if unit == "share":
         assert G[2] / log.full_thrust == pytest.approx(0.5, rel=0.04)
 
 
-def test_a_hover_is_no_ground(tmp_path):
-    """At rest in the air the thrust is that of hover, whatever its scale is."""
+def test_hover_is_not_ground(tmp_path):
+    """At rest in the air the thrust equals that of hover for any thrust scale."""
     n = 800
     level = dataclasses.replace(
         FLIGHT,
@@ -149,7 +149,7 @@ def test_a_hover_is_no_ground(tmp_path):
     assert log.valid[3:-3].mean() > 0.98
 
 
-def test_a_land_detector_is_believed(tmp_path):
+def test_land_detector_is_used(tmp_path):
     topics, stamps = px4_topics(FLIGHT)
     topics["vehicle_land_detected"] = {"landed": ("bool", np.array([1, 0, 1]))}
     slow = dict.fromkeys(topics, stamps) | {"vehicle_land_detected": stamps[[0, 100, 700]]}
@@ -163,8 +163,8 @@ def test_a_land_detector_is_believed(tmp_path):
     assert log.valid[3:-3].all()
 
 
-def test_a_position_that_is_never_valid_is_not_used(tmp_path):
-    """As that of a flight without GPS, whose velocity holds: no residual needs it."""
+def test_position_that_is_never_valid_is_not_used(tmp_path):
+    """A flight without GPS has a valid velocity, and the residual does not need the position."""
     topics, stamps = px4_topics(FLIGHT)
     place = topics["vehicle_local_position"]
     place |= {"xy_valid": ("bool", np.zeros(len(stamps))), "v_xy_valid": ("bool", np.ones(len(stamps)))}
@@ -172,12 +172,12 @@ def test_a_position_that_is_never_valid_is_not_used(tmp_path):
         place[name] = ("float", np.zeros(len(stamps)))
     log = read_ulog(tmp_path, topics, stamps)
     assert "position is never valid, and is not used" in log.notes
-    assert miss(log)[1] < 0.03
+    assert residual_errors(log)[1] < 0.03
     assert log.valid[3:-3].all()
 
 
-def test_marks_may_be_compared_with_a_number(tmp_path):
-    """As a state that is 1 on the ground, or a fix that is 3 where it holds."""
+def test_marks_can_be_compared_with_number(tmp_path):
+    """Examples are a state that is 1 on the ground, and a fix that is 3 if valid."""
     t = FLIGHT.t
     table = columns(FLIGHT) | {"state": np.where(t < 3.0, 1.0, 2.0), "fix": np.where((t > 8.0) & (t < 10.0), 1.0, 3.0)}
     table["vx"] = np.where((t > 8.0) & (t < 10.0), 0.0, table["vx"])
@@ -187,10 +187,10 @@ def test_marks_may_be_compared_with_a_number(tmp_path):
     assert not log.valid[(log.t > 7.99) & (log.t < 9.99)].any()
     assert log.valid[((log.t > 3.1) & (log.t < 7.9)) | ((log.t > 10.1) & (log.t < 15.9))].all()
     assert "velocity was not valid for 2.0 s, which are left out" in log.notes
-    assert miss(log)[1] < 0.03
+    assert residual_errors(log)[1] < 0.03
 
 
-def test_marks_that_a_log_does_not_have_are_passed_over(tmp_path):
+def test_missing_marks_are_ignored(tmp_path):
     choice = write_map(
         tmp_path / "map.toml", landed__fields='["ground"]', velocity__valid='["ok"]', attitude__resets='["n"]'
     )

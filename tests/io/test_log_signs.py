@@ -1,4 +1,4 @@
-"""Any sign and any axes can be said in a map; what is wrong is named by the statement that mends it."""
+"""A map can state any sign and any axes; a wrong one is refused with the statement that corrects it."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def read(tmp_path, table, **changes):
     return read_flight_log(path, read_map(write_map(tmp_path / "map.toml", MAP, **changes)))
 
 
-def is_the_flight(log):
+def assert_is_flight(log):
     np.testing.assert_allclose(log.R, FLIGHT.R, atol=1e-6)
     np.testing.assert_allclose(log.v, FLIGHT.v, atol=1e-6)
     np.testing.assert_allclose(log.p, FLIGHT.p, atol=1e-6)
@@ -71,8 +71,8 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("table", "names"), WRONG, ids=lambda x: x if isinstance(x, str) else "-".join(x))
-def test_a_wrong_sign_is_named_and_the_map_can_say_it(table, names, tmp_path):
-    """As that of a Crazyflie, whose pitch is positive nose up, or of a compass."""
+def test_wrong_sign_is_reported_and_correctable(table, names, tmp_path):
+    """Examples are the pitch of a Crazyflie, which is positive nose up, and the heading of a compass."""
     changes = AXES.get(table, {})
     fields = FIELDS[table]
     table = table.partition("_q")[0]
@@ -81,7 +81,7 @@ def test_a_wrong_sign_is_named_and_the_map_can_say_it(table, names, tmp_path):
     with pytest.raises(LogError) as error:
         read(tmp_path, wrong, **changes)
     assert f"{table}.fields = {correction} they would" in str(error.value)
-    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": correction}))
+    assert_is_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": correction}))
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_wrong_sign_is_named_and_the_map_can_say_it(table, names, tmp_path):
      ("measured_rates", ("gy", "gx", "-gz")), ("attitude", ("yaw", "pitch", "roll")),
      ("attitude", ("pitch", "roll", "yaw"))],
 )  # fmt: skip
-def test_a_wrong_order_is_named_and_the_map_can_say_it(table, order, tmp_path):
+def test_wrong_order_is_reported_and_correctable(table, order, tmp_path):
     changes = AXES.get(table, {})
     fields = FIELDS[table]
     wrong = dict(TABLE)
@@ -100,32 +100,32 @@ def test_a_wrong_order_is_named_and_the_map_can_say_it(table, order, tmp_path):
     with pytest.raises(LogError) as error:
         read(tmp_path, wrong, **changes)
     assert f"{table}.fields = {correction} they would" in str(error.value)
-    is_the_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": correction}))
+    assert_is_flight(read(tmp_path, wrong, **changes | {f"{table}__fields": correction}))
 
 
 @pytest.mark.parametrize(("world", "body"), [("NWU", "FLU"), ("SEU", "FLU"), ("ENU", "LBU"), ("ENU", "RFU")])
-def test_an_attitude_that_is_turned_about_z_is_named(world, body, tmp_path):
+def test_attitude_rotated_about_z_is_reported(world, body, tmp_path):
     own = np.swapaxes(to_world(world)[None], 1, 2) @ FLIGHT.R @ to_body(body)
     table = columns(dataclasses.replace(FLIGHT, R=own))
     text = f'attitude.world = "{world}"' if world != "ENU" else f'attitude.body = "{body}"'
     with pytest.raises(LogError, match=f"with {text} they would"):
         read(tmp_path, table)
-    is_the_flight(read(tmp_path, table, attitude__world=f'"{world}"', attitude__body=f'"{body}"'))
+    assert_is_flight(read(tmp_path, table, attitude__world=f'"{world}"', attitude__body=f'"{body}"'))
 
 
 @pytest.mark.parametrize("degrees", [-150.0, -40.0, 30.0, 100.0])
-def test_a_heading_of_the_attitude_that_differs_is_named(degrees, tmp_path):
-    """As that of a compass beside the axes of motion capture."""
+def test_heading_offset_is_reported(degrees, tmp_path):
+    """A compass heading and the axes of motion capture may differ by an offset."""
     rotations = Rotation.from_euler("z", -degrees, degrees=True) * Rotation.from_matrix(FLIGHT.R)
     table = columns(dataclasses.replace(FLIGHT, R=rotations.as_matrix()))
     with pytest.raises(LogError, match=rf"with attitude.heading = {degrees:.0f} they would"):
         read(tmp_path, table)
-    is_the_flight(read(tmp_path, table, attitude__heading=f"{degrees:.0f}"))
+    assert_is_flight(read(tmp_path, table, attitude__heading=f"{degrees:.0f}"))
 
 
 @pytest.mark.parametrize("names", [("pitch",), ("roll",)])
-def test_a_wrong_sign_is_named_without_rates(names, tmp_path):
-    """By the acceleration alone."""
+def test_wrong_sign_is_reported_without_rates(names, tmp_path):
+    """The acceleration alone reveals the sign."""
     wrong = TABLE | {name: -TABLE[name] for name in names}
     text = MAP.partition("[rates]")[0]
     path = write_csv(tmp_path / "log.csv", wrong)
@@ -139,21 +139,21 @@ def test_a_wrong_sign_is_named_without_rates(names, tmp_path):
      ("EUN", "RUF")],
 )  # fmt: skip
 def test_axes_of_any_kind(world, body, tmp_path):
-    """Right-handed and left-handed, as those of game engines; y upwards, as motion capture has it."""
+    """Axes may be right-handed or left-handed, as in game engines, or have y upwards, as in motion capture."""
     W, B = to_world(world), to_body(body)
     spin = np.linalg.det(B) * B
     turned_log = dataclasses.replace(
         FLIGHT, p=FLIGHT.p @ W, v=FLIGHT.v @ W, R=np.swapaxes(W[None], 1, 2) @ FLIGHT.R @ B, omega=FLIGHT.omega @ spin
     )
-    is_the_flight(read(tmp_path, columns(turned_log), frames__world=f'"{world}"', frames__body=f'"{body}"'))
+    assert_is_flight(read(tmp_path, columns(turned_log), frames__world=f'"{world}"', frames__body=f'"{body}"'))
 
 
-def test_an_attitude_may_have_axes_of_its_own(tmp_path):
+def test_attitude_may_have_separate_axes(tmp_path):
     ned = np.swapaxes(to_world("NED")[None], 1, 2) @ FLIGHT.R @ to_body("FRD")
     table = columns(dataclasses.replace(FLIGHT, R=ned))
     with pytest.raises(LogError, match=r'attitude.world = "NED" and attitude.body = "FRD" they would'):
         read(tmp_path, table)
-    is_the_flight(read(tmp_path, table, attitude__world='"NED"', attitude__body='"FRD"'))
+    assert_is_flight(read(tmp_path, table, attitude__world='"NED"', attitude__body='"FRD"'))
 
 
 def test_rotation_vectors_and_parts_of_lists(tmp_path):
@@ -161,12 +161,12 @@ def test_rotation_vectors_and_parts_of_lists(tmp_path):
     table = TABLE | {f"r{i}": vectors[:, i] for i in range(3)}
     log = read(tmp_path, table, attitude__fields='["r0", "r1", "r2"]', attitude__form='"rotation vector"',
                attitude__unit='"deg"')  # fmt: skip
-    is_the_flight(log)
+    assert_is_flight(log)
 
 
-def test_alternatives_and_names_in_other_letters(tmp_path):
+def test_alternative_and_capitalised_names(tmp_path):
     log = read(tmp_path, TABLE, velocity__fields='["speed_x|vx", "VY", "vz|wz"]', time__field='"T"')
-    is_the_flight(log)
+    assert_is_flight(log)
 
 
 @pytest.mark.parametrize(
@@ -181,13 +181,13 @@ def test_alternatives_and_names_in_other_letters(tmp_path):
         ({"thrust__full": "65535.0"}, 'full goes with unit = "share"'),
     ],
 )
-def test_axes_that_are_none_are_named(changes, text, tmp_path):
+def test_invalid_axes_are_refused(changes, text, tmp_path):
     with pytest.raises(ConfigError, match=text):
         read_map(write_map(tmp_path / "map.toml", **changes))
 
 
-def test_an_attitude_that_explains_little_is_read_with_a_warning(tmp_path):
-    """A tilt that wanders: no statement of the map mends it."""
+def test_unexplained_attitude_gives_warning(tmp_path):
+    """The tilt drifts, and no statement of the map corrects this."""
     off = 0.9 * np.sin(np.stack([2.3 * FLIGHT.t, 1.7 * FLIGHT.t + 1.0, 0.0 * FLIGHT.t], axis=1))
     noise = Rotation.from_matrix(FLIGHT.R) * Rotation.from_rotvec(off)
     table = columns(dataclasses.replace(FLIGHT, R=noise.as_matrix()))
@@ -199,7 +199,7 @@ def test_an_attitude_that_explains_little_is_read_with_a_warning(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["noise", "voltage", "constant", "sawtooth"])
-def test_a_column_that_is_not_the_thrust_is_read_with_a_warning(kind, tmp_path):
+def test_column_that_is_not_thrust_gives_warning(kind, tmp_path):
     rng, t = np.random.default_rng(0), FLIGHT.t
     column = {"noise": 0.5 + 0.1 * rng.random(len(t)), "voltage": 16.2 - 0.02 * t - 0.05 * (FLIGHT.c - FLIGHT.c.mean()),
               "constant": np.full(len(t), 0.5), "sawtooth": 0.4 + 0.2 * np.mod(t / 1.7, 1.0)}[kind]  # fmt: skip
@@ -209,8 +209,8 @@ def test_a_column_that_is_not_the_thrust_is_read_with_a_warning(kind, tmp_path):
     assert ("thrust is 0.5 throughout" in log.notes) == (kind == "constant")
 
 
-def test_rates_that_are_not_commanded_are_not_used(tmp_path):
-    """As those of a message whose type mask says to ignore them."""
+def test_rates_masked_as_unused_are_ignored(tmp_path):
+    """The type mask of such a message states that its rates are ignored."""
     log = read(tmp_path, TABLE | {name: 0.0 * TABLE[name] for name in ("wx", "wy", "wz")})
     assert log.command is None
     assert "rates are 0 throughout, and are not used" in log.notes

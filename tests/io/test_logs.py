@@ -1,4 +1,4 @@
-"""A log in any units and frames is the same flight; damage of every kind is named, and never a crash."""
+"""A log in any units and frames gives the same flight; damage of every kind is reported and never crashes."""
 
 import contextlib
 import dataclasses
@@ -24,8 +24,8 @@ def read(tmp_path, table, text=MAP, **changes):
     return read_flight_log(path, read_map(write_map(tmp_path / "map.toml", text, **changes)))
 
 
-def agrees(log, flight, places=1e-6):
-    """The log is the flight, but for the two ticks at each end that have no derivative."""
+def assert_agrees(log, flight, places=1e-6):
+    """Assert that the log equals the flight, except for the two ticks at each end that have no derivative."""
     assert len(log.t) == len(flight.t)
     for result, true in ((log.p, flight.p), (log.R, flight.R), (log.v, flight.v), (log.c, flight.c)):
         np.testing.assert_allclose(result, true, atol=places)
@@ -34,9 +34,9 @@ def agrees(log, flight, places=1e-6):
     assert log.valid[2:-2].all()
 
 
-def test_a_plain_log_is_the_flight(tmp_path):
+def test_plain_log_is_flight(tmp_path):
     log = read(tmp_path, columns(FLIGHT))
-    agrees(log, FLIGHT)
+    assert_agrees(log, FLIGHT)
     assert log.dt == pytest.approx(0.02)
     assert log.notes == ()
     np.testing.assert_allclose(log.rates[1:-1], 0.5 * (FLIGHT.omega[1:-1] + FLIGHT.omega[:-2]), atol=0.05)
@@ -57,21 +57,21 @@ def test_units_are_converted(tmp_path):
         attitude__fields='["roll", "pitch", "yaw"]', attitude__form='"roll pitch yaw"', attitude__unit='"deg"',
         thrust__unit='"g"', rates__unit='"deg/s"',
     )  # fmt: skip
-    agrees(log, FLIGHT, 1e-5)
+    assert_agrees(log, FLIGHT, 1e-5)
 
 
-def test_frames_are_turned(tmp_path):
+def test_frames_are_converted(tmp_path):
     log = read(tmp_path, columns(turned_frames(FLIGHT)), frames__world='"NED"', frames__body='"FRD"')
-    agrees(log, FLIGHT)
+    assert_agrees(log, FLIGHT)
 
 
 def test_velocities_in_body_axes_and_inverse_attitudes(tmp_path):
     body = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.v)
     table = columns(dataclasses.replace(FLIGHT, v=body, R=np.swapaxes(FLIGHT.R, 1, 2)))
-    agrees(read(tmp_path, table, velocity__axes='"body"', attitude__turns='"world to body"'), FLIGHT)
+    assert_agrees(read(tmp_path, table, velocity__axes='"body"', attitude__turns='"world to body"'), FLIGHT)
 
 
-def test_a_share_of_the_thrust_is_found_from_the_flight_or_told(tmp_path):
+def test_thrust_scale_is_estimated_or_given(tmp_path):
     table = columns(FLIGHT)
     table["c"] = -0.5 * table["c"] / G[2]
     result = read(tmp_path, table, thrust__unit='"share"', thrust__positive='"down"')
@@ -83,14 +83,14 @@ def test_a_share_of_the_thrust_is_found_from_the_flight_or_told(tmp_path):
     np.testing.assert_allclose(read(tmp_path, newton, thrust__unit='"N"', thrust__mass="1.3").c, FLIGHT.c, rtol=1e-6)
 
 
-def test_an_accelerometer_is_the_derivative_of_the_velocity(tmp_path):
+def test_accelerometer_equals_derivative_of_velocity(tmp_path):
     specific_force = np.einsum("nji,nj->ni", FLIGHT.R, FLIGHT.a + G)
     table = columns(FLIGHT) | {f"f{a}": specific_force[:, i] for i, a in enumerate("xyz")}
     log = read(tmp_path, table, acceleration__fields='["fx", "fy", "fz"]')
     np.testing.assert_allclose(log.a, FLIGHT.a, atol=1e-5)
 
 
-def test_a_faster_log_is_interpolated_and_a_slower_one_has_its_own_tick(tmp_path):
+def test_fast_log_is_interpolated_and_slow_log_keeps_its_tick(tmp_path):
     fast = read(tmp_path, columns(fly_once(6.0, dt=0.004)))
     slow = fly_once(6.0, dt=0.02)
     assert fast.dt == 0.02
@@ -100,7 +100,7 @@ def test_a_faster_log_is_interpolated_and_a_slower_one_has_its_own_tick(tmp_path
     assert rare.dt == pytest.approx(0.05)
 
 
-def test_samples_that_are_missing_are_left_out(tmp_path):
+def test_missing_samples_are_excluded(tmp_path):
     table = {name: np.delete(x, np.s_[200:260]) for name, x in columns(FLIGHT).items()}
     table["px"][100] = np.nan
     log = read(tmp_path, table)
@@ -113,7 +113,7 @@ def test_samples_that_are_missing_are_left_out(tmp_path):
         [np.interp(log.t[log.valid], FLIGHT.t, FLIGHT.p[:, i]) for i in range(3)], axis=1), atol=1e-3)  # fmt: skip
 
 
-def test_ages_bring_states_to_their_own_time(tmp_path):
+def test_ages_shift_states_to_their_time(tmp_path):
     table = columns(FLIGHT) | {"age": np.full(len(FLIGHT.t), 0.04)}
     log = read(tmp_path, table, time__age='"age"')
     np.testing.assert_allclose(log.c[:100], FLIGHT.c[:100], atol=1e-6)
@@ -123,7 +123,7 @@ def test_ages_bring_states_to_their_own_time(tmp_path):
 EPOCH = 1.7e9
 
 
-def exact(path, table):
+def write_exact(path, table):
     """Write columns with all the digits that a time since 1970 needs."""
     rows = zip(*table.values(), strict=True)
     path.write_text("\n".join([",".join(table), *(",".join(repr(float(x)) for x in row) for row in rows)]))
@@ -132,10 +132,10 @@ def exact(path, table):
 
 @pytest.mark.parametrize("stamp", [0.0, EPOCH - 300.0, EPOCH + 900.0, 1.8e13, np.nan])
 @pytest.mark.parametrize("place", [0, 1, 300, -1])
-def test_a_sample_with_an_impossible_time_is_left_out(stamp, place, tmp_path):
+def test_sample_with_impossible_time_is_excluded(stamp, place, tmp_path):
     table = columns(FLIGHT) | {"t": EPOCH + FLIGHT.t}
     table["t"][place] = stamp
-    log = read_flight_log(exact(tmp_path / "log.csv", table), read_map(write_map(tmp_path / "map.toml")))
+    log = read_flight_log(write_exact(tmp_path / "log.csv", table), read_map(write_map(tmp_path / "map.toml")))
     assert any("1 of 601 samples" in note for note in log.notes)
     assert log.valid.sum() > 585
     np.testing.assert_allclose(log.c[log.valid], np.interp(
@@ -143,8 +143,8 @@ def test_a_sample_with_an_impossible_time_is_left_out(stamp, place, tmp_path):
 
 
 @pytest.mark.parametrize("back", [0.01, 0.025, 0.4])
-def test_commands_that_overtake_each_other_are_left_out(back, tmp_path):
-    """Stamps are taken in two threads; what is commanded is held over the place of what came late."""
+def test_commands_out_of_order_are_excluded(back, tmp_path):
+    """Two threads stamp the commands; the previous command is held in place of a late one."""
     series = Series(EPOCH + FLIGHT.t.copy(), FLIGHT.c[:, None])
     series.t[7::50] -= back
     result, notes = in_order(series, "thrust", Path("log"))
@@ -153,14 +153,14 @@ def test_commands_that_overtake_each_other_are_left_out(back, tmp_path):
     assert len(result.t) == 601 - (12 if back > 0.02 else 0)
 
 
-def test_times_that_go_back_are_told_since_the_beginning():
+def test_backward_times_are_reported_relative_to_start():
     t = EPOCH + np.concatenate([FLIGHT.t, FLIGHT.t])
     with pytest.raises(LogError, match=r"goes back 1 times, first by 12\.000 s, 12\.000 s after the beginning"):
         in_order(Series(t, np.ones((len(t), 1))), "thrust", Path("log"))
 
 
 @pytest.mark.parametrize("dt", [0.096, 0.1016, 0.104])
-def test_ten_samples_a_second_are_enough(dt, tmp_path):
+def test_ten_samples_per_second_suffice(dt, tmp_path):
     log = read(tmp_path, columns(fly_once(40.0, dt=dt)))
     assert log.dt == pytest.approx(dt, rel=1e-3)
     assert log.seconds > 39.0
@@ -180,14 +180,14 @@ WINDY = fly_once(12.0, wind=(6.0, -2.0, 1.0))
         (1.0 / 9.80665, {"thrust__unit": '"g"'}),
     ],
 )
-def test_a_strong_wind_is_no_mistake_of_the_map(factor, changes, tmp_path):
+def test_strong_wind_is_not_a_map_error(factor, changes, tmp_path):
     table = columns(WINDY) | {"c": factor * WINDY.c}
     log = read(tmp_path, table, **changes)
     assert log.valid[2:-2].all()
 
 
 @pytest.mark.parametrize("form", ["matrix", "roll pitch yaw"])
-def test_a_strong_wind_is_no_mistake_of_other_attitudes(form, tmp_path):
+def test_strong_wind_is_not_an_attitude_error(form, tmp_path):
     attitudes, table = Rotation.from_matrix(WINDY.R), columns(WINDY)
     values = WINDY.R.reshape(-1, 9) if form == "matrix" else attitudes.as_euler("ZYX")[:, ::-1]
     table |= {f"r{i}": values[:, i] for i in range(values.shape[1])}
@@ -205,11 +205,11 @@ def test_a_strong_wind_is_no_mistake_of_other_attitudes(form, tmp_path):
 # ---- damage
 
 
-def spoil(name, change):
-    def spoilt(table):
+def modify(name, change):
+    def modified_log(table):
         return table | {name: change(table[name].copy())}
 
-    return spoilt
+    return modified_log
 
 
 def with_nan(x):
@@ -243,7 +243,7 @@ def in_body_axes(table):
     return table | {f"v{a}": body[:, i] for i, a in enumerate("xyz")}
 
 
-def still(table):
+def at_rest(table):
     return table | {name: np.full_like(table[name], table[name][0]) for name in ("px", "py", "pz")}
 
 
@@ -264,13 +264,13 @@ def frd(table):
 
 DAMAGED_TABLES = {
     "no column": (lambda table: {n: x for n, x in table.items() if n != "pz"}, "no field 'pz'; there are t, px"),
-    "nothing finite": (spoil("vx", with_nan), "velocity has no finite sample"),
-    "time stands still": (spoil("t", lambda t: 0 * t), "all at one time"),
-    "time goes back": (spoil("t", back), "goes back 1 times.*several flights"),
+    "nothing finite": (modify("vx", with_nan), "velocity has no finite sample"),
+    "time stands still": (modify("t", lambda t: 0 * t), "all at one time"),
+    "time goes back": (modify("t", back), "goes back 1 times.*several flights"),
     "time in ms": (scale(1000.0, "t"), "every 20 s.*is time in ms"),
     "time too fine": (scale(1e-6, "t"), "is time in ms, us or ns"),
     "two flights": (
-        spoil("t", lambda t: np.concatenate([t[:300], t[: len(t) - 300]])),
+        modify("t", lambda t: np.concatenate([t[:300], t[: len(t) - 300]])),
         "back 1 times, first by 5.980 s",
     ),
     "too short": (lambda table: {n: x[:20] for n, x in table.items()}, "of flight are left, at least 1 s"),
@@ -293,13 +293,13 @@ DAMAGED_TABLES = {
     "thrust downwards": (negate("c"), 'thrust is never above zero.*positive = "down"'),
     "thrust in g": (scale(1 / 9.80665, "c"), 'thrust.unit = "g" they would'),
     "thrust of nothing": (scale(0.0, "c"), "thrust is 0 throughout; thrust.fields must name"),
-    "position does not change": (still, "position"),
+    "position does not change": (at_rest, "position"),
     "positions of another time": (other_time, "position"),
 }
 
 
 @pytest.mark.parametrize("kind", DAMAGED_TABLES)
-def test_damaged_tables_are_named(kind, tmp_path):
+def test_damaged_tables_are_refused(kind, tmp_path):
     damage, text = DAMAGED_TABLES[kind]
     with pytest.raises(LogError, match=f"(?s)log.csv.*{text}") as error:
         read(tmp_path, damage(columns(FLIGHT)))
@@ -332,7 +332,7 @@ DAMAGED_FILES = {
 
 
 @pytest.mark.parametrize("kind", DAMAGED_FILES)
-def test_damaged_files_are_named(kind, tmp_path):
+def test_damaged_files_are_refused(kind, tmp_path):
     damage, text = DAMAGED_FILES[kind]
     path = tmp_path / "log.csv"
     path.write_text(damage(text_of(tmp_path)))
@@ -340,14 +340,14 @@ def test_damaged_files_are_named(kind, tmp_path):
         read_flight_log(path, read_map(write_map(tmp_path / "map.toml")))
 
 
-def test_a_torn_last_line_is_left_out(tmp_path):
+def test_incomplete_last_line_is_excluded(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(text_of(tmp_path)[:-30])
     log = read_flight_log(path, read_map(write_map(tmp_path / "map.toml")))
     assert any("torn" in note for note in log.notes)
 
 
-def test_positions_that_jump_or_freeze_are_left_out(tmp_path):
+def test_jumping_or_frozen_positions_are_excluded(tmp_path):
     table = columns(FLIGHT)
     table["px"][200:] += 3.0
     for name in ("px", "py", "pz"):
@@ -359,7 +359,7 @@ def test_positions_that_jump_or_freeze_are_left_out(tmp_path):
     assert log.valid.mean() > 0.9
 
 
-def test_time_on_the_ground_is_left_out(tmp_path):
+def test_time_on_ground_is_excluded(tmp_path):
     n, table = 200, columns(FLIGHT)
     before = {name: np.full(n, x[0]) for name, x in table.items()}
     before |= {"t": 0.02 * np.arange(-n, 0), "c": np.zeros(n)} | {f"v{a}": np.zeros(n) for a in "xyz"}
@@ -383,12 +383,12 @@ def test_time_on_the_ground_is_left_out(tmp_path):
         ({"altitude__fields": '["z"]'}, "unknown key; "),
     ],
 )
-def test_wrong_maps_are_named(change, text, tmp_path):
+def test_wrong_maps_are_refused(change, text, tmp_path):
     with pytest.raises(ConfigError, match=text):
         read_map(write_map(tmp_path / "map.toml", **change))
 
 
-def test_what_is_no_log_is_named(tmp_path):
+def test_other_files_are_refused(tmp_path):
     for name, data, text in (
         ("log.xyz", b"1", "no log that is known"),
         ("log.npz", b"PK junk", "not a whole NPZ"),
@@ -423,8 +423,8 @@ def test_what_is_no_log_is_named(tmp_path):
         read_flight_log(tmp_path, read_map("retrim-mcap"))
 
 
-def test_noise_is_never_a_flight(tmp_path):
-    """Any bytes in any format give one line, and no other error."""
+def test_random_bytes_give_one_line(tmp_path):
+    """Random bytes in any format give one line and no other error."""
     rng, choice = np.random.default_rng(0), read_map(write_map(tmp_path / "map.toml"))
     whole = text_of(tmp_path).encode()
     for k in range(60):
@@ -442,8 +442,8 @@ DAMAGED = (0.0, np.nan, np.inf, 1e308, -1e308, 1e-308, 1e30, -1.0, 1e9)
 
 
 @pytest.mark.parametrize("missing", ["nothing", "velocity", "position"])
-def test_damaged_numbers_are_one_line_or_a_flight_that_is_finite(missing, tmp_path):
-    """Any number in any column, once, for a while or throughout."""
+def test_damaged_numbers_give_one_line_or_finite_flight(missing, tmp_path):
+    """Any number in any column may be damaged once, for an interval, or throughout."""
     rng, short = np.random.default_rng(1), columns(fly_once(3.0))
     text = MAP if missing == "nothing" else re.sub(rf"\[{missing}\]\n.*\n", "", MAP)
     maps = [read_map(write_map(tmp_path / "map.toml", text, thrust__unit=unit)) for unit in ('"m/s^2"', '"share"')]

@@ -1,4 +1,4 @@
-"""The same flight as autopilots and their tools log it: without a map it is known by its fields."""
+"""The same flight in the formats of autopilots and their tools: without a map, its fields identify the format."""
 
 import dataclasses
 
@@ -19,8 +19,8 @@ FLIGHT = fly_once(8.0)
 Q = Rotation.from_matrix(FLIGHT.R).as_quat()
 
 
-def is_the_flight(log, places=1e-4, command=True):
-    """The residual is zero, and the states are those of the flight."""
+def assert_is_flight(log, places=1e-4, command=True):
+    """Assert that the residual is zero, and that the states are those of the flight."""
     start = round(float(np.argmin(np.linalg.norm(FLIGHT.p - log.p[10], axis=1)))) - 10
     part = slice(start, start + len(log.t))
     np.testing.assert_allclose(log.p[:200], FLIGHT.p[part][:200], atol=places)
@@ -42,43 +42,43 @@ def test_every_name_is_a_map():
 @pytest.mark.parametrize("jitter", [0.0, 0.006])
 @pytest.mark.parametrize("old", [False, True])
 def test_px4_over_dds(old, jitter, tmp_path):
-    """Both layouts of its odometry; times are those of the messages, whenever they are received."""
+    """The log has either layout of the odometry, and times are those in the messages, regardless of their reception."""
     pytest.importorskip("rosbags")
     folder = "/fmu/{}/" if not old else "/fmu/"
     messages = px4_messages(FLIGHT, old=old, jitter=jitter, folder=folder)
     log = read_flight_log(bag2(tmp_path / "fmu", PX4_OLD_ODOMETRY if old else PX4_ODOMETRY, messages))
-    is_the_flight(log, 2e-3 if jitter and old else 1e-4)
+    assert_is_flight(log, 2e-3 if jitter and old else 1e-4)
 
 
-def test_commands_of_another_clock_are_brought_to_that_of_the_recorder(tmp_path):
-    """An offboard computer stamps by the time of day, the autopilot since it started."""
+def test_command_clock_is_converted_to_recorder_clock(tmp_path):
+    """An offboard computer uses the time of day, and the autopilot the time since its start."""
     pytest.importorskip("rosbags")
     messages = px4_messages(FLIGHT, clock=lambda t: round(1.7e15 + 1e6 * t))
     log = read_flight_log(bag2(tmp_path / "fmu", PX4_ODOMETRY, messages))
-    is_the_flight(log, 1e-3)
+    assert_is_flight(log, 1e-3)
     assert any("clocks of their own" in note for note in log.notes)
 
 
-def test_commands_without_a_stamp_have_the_time_of_reception(tmp_path):
+def test_commands_without_stamp_use_time_of_reception(tmp_path):
     pytest.importorskip("rosbags")
     log = read_flight_log(bag2(tmp_path / "fmu", PX4_ODOMETRY, px4_messages(FLIGHT, clock=lambda t: 0)))
-    is_the_flight(log, 1e-3)
+    assert_is_flight(log, 1e-3)
     assert any("no stamps; its times are those of reception" in note for note in log.notes)
 
 
-def test_a_namespace_and_a_version_in_the_names_of_topics(tmp_path):
+def test_namespace_and_version_in_topic_names(tmp_path):
     pytest.importorskip("rosbags")
     messages = [
         (topic + "_v1" * ("odometry" in topic), *rest) for topic, *rest in px4_messages(FLIGHT, folder="/uav3/fmu/{}/")
     ]
-    is_the_flight(read_flight_log(bag2(tmp_path / "fmu", PX4_ODOMETRY, messages)))
+    assert_is_flight(read_flight_log(bag2(tmp_path / "fmu", PX4_ODOMETRY, messages)))
     two = messages + [("/uav4" + topic[5:], *rest) for topic, *rest in messages]
     with pytest.raises(LogError, match=r"fits several topics: /uav3/fmu/out/vehicle_odometry_v1, /uav4/.*; name one"):
         read_flight_log(bag2(tmp_path / "two", PX4_ODOMETRY, two))
 
 
-def test_the_map_names_the_time_of_messages(tmp_path):
-    """A message of one's own without a header, in milliseconds."""
+def test_map_states_time_field_of_messages(tmp_path):
+    """A custom message has no header, and a time in milliseconds."""
     pytest.importorskip("rosbags")
     kind, rng = "mine_msgs/msg/State", np.random.default_rng(0)
     definition = {kind: "float64 at\nfloat64[3] p\nfloat64[3] v\nfloat64[4] q\nfloat64[3] w\nfloat64 c\n"}
@@ -100,13 +100,13 @@ def test_the_map_names_the_time_of_messages(tmp_path):
     rates.fields = ["/state.w"]
     """)
     log = read_flight_log(path, read_map(tmp_path / "map.toml"))
-    is_the_flight(log, 1e-6)
+    assert_is_flight(log, 1e-6)
     assert not any("reception" in note for note in log.notes)
 
 
 @pytest.mark.parametrize("pose", [False, True])
 def test_mavros(pose, tmp_path):
-    """Odometry with velocities in body axes; or poses and velocities in world axes."""
+    """The log has odometry with velocities in body axes, or poses and velocities in world axes."""
     pytest.importorskip("rosbags")
     from rosbags.typesys import Stores, get_typestore
 
@@ -141,7 +141,7 @@ def test_mavros(pose, tmp_path):
 
     definition = {target: "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Vector3 body_rate\nfloat32 thrust\n"}
     log = read_flight_log(bag2(tmp_path / "bag", definition, messages(), store))
-    is_the_flight(log, 1e-3)
+    assert_is_flight(log, 1e-3)
 
 
 @pytest.mark.parametrize("kind", ["thrust", "controls"])
@@ -157,11 +157,11 @@ def test_px4_before_1_10(kind, tmp_path):
     else:
         topics["actuator_controls_0"] = {"control": ("float[8]", np.repeat(share[:, None], 8, axis=1))}
     (tmp_path / "old.ulg").write_bytes(ulog(topics, stamps))
-    is_the_flight(read_flight_log(tmp_path / "old.ulg"), 1e-4)
+    assert_is_flight(read_flight_log(tmp_path / "old.ulg"), 1e-4)
 
 
-def test_a_ulog_may_have_another_time(tmp_path):
-    """Its topics' own stamps are late by up to 8 ms; the field that the map names is not."""
+def test_ulog_may_use_other_time_field(tmp_path):
+    """The stamps of the topics are late by up to 8 ms, and the field named by the map is exact."""
     pytest.importorskip("pyulog")
     topics, stamps = px4_topics(FLIGHT)
     for fields in topics.values():
@@ -169,11 +169,11 @@ def test_a_ulog_may_have_another_time(tmp_path):
     late = stamps + np.random.default_rng(0).integers(0, 8000, len(stamps))
     (tmp_path / "late.ulg").write_bytes(ulog(topics, late))
     choice = dataclasses.replace(read_map("px4"), time=Time("sampled", "us"))
-    is_the_flight(read_flight_log(tmp_path / "late.ulg", choice), 1e-4)
+    assert_is_flight(read_flight_log(tmp_path / "late.ulg", choice), 1e-4)
 
 
 def crazyflie(compressed, quaternion):
-    """Columns of its log variables; pitch and its rates are positive nose up."""
+    """Return columns of its log variables; pitch and its rate are positive nose up."""
     yaw, pitch, roll = Rotation.from_matrix(FLIGHT.R).as_euler("ZYX", degrees=True).T
     message = np.degrees(FLIGHT.omega)
     table = {"timestamp": 1000.0 * FLIGHT.t + 4000.0}
@@ -200,14 +200,14 @@ def crazyflie(compressed, quaternion):
 
 @pytest.mark.parametrize("quaternion", [False, True])
 @pytest.mark.parametrize("compressed", [False, True])
-def test_a_crazyflie(compressed, quaternion, tmp_path):
+def test_crazyflie(compressed, quaternion, tmp_path):
     log = read_flight_log(write_csv(tmp_path / "log.csv", crazyflie(compressed, quaternion)))
-    is_the_flight(log, 1e-5)
+    assert_is_flight(log, 1e-5)
     assert log.warnings == ()
 
 
 def test_crazyswarm_has_poses_without_velocities(tmp_path):
-    """Poses of motion capture at 100 Hz, and thrust as it is sent, which has no header."""
+    """The log has poses of motion capture at 100 Hz, and commanded thrust without a header."""
     pytest.importorskip("rosbags")
     from rosbags.typesys import Stores, get_typestore
 
@@ -229,7 +229,7 @@ def test_crazyswarm_has_poses_without_velocities(tmp_path):
             yield "/cf7/cmd_vel_legacy", "geometry_msgs/msg/Twist", now + 100, message
 
     log = read_flight_log(bag2(tmp_path / "bag", {}, messages(), store))
-    is_the_flight(log, 1e-3, command=False)
+    assert_is_flight(log, 1e-3, command=False)
     assert any("velocity is the derivative of the position" in note for note in log.notes)
 
 
@@ -245,12 +245,12 @@ FOUR = ", ".join(f'"motor.m{i}"' for i in range(1, 5))
 
 
 def motors_of(shares):
-    """Pulse widths with the thrust 0.4 s + 0.6 s^2, of motors that differ although their sum does not."""
+    """Return pulse widths with the thrust 0.4 s + 0.6 s^2, of motors that differ although their sum does not."""
     square = np.sqrt(0.16 + 2.4 * shares) / 1.2 - 1.0 / 3.0
     return {f"motor.m{i}": 1000.0 * (1.0 + square) for i in range(1, 5)}
 
 
-def test_motors_are_a_thrust(tmp_path):
+def test_motors_give_thrust(tmp_path):
     table = crazyflie(False, False) | motors_of(0.5 * FLIGHT.c / G[2])
     choice = tmp_path / "map.toml"
     choice.write_text(MOTORS.format(FOUR))
@@ -266,7 +266,7 @@ def test_motors_are_a_thrust(tmp_path):
     assert told.full_thrust == pytest.approx(2.0 * G[2], rel=1e-6)
 
 
-def test_three_numbers_are_no_thrust(tmp_path):
+def test_three_motors_are_refused(tmp_path):
     choice = tmp_path / "map.toml"
     choice.write_text(MOTORS.format('"motor.m1", "motor.m2", "motor.m3"'))
     table = crazyflie(False, False) | motors_of(0.5 * FLIGHT.c / G[2])
@@ -275,7 +275,7 @@ def test_three_numbers_are_no_thrust(tmp_path):
 
 
 @pytest.mark.parametrize(("period", "jitter"), [(0.02, 0.006), (0.004, 0.003)])
-def test_messages_of_an_even_rate_are_not_as_late_as_they_are_received(period, jitter):
+def test_jitter_of_regular_messages_is_removed(period, jitter):
     rng = np.random.default_rng(0)
     sending = 1.7e9 + period * np.arange(1200)
     arrival = np.maximum.accumulate(sending + 0.003 + np.abs(rng.normal(0.0, jitter, 1200)))
@@ -286,7 +286,7 @@ def test_messages_of_an_even_rate_are_not_as_late_as_they_are_received(period, j
 
 
 @pytest.mark.parametrize("kind", ["uneven", "lost", "few"])
-def test_messages_of_no_even_rate_have_the_time_of_reception(kind):
+def test_irregular_messages_use_time_of_reception(kind):
     rng = np.random.default_rng(0)
     arrival = {
         "uneven": np.cumsum(rng.uniform(0.0, 0.04, 1000)),
@@ -298,8 +298,8 @@ def test_messages_of_no_even_rate_have_the_time_of_reception(kind):
     np.testing.assert_array_equal(result, arrival)
 
 
-def test_thrust_without_a_header_beside_odometry_with_one(tmp_path):
-    """A number of std_msgs, received late by up to 20 ms."""
+def test_thrust_without_header_and_odometry_with_header(tmp_path):
+    """The thrust is a number of std_msgs, received up to 20 ms late."""
     pytest.importorskip("rosbags")
     from rosbags.typesys import Stores, get_typestore
 

@@ -1,4 +1,4 @@
-"""Policies with their presets, and what a flight has learnt: exact round trips; headers that lie are refused."""
+"""Policies with their presets, and learner states: exact round trips; false headers are refused."""
 
 import json
 import time
@@ -30,7 +30,7 @@ def setup():
 
 @pytest.fixture(scope="module")
 def states(setup):
-    """A learner state of each method with numbers in every leaf: weights, moments and counters."""
+    """Return a learner state of each method with numbers in every leaf: weights, moments and counters."""
     policy = setup.new_policy(random.key(4))
 
     def fill(leaf):
@@ -44,7 +44,7 @@ def states(setup):
 
 
 def with_limits(policy, tree):
-    """A tree whose policies have the command limits of ``policy``."""
+    """Return a tree whose policies have the command limits of ``policy``."""
 
     def limit(part):
         return policy.with_params(part.layers) if isinstance(part, Policy) else part
@@ -53,7 +53,7 @@ def with_limits(policy, tree):
 
 
 def preset_with(preset, **values):
-    """JSON of a preset with values that no check has seen, as in ``pretrain={"horizon": 10**9}``."""
+    """Return the JSON of a preset with unchecked values, for example ``pretrain={"horizon": 10**9}``."""
     tables = json.loads(dump(preset))
     for name, value in values.items():
         tables[name] = tables[name] | value if isinstance(value, dict) else value
@@ -107,15 +107,15 @@ SIZES |= {
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_comes_back_from_its_file(tmp_path, name):
+def test_every_preset_survives_its_file(tmp_path, name):
     preset = changed(load(name), pretrain={"hidden_sizes": (8,)})
     policy = Policy.of(SIZES[name], small(), key=random.key(0), hidden=(8,))
     save_policy(tmp_path / "policy.safetensors", policy, preset)
     assert load_policy(tmp_path)[1] == preset
 
 
-def test_a_policy_is_read_without_its_preset(tmp_path):
-    """A file whose preset is gone or of another version: weights and header are still read, and never its preset."""
+def test_policy_is_read_without_its_preset(tmp_path):
+    """If the preset is missing or of a different version, weights and header are still readable."""
     policy = Policy.of(15, small(), key=random.key(0), hidden=(8,))
     path = tmp_path / "policy.safetensors"
     for about in ({}, {"preset": "of another version"}):
@@ -128,7 +128,7 @@ def test_a_policy_is_read_without_its_preset(tmp_path):
 
 
 @pytest.mark.parametrize(("values", "message"), LIES)
-def test_a_header_that_lies_is_refused_even_with_a_checksum(tmp_path, setup, values, message):
+def test_false_header_with_valid_checksum_is_refused(tmp_path, setup, values, message):
     path = tmp_path / "policy.safetensors"
     write_policy(path, setup.new_policy(random.key(4)), {"preset": preset_with(setup.preset, **values)})
     with pytest.raises(CheckpointError, match=message) as error:
@@ -140,7 +140,7 @@ def test_a_header_that_lies_is_refused_even_with_a_checksum(tmp_path, setup, val
 
 
 @pytest.mark.parametrize("method", ["full", "lora"])
-def test_what_was_learnt_comes_back_bit_for_bit(tmp_path, setup, states, method):
+def test_learner_state_survives_bit_for_bit(tmp_path, setup, states, method):
     path = tmp_path / "deep" / "learner_state.safetensors"
     save_learner_state(path, states[method], setup.preset)
     result, preset = load_learner_state(path)
@@ -151,8 +151,8 @@ def test_what_was_learnt_comes_back_bit_for_bit(tmp_path, setup, states, method)
         np.testing.assert_array_equal(a, b)
 
 
-def rewritten(path, setup, state, preset, **header):
-    """Write a state with any header, and with the checksum of both."""
+def rewrite(path, setup, state, preset, **header):
+    """Write a state with any header, and a valid checksum."""
     policy = state.policy.policy
     low_rank = lora_header(policy) if hasattr(policy, "delta") else {}
     about = {"preset": preset, "architecture": architecture(policy.merged()), **low_rank} | header
@@ -160,9 +160,9 @@ def rewritten(path, setup, state, preset, **header):
 
 
 @pytest.mark.parametrize(("values", "message"), LIES)
-def test_a_header_of_learnt_weights_that_lies_is_refused(tmp_path, setup, states, values, message):
+def test_false_header_of_learner_state_is_refused(tmp_path, setup, states, values, message):
     path = tmp_path / "learner_state.safetensors"
-    rewritten(path, setup, states["full"], preset_with(setup.preset, **values))
+    rewrite(path, setup, states["full"], preset_with(setup.preset, **values))
     with pytest.raises(CheckpointError, match=message):
         load_learner_state(path)
 
@@ -179,14 +179,14 @@ def test_a_header_of_learnt_weights_that_lies_is_refused(tmp_path, setup, states
         ({"architecture": "everything"}, "architecture everything, but its preset"),
     ],
 )
-def test_a_low_rank_header_that_lies_is_refused(tmp_path, setup, states, header, message):
+def test_false_low_rank_header_is_refused(tmp_path, setup, states, header, message):
     path = tmp_path / "learner_state.safetensors"
-    rewritten(path, setup, states["lora"], dump(setup.preset), **header)
+    rewrite(path, setup, states["lora"], dump(setup.preset), **header)
     with pytest.raises(CheckpointError, match=message):
         load_learner_state(path)
 
 
-def test_a_policy_is_not_what_was_learnt(tmp_path, setup, states):
+def test_policy_is_not_a_learner_state(tmp_path, setup, states):
     path = tmp_path / "file.safetensors"
     save_policy(path, setup.new_policy(random.key(4)), setup.preset)
     with pytest.raises(CheckpointError, match="holds a 'policy', expected a 'learnt'"):
@@ -198,7 +198,7 @@ def test_a_policy_is_not_what_was_learnt(tmp_path, setup, states):
         load_learner_state(tmp_path / "nothing")
 
 
-# ---- numbers that are finite and cannot be flown
+# ---- numbers that are finite and unsuitable for flight
 
 
 def with_leaf(tree, where, value):
@@ -215,7 +215,7 @@ def with_leaf(tree, where, value):
         (lambda p: p.u_max.c, 0.0, "do not enclose hover"),
     ],
 )
-def test_a_policy_whose_numbers_cannot_be_flown_is_refused(tmp_path, setup, states, where, value, message):
+def test_unflyable_policy_is_refused(tmp_path, setup, states, where, value, message):
     policy = setup.new_policy(random.key(4))
     save_policy(tmp_path / "p.safetensors", with_leaf(policy, where, value), setup.preset)
     with pytest.raises(CheckpointError, match=message):
@@ -226,19 +226,19 @@ def test_a_policy_whose_numbers_cannot_be_flown_is_refused(tmp_path, setup, stat
         load_learner_state(tmp_path / "l.safetensors")
 
 
-def test_a_delta_is_judged_by_what_it_makes_of_its_base(tmp_path, setup, states):
+def test_delta_is_checked_with_its_base(tmp_path, setup, states):
     lora = states["lora"].policy.policy
     for value, path in ((1e39, tmp_path / "a"), (1e9, tmp_path / "b")):
         save_delta(path, eqx.tree_at(lambda p: p.scale, lora, value))
         with pytest.raises(CheckpointError, match=r"merged: 0\.weight holds .* at most 100000 can be flown"):
             load_delta(path, lora.base)
     state = eqx.tree_at(lambda s: s.policy.policy.scale, states["lora"], jnp.asarray(1e9))
-    rewritten(tmp_path / "l", setup, state, dump(setup.preset))
+    rewrite(tmp_path / "l", setup, state, dump(setup.preset))
     with pytest.raises(CheckpointError, match=r"holds .* at most 100000 can be flown"):
         load_learner_state(tmp_path / "l")
 
 
-def test_a_residual_that_makes_the_command_useless_is_refused(tmp_path):
+def test_excessive_residual_is_refused(tmp_path):
     setup = Setup.from_preset(tiny_preset(adapt={"residual": "regression", "frame": "gravity"}))
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     save_learner_state(tmp_path / "l.safetensors", state, setup.preset)
@@ -249,7 +249,7 @@ def test_a_residual_that_makes_the_command_useless_is_refused(tmp_path):
         load_learner_state(tmp_path / "l.safetensors")
 
 
-def test_the_same_content_is_the_same_file_at_any_time(tmp_path, setup, states, monkeypatch):
+def test_equal_content_gives_equal_file(tmp_path, setup, states, monkeypatch):
     for year, name in ((1990, "a"), (2040, "b")):
         now = time.struct_time((year, 1, 2, 3, 4, 5, 0, 2, 0))
         monkeypatch.setattr(time, "localtime", lambda *_, now=now: now)
@@ -268,7 +268,7 @@ def test_the_same_content_is_the_same_file_at_any_time(tmp_path, setup, states, 
 # ---- releases
 
 
-def test_files_say_which_release_wrote_them(tmp_path, setup, states):
+def test_files_state_their_release(tmp_path, setup, states):
     save_policy(tmp_path / "p", setup.new_policy(random.key(4)), setup.preset)
     save_learner_state(tmp_path / "l", states["full"], setup.preset)
     save_delta(tmp_path / "d", states["lora"].policy.policy)
@@ -289,7 +289,7 @@ def test_files_say_which_release_wrote_them(tmp_path, setup, states):
         ("é.1", False),
     ],
 )
-def test_a_key_of_a_newer_release_is_told_as_such(tmp_path, setup, message, newer):
+def test_key_of_newer_release_is_reported(tmp_path, setup, message, newer):
     policy = setup.new_policy(random.key(4))
     about = {"preset": preset_with(setup.preset, more=3), "architecture": architecture(policy), "version": message}
     (tmp_path / "p").write_bytes(wire.pack(policy, kind="policy", about=about))
@@ -306,7 +306,7 @@ def test_a_key_of_a_newer_release_is_told_as_such(tmp_path, setup, message, newe
     assert load_policy(tmp_path / "p")[1] == setup.preset
 
 
-def test_defaults_of_keys_that_an_older_file_lacks_are_listed(tmp_path, setup, caplog):
+def test_defaults_for_missing_keys_of_older_file_are_listed(tmp_path, setup, caplog):
     policy, tables = setup.new_policy(random.key(4)), json.loads(dump(setup.preset))
     for table, key in ((tables, "jump_cost"), (tables["adapt"], "trim"), (tables, "goal")):
         del table[key]

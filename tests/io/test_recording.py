@@ -1,4 +1,4 @@
-"""A recording is the flight: an independent reader finds every tick, in the form in which other viewers expect it."""
+"""A recording contains the flight: an independent reader finds every tick in the expected form."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def recording():
     )  # fmt: skip
 
 
-def test_what_is_written_is_read_by_another_reader(tmp_path):
+def test_recording_is_readable_by_independent_reader(tmp_path):
     pytest.importorskip("rosbags")
     make_reader = pytest.importorskip("mcap.reader").make_reader
     decoders = [pytest.importorskip("mcap_ros2.decoder").DecoderFactory()]
@@ -55,8 +55,8 @@ def test_what_is_written_is_read_by_another_reader(tmp_path):
     assert {m.data for _, m in result["/flown_by"]} == {"policy"}
 
 
-def test_rerun_s_own_reader_finds_the_flight(tmp_path):
-    """On one timeline, in seconds since the start."""
+def test_rerun_reader_finds_flight(tmp_path):
+    """The timeline is in seconds since the start."""
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
@@ -88,7 +88,7 @@ def test_rerun_s_own_reader_finds_the_flight(tmp_path):
     np.testing.assert_allclose(seconds("/events"), [0.0, 0.1, 0.3], atol=1e-6)
 
 
-def test_arrays_are_the_flight(tmp_path):
+def test_arrays_contain_flight(tmp_path):
     flight, path = recording(), tmp_path / "flight.npz"
     write_npz(path, flight)
     assert [p.name for p in tmp_path.iterdir()] == ["flight.npz"]
@@ -98,7 +98,7 @@ def test_arrays_are_the_flight(tmp_path):
         np.testing.assert_array_equal(file["u"], flight.command)
 
 
-def test_where_nothing_can_be_recorded_is_named(tmp_path):
+def test_unwritable_recording_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"must end with \.mcap or \.rrd"):
         check_recording(tmp_path / "flight.bag")
     pytest.importorskip("rosbags")
@@ -108,7 +108,7 @@ def test_where_nothing_can_be_recorded_is_named(tmp_path):
     check_recording(tmp_path / "flight.mcap")
 
 
-def test_a_viewer_that_is_not_installed_is_named(tmp_path, monkeypatch):
+def test_missing_viewer_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr("retrim.io.logs.viewers.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"flight\.rrd needs rerun: pip install rerun-sdk"):
         check_recording(tmp_path / "flight.rrd")

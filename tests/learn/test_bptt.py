@@ -1,4 +1,4 @@
-"""Roll-outs and their gradients: against finite differences, and perturbations against plain autodiff."""
+"""Roll-outs and their gradients, compared with finite differences and with plain autodiff."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from retrim.learn.residuals import EnsembleResidual
 from retrim.physics import Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
 from retrim.tasks import Start
 
-# As programs: eagerly, each call compiles its scan again.
+# Compiled programs: without jit, each call compiles its scan again.
 bptt, policy_gradient, policy_loss, rollout = map(
     eqx.filter_jit, (learn.bptt, learn.policy_gradient, learn.policy_loss, learn.rollout)
 )
@@ -28,13 +28,13 @@ reset = eqx.filter_jit(lambda task, key: task.reset(key))
 
 @eqx.filter_jit
 def fresh(key, size=23, hidden=(8, 8)):
-    """A policy that sees a history of two commands, unless told otherwise."""
+    """Return a policy with a history of two commands by default."""
     return Policy.of(size, small(), key=key, hidden=hidden)
 
 
 @eqx.filter_jit
-def awake(key):
-    """The same with weights large enough to matter."""
+def random_policy(key):
+    """Return a fresh policy with weights large enough to have an effect."""
     policy = fresh(key)
     layers = tuple(
         eqx.tree_at(lambda l: l.weight, l, 0.4 * random.normal(k, l.weight.shape))
@@ -49,8 +49,8 @@ def residual(key):
     return jax.tree.map(lambda leaf: leaf + 0.05, ensemble)
 
 
-def flown_env(dynamics=None, **options):
-    """What most tests fly: of one size, so that programs are shared."""
+def shared_env(dynamics=None, **options):
+    """Return the environment of most tests, in one size, so that they share compiled programs."""
     return hover_env(dynamics, horizon=8, history=2, **options)
 
 
@@ -69,10 +69,10 @@ def models(key):
     [("simple", 0, None), ("hybrid", 2, None), ("through residual", 0, 0.3), ("straight through", 2, None)],
 )
 def test_perturbations_equal_plain_gradient(which, delay, jump_cost, key):
-    """Whatever the model; a cost of jumps is in the gradient."""
-    env = flown_env(models(key)[which], delay_ticks=delay)
+    """The gradient includes the cost of jumps, for every model."""
+    env = shared_env(models(key)[which], delay_ticks=delay)
     env = env if jump_cost is None else replace_fields(env, jump_cost=jnp.array(jump_cost))
-    policy, x0 = awake(key), draw_starts(env.task, key, 3)
+    policy, x0 = random_policy(key), draw_starts(env.task, key, 3)
     value, gradient = policy_gradient(policy, env, x0)
 
     def plain(layers):
@@ -85,9 +85,9 @@ def test_perturbations_equal_plain_gradient(which, delay, jump_cost, key):
     assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(gradient)) > 1e-4
 
 
-def test_gradient_against_finite_differences(key):
-    """Residual off: along random directions in weight space."""
-    env, policy = flown_env(), awake(key)
+def test_gradient_equals_finite_differences(key):
+    """Without a residual, along random directions in weight space."""
+    env, policy = shared_env(), random_policy(key)
     x0 = draw_starts(env.task, key, 3)
     _, gradient = policy_gradient(policy, env, x0)
     flat, unravel = ravel_pytree(policy.layers)
@@ -98,9 +98,9 @@ def test_gradient_against_finite_differences(key):
     np.testing.assert_allclose(slopes, (ahead - behind) / (2 * step), rtol=1e-6)
 
 
-def test_delay_holds_commands_back(key):
-    """The first ``delay`` ticks hover; then each command acts that many ticks after it was issued."""
-    policy = awake(key)
+def test_commands_act_after_delay(key):
+    """In the first ``delay`` ticks hover acts; then each command acts that many ticks after it was issued."""
+    policy = random_policy(key)
 
     @eqx.filter_jit
     def first_commands(task, x):
@@ -108,7 +108,7 @@ def test_delay_holds_commands_back(key):
         return policy(o).c
 
     for delay in (1, 3):
-        env = flown_env(delay_ticks=delay)
+        env = shared_env(delay_ticks=delay)
         flight = jax.tree.map(np.asarray, rollout(env, policy, reset(env.task, key)))
         np.testing.assert_allclose(flight.u.c[:delay], 9.81)
         first = first_commands(env.task, jax.tree.map(lambda leaf: leaf[0], flight.x))
@@ -116,31 +116,33 @@ def test_delay_holds_commands_back(key):
 
 
 @pytest.mark.parametrize("delay", [0, 3])
-def test_a_jump_costs_its_square_when_it_is_issued(key, delay):
-    env, policy = flown_env(delay_ticks=delay), awake(key)
+def test_jump_costs_its_square_when_issued(key, delay):
+    env, policy = shared_env(delay_ticks=delay), random_policy(key)
     start = reset(env.task, key)
     free, cost_of_charge = (
         rollout(each, policy, start) for each in (env, replace_fields(env, jump_cost=jnp.array(0.3)))
     )
     jax.tree.map(np.testing.assert_array_equal, (free.x, free.u), (cost_of_charge.x, cost_of_charge.u))
-    commands = np.column_stack([free.u.c, free.u.omega])[delay:]  # it acts so much later
+    commands = np.column_stack([free.u.c, free.u.omega])[delay:]  # it acts after the delay
     jumps = np.diff(commands, axis=0, prepend=[policy.u_hover.vector()])
     cost = (np.asarray(free.reward) - np.asarray(cost_of_charge.reward))[: len(commands)]
     np.testing.assert_allclose(cost, 0.3 * np.sum(jumps**2, axis=1), rtol=1e-9)
     assert np.max(cost) > 1e-3
 
 
-def test_a_residual_reaches_the_rollout(key):
+def test_roll_out_includes_residual(key):
     policy, x0 = fresh(key), Start(jnp.array(0.0), State.at(jnp.array(GOAL)))
-    env = flown_env()
+    env = shared_env()
     with_push = rollout(env.with_residual(lambda x, u: jnp.array([2.0, 0.0, 0.0])), policy, x0)
     assert np.asarray(rollout(env, policy, x0).x.v)[1, 0] == pytest.approx(0.0, abs=1e-2)
     assert np.asarray(with_push.x.v)[1, 0] == pytest.approx(0.04, rel=1e-2)
 
 
-def test_the_terminated_are_frozen_charged_and_give_finite_gradients(key):
-    """Pushed out of a small box: terminated goes true for good, the state stays, the worst reward is charged."""
-    env, policy = flown_env(box=1.05), awake(key)
+def test_terminated_roll_outs_are_frozen_with_worst_reward_and_finite_gradient(key):
+    """A push moves the vehicle out of a small box: it stays terminated, its state is constant, and its reward is the
+    worst.
+    """
+    env, policy = shared_env(box=1.05), random_policy(key)
     x0 = Start(jnp.array(0.0), State(jnp.array([1.0, 0.0, 1.0]), jnp.eye(3), jnp.array([1.0, 0.0, 0.0])))
     flight = jax.tree.map(np.asarray, rollout(env, policy, x0))
     end = int(np.argmax(flight.terminated))
@@ -150,13 +152,13 @@ def test_the_terminated_are_frozen_charged_and_give_finite_gradients(key):
     np.testing.assert_allclose(flight.reward[end:], flight.reward[:end].min())
     batch = jax.tree.map(lambda leaf: jnp.asarray(np.stack(3 * [leaf])), x0)
     _, gradient = policy_gradient(policy, env, batch)
-    assert flight.reward[0] < 0.0  # a start outside the box is charged too, from its first tick
+    assert flight.reward[0] < 0.0  # a start outside the box has the worst reward from its first tick
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_a_gradient_that_is_not_finite_changes_nothing(key):
-    env, policy, optimiser = flown_env(), awake(key), optax.adam(1e-2)
+def test_nonfinite_gradient_changes_nothing(key):
+    env, policy, optimiser = shared_env(), random_policy(key), optax.adam(1e-2)
     state = PolicyState(policy, jax.jit(optimiser.init)(policy.layers))
     x0 = random_starts(env.task, key, 1, 2)
     bad = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
@@ -166,7 +168,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(key):
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_training_lowers_the_loss_and_leaves_limits_alone(key):
+def test_training_lowers_loss_and_keeps_limits(key):
     env = hover_env(horizon=75, heading=0.3)
     policy = fresh(key, 15, (64, 64))
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(5e-3))
@@ -182,7 +184,7 @@ def test_training_lowers_the_loss_and_leaves_limits_alone(key):
     )
 
 
-def test_chunks_do_not_change_the_program(key):
+def test_chunks_do_not_change_training(key):
     with pytest.raises(ValueError, match="num_updates = 25 must be a positive multiple of 10"):
         next(
             pretrain(
@@ -196,8 +198,8 @@ def test_chunks_do_not_change_the_program(key):
         )
 
 
-def test_an_environment_has_one_tick_and_a_delay_that_its_queue_holds():
-    """A model and a task at different rates would disagree on what a tick is."""
+def test_environment_requires_one_tick_and_sufficient_queue():
+    """A model and a task with different ticks are inconsistent."""
     with pytest.raises(ValueError, match=r"the model ticks every 0\.01 s, the task every 0\.02 s"):
         Env(PointMass(0.01), hover_task(dt=0.02))
     with pytest.raises(ValueError, match=r"Env\.delay = -0\.02 s must be 0 to 0\.2 s"):

@@ -1,4 +1,4 @@
-"""One program on eight devices: pretraining, flights and what they learn are those of one device, to rounding."""
+"""Pretraining, flights and learning on eight devices equal those on one device, up to rounding."""
 
 import os
 import subprocess
@@ -62,7 +62,7 @@ np.savez(
 
 @pytest.fixture(scope="module")
 def devices(tmp_path_factory):
-    """What one device and eight devices have computed, each in a process of its own, at the same time."""
+    """Return the results of one and of eight devices, computed in parallel in a process each."""
     folder = tmp_path_factory.mktemp("devices")
 
     def start(devices):
@@ -78,7 +78,7 @@ def devices(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_pretraining_is_that_of_one_device(devices):
+def test_pretraining_equals_one_device(devices):
     one, eight = devices
     assert len(one["losses"]) == 4
     np.testing.assert_allclose(eight["losses"], one["losses"], rtol=1e-9)
@@ -86,7 +86,7 @@ def test_pretraining_is_that_of_one_device(devices):
 
 
 @pytest.mark.slow
-def test_flights_of_a_batch_are_those_of_one_device(devices):
+def test_batch_of_flights_equals_one_device(devices):
     one, eight = devices
     assert one["flown"].shape == (8, 51, 3)
     np.testing.assert_allclose(eight["flown"], one["flown"], atol=1e-7)
@@ -94,7 +94,7 @@ def test_flights_of_a_batch_are_those_of_one_device(devices):
 
 
 @pytest.mark.slow
-def test_what_a_fleet_learns_is_that_of_one_device(devices):
+def test_fleet_learning_equals_one_device(devices):
     one, eight = devices
     np.testing.assert_array_equal(eight["swaps"], one["swaps"])
     assert one["swaps"].sum() > 0
@@ -102,7 +102,7 @@ def test_what_a_fleet_learns_is_that_of_one_device(devices):
 
 
 @pytest.mark.slow
-def test_a_shared_base_is_that_of_one_device(devices):
+def test_shared_base_equals_one_device(devices):
     one, eight = devices
     np.testing.assert_allclose(eight["base"], one["base"], atol=1e-7)
 
@@ -110,18 +110,18 @@ def test_a_shared_base_is_that_of_one_device(devices):
 @pytest.mark.parametrize(
     ("n", "devices", "count"), [(24, 8, 8), (10, 8, 5), (7, 8, 7), (11, 8, 1), (64, 3, 2), (5, 1, 1)]
 )
-def test_as_many_devices_share_work_as_divide_it(n, devices, count):
+def test_number_of_devices_divides_work(n, devices, count):
     assert num_shards(n, devices) == count
 
 
-def test_with_one_device_nothing_is_moved():
+def test_one_device_moves_no_data():
     tree = {"x": np.ones((4, 2)), "name": "kept"}
     assert shard(tree) is tree
     assert jax.device_count() == 1
 
 
-def test_small_trainings_stay_on_the_cpu(monkeypatch):
-    """As with one accelerator; here the CPU itself stands for it."""
+def test_small_training_stays_on_cpu(monkeypatch):
+    """The CPU itself represents a single accelerator."""
     weights = np.zeros(1000)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "device_count", lambda: 1)

@@ -1,4 +1,4 @@
-"""The command path in training: one program for every delay and response, and today's numbers for whole ticks."""
+"""The command path in training: one program serves every delay and response, and whole ticks equal the former model."""
 
 import equinox as eqx
 import jax
@@ -35,8 +35,8 @@ def fly_once(env, key):
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 7])
-def test_whole_ticks_are_the_roll_out_of_old(ticks, key):
-    """Commands wait in a list, and the first-order lag is the one of before: to the last digits, tick by tick."""
+def test_whole_ticks_equal_former_roll_out(ticks, key):
+    """In the former model, commands wait in a list and the lag is of first order."""
     env = hover_env(LaggedModel(PointMass(DT), first_order(0.033)), delay_ticks=ticks, horizon=15)
     policy, start = policy_of(key), env.task.reset(key)
     result = fly_once(env, key)
@@ -58,10 +58,12 @@ def test_whole_ticks_are_the_roll_out_of_old(ticks, key):
         x = step(x, mean, STILL)
 
 
-def test_a_fractional_delay_is_a_mean_of_two_commands(key):
-    """What was issued is what acts at the delay of zero; the vehicle is frozen, so that both fly the same states."""
+def test_fractional_delay_is_mean_of_two_commands(key):
+    """With zero delay, commands act when they are issued; the vehicle is frozen, so that both roll-outs have the same
+    states.
+    """
     policy, task = policy_of(key), hover_task(horizon=12)
-    env = Env(LaggedModel(PointMass(DT), first_order(1e6)), task)  # actuators that never move: commands do not matter
+    env = Env(LaggedModel(PointMass(DT), first_order(1e6)), task)  # with frozen actuators, commands have no effect
     start = task.reset(key)
     commands, late = (
         eqx.filter_jit(rollout)(env.with_path(CommandPath.of(d, first_order(1e6))), policy, start).u
@@ -72,7 +74,7 @@ def test_a_fractional_delay_is_a_mean_of_two_commands(key):
 
 
 def test_one_program_trains_for_every_path(key):
-    """Another delay, lag or damping is another number; so it is for a task with another queue of the same length."""
+    """A different delay, lag or damping is a different value, as is a task with a queue of the same length."""
     optimiser, traces = optax.adam(1e-3), []
     env = hover_env(LaggedModel(PointMass(DT), first_order(0.03)), horizon=6)
 
@@ -89,7 +91,7 @@ def test_one_program_trains_for_every_path(key):
     assert len({float(loss[0]) for loss in losses}) == 3
 
 
-def test_a_batch_of_vehicles_equals_its_members(key):
+def test_batch_of_vehicles_equals_members(key):
     env = hover_env(LaggedModel(PointMass(DT), first_order(0.03)), horizon=12)
     policy, start = policy_of(key), env.task.reset(key)
     fly = eqx.filter_jit(lambda paths: jax.vmap(lambda path: rollout(env.with_path(path), policy, start))(paths))
@@ -100,8 +102,8 @@ def test_a_batch_of_vehicles_equals_its_members(key):
             np.testing.assert_allclose(a[i], b, rtol=1e-11, atol=1e-12)
 
 
-def test_gradients_of_a_path_against_finite_differences(key):
-    """Of a roll-out's reward, in the vehicle: what a policy gains by a faster one."""
+def test_path_gradient_equals_finite_differences(key):
+    """The gradient is that of the reward of a roll-out with respect to the vehicle."""
     env = hover_env(LaggedModel(PointMass(DT), first_order(0.03)), horizon=10)
     policy, start = policy_of(key), env.task.reset(key)
     cost = jax.jit(lambda path: jnp.sum(rollout(env.with_path(path), policy, start).reward))
@@ -118,7 +120,7 @@ def test_gradients_of_a_path_against_finite_differences(key):
 
 
 @pytest.mark.parametrize("wrap", [lambda model: model, lambda model: Hybrid(model, lambda x, u: STILL)])
-def test_a_path_reaches_the_model_behind_its_wrappers(wrap, key):
+def test_wrappers_forward_path_to_model(wrap, key):
     slow, u = first_order(0.2), random_command(key)
     expected = wrap(LaggedModel(PointMass(DT), slow))
     for model in (wrap(PointMass(DT)), wrap(LaggedModel(PointMass(DT), first_order(0.01)))):

@@ -1,4 +1,4 @@
-"""Training that comes to nothing ends with one line, and leaves no policy."""
+"""Training that diverges ends with one line and saves no policy."""
 
 import sys
 
@@ -16,7 +16,7 @@ from retrim.learn.pretrain import pretrain
 
 @pytest.fixture
 def losses(monkeypatch):
-    """Training that only tells losses."""
+    """Replace training by a given sequence of losses."""
 
     def capture(values):
         rest = iter(values)
@@ -36,19 +36,19 @@ def run(num_updates, chunk):
     return len(list(pretrain(policy, setup.env, random.key(1), optimiser=setup.optimiser, **sizes)))
 
 
-def test_ten_steps_without_a_loss_end_training(losses):
+def test_ten_steps_without_finite_loss_end_training(losses):
     losses([1.0, np.nan, 0.5])
     with pytest.raises(TrainingError, match=r"not a number in steps 11 to 20 of 30, and no policy is kept"):
         run(30, 10)
 
 
-def test_so_does_a_last_step_without_one(losses):
+def test_last_step_without_finite_loss_ends_training(losses):
     losses([1.0, 1.0, np.inf])
     with pytest.raises(TrainingError, match=r"in steps 3 to 3 of 3"):
         run(3, 1)
 
 
-def test_a_bad_start_is_left_out(losses):
+def test_bad_start_is_excluded(losses):
     losses([1.0, np.nan, 0.5, np.inf, 0.4])
     assert run(5, 1) == 5
 
@@ -71,7 +71,7 @@ def empty(request):
 
 
 @pytest.mark.usefixtures("as_a_user")
-def test_nothing_is_saved(tmp_path):
+def test_diverged_training_saves_nothing(tmp_path):
     (tmp_path / "nan_task.py").write_text(NAN)
     words = ("pretrain", "nan_task:empty", "--updates", "10", "--envs", "1", "--out", "p")
     text = [line for line in retrim(*words, cwd=tmp_path, code=1).splitlines() if line.startswith("retrim:")]

@@ -1,4 +1,4 @@
-"""Screening of windows: the wrong measurements are found, with their reasons, and the others stay."""
+"""Screening of windows finds wrong measurements with their reasons, and keeps the others."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ screen_window = eqx.filter_jit(lambda window: screen(window, DT))
 
 @pytest.fixture(scope="module")
 def window():
-    """A flight with a changing command, without noise."""
+    """Return a flight with a changing command and without noise."""
     model = PointMass(DT)
 
     def tick(x, k):
@@ -39,7 +39,7 @@ def counts(result):
     return dict(zip(REASONS, np.asarray(result.counts).tolist(), strict=True))
 
 
-def test_a_clean_window_loses_nothing(window):
+def test_clean_window_is_kept(window):
     result = screen_window(window)
     assert result.steps.all()
     assert result.samples.all()
@@ -48,7 +48,7 @@ def test_a_clean_window_loses_nothing(window):
 
 
 @pytest.mark.parametrize("noise", [1e-3, 2e-3])
-def test_noise_loses_next_to_nothing(window, noise):
+def test_noisy_window_is_mostly_kept(window, noise):
     p = window.x.p + noise * random.normal(random.key(1), (N, 3))
     v = window.x.v + 10.0 * noise * random.normal(random.key(2), (N, 3))
     result = screen_window(change(window, p=p, v=v))
@@ -57,7 +57,7 @@ def test_noise_loses_next_to_nothing(window, noise):
 
 
 @pytest.mark.parametrize("rows", [[20], [5, 30, 50]])
-def test_a_wrong_velocity_loses_the_steps_to_and_from_it_and_no_other(window, rows):
+def test_wrong_velocity_excludes_adjacent_steps_only(window, rows):
     at = jnp.array(rows)
     result = screen_window(change(window, v=window.x.v.at[at, 0].add(2.0)))
     np.testing.assert_array_equal(np.flatnonzero(~result.steps), sorted([*(at - 1).tolist(), *at.tolist()]))
@@ -66,7 +66,7 @@ def test_a_wrong_velocity_loses_the_steps_to_and_from_it_and_no_other(window, ro
     assert result.trusted
 
 
-def test_the_step_after_a_repeated_measurement_does_not_count(window):
+def test_step_after_repeated_measurement_is_excluded(window):
     x = jax.tree.map(lambda leaf: leaf.at[31].set(leaf[30]), window.x)
     result = screen_window(dataclasses.replace(window, x=x))
     assert not result.steps[30]
@@ -75,13 +75,13 @@ def test_the_step_after_a_repeated_measurement_does_not_count(window):
     assert counts(result)["repeated"] == 1
 
 
-def test_nothing_is_learned_if_most_steps_contradict(window):
+def test_window_with_mostly_contradictory_steps_is_excluded(window):
     wrong = screen_window(change(window, v=2.0 * window.x.v + 1.0))
     assert not wrong.trusted
     assert int((~wrong.steps).sum()) > N // 2
 
 
-def test_invalid_ticks_are_not_judged(window):
+def test_invalid_ticks_are_not_screened(window):
     valid = jnp.arange(N) >= 30
     result = screen_window(dataclasses.replace(change(window, v=window.x.v.at[10, 0].add(5.0)), valid=valid))
     assert int(result.counts.sum()) == 0
@@ -89,8 +89,8 @@ def test_invalid_ticks_are_not_judged(window):
     assert result.trusted
 
 
-def test_a_step_of_several_ticks_is_not_judged(window):
-    """Five measurements are lost; the vehicle flies on."""
+def test_step_of_several_ticks_is_not_screened(window):
+    """Five measurements are missing while the vehicle continues to fly."""
     left = jnp.concatenate([jnp.arange(25), jnp.arange(30, N)])
     result = screen_window(jax.tree.map(lambda leaf: leaf[left], window))
     assert int(result.counts.sum()) == 0

@@ -1,4 +1,4 @@
-"""Weights in both layouts: the same layers, and products that read their matrices along the rows."""
+"""Weights in both layouts: the layers are equal, and products read their matrices along rows."""
 
 import equinox as eqx
 import jax
@@ -17,8 +17,8 @@ from retrim.physics import Hybrid, PointMass, small
 
 
 @pytest.mark.parametrize("use_bias", [True, False])
-def test_a_layer_in_both_layouts_is_that_layer(use_bias, key):
-    """Value, and gradients with respect to weight, bias and input, for one input and for several."""
+def test_transposed_layer_equals_layer(use_bias, key):
+    """Values and gradients with respect to weight, bias and input are equal, for one input and for several."""
     layer = eqx.nn.Linear(5, 3, use_bias=use_bias, key=key)
 
     def cost(layer, x):
@@ -31,8 +31,8 @@ def test_a_layer_in_both_layouts_is_that_layer(use_bias, key):
         np.testing.assert_allclose(result, expected, rtol=1e-13)
 
 
-def test_stacked_layers_are_laid_out_each(key):
-    """As an ensemble is made and called."""
+def test_stacked_layers_are_transposed_individually(key):
+    """The layers are created and called as in an ensemble."""
     setup = eqx.filter_vmap(lambda key: eqx.nn.MLP(4, 2, 3, 1, key=key))(random.split(key, 5))
 
     @eqx.filter_jit
@@ -43,8 +43,8 @@ def test_stacked_layers_are_laid_out_each(key):
     np.testing.assert_allclose(members(with_transposed_copy(setup), x), members(setup, x), rtol=1e-14)
 
 
-def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
-    """Whatever holds them; a layer of scalars has no matrix, and one that derives from a layer may be another."""
+def test_nested_layers_are_transposed_and_other_leaves_kept(key):
+    """A layer of scalars has no matrix, and a subclass of a layer may compute something different."""
 
     class DoubleLinear(eqx.nn.Linear):
         def __call__(self, x, *, key=None):
@@ -59,8 +59,8 @@ def test_layers_anywhere_are_laid_out_and_all_else_stays(key):
     assert (copies["scalar"], copies["word"]) == (scalar, "w")
 
 
-def test_no_product_of_a_scan_reads_a_matrix_across_its_rows(key):
-    """Forward and backward, of the policy and of networks in the model."""
+def test_products_in_scan_read_matrices_along_rows(key):
+    """This holds forward and backward, for the policy and for networks in the model."""
     residual = EnsembleResidual.of(jnp.zeros(3), small().omega_max, key=key, members=2, hidden=(8, 8))
     env = hover_env(Hybrid(PointMass(0.02), residual, backprop=True), horizon=8, history=2)
     policy = Policy.of(23, small(), key=key, hidden=(8, 8))
@@ -76,7 +76,7 @@ def test_no_product_of_a_scan_reads_a_matrix_across_its_rows(key):
 
 
 def find(name, jaxpr):
-    """Equations of a name, in a program and in all that it calls."""
+    """Return the equations of a name, in a program and in its subprograms."""
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == name:
             yield eqn

@@ -1,4 +1,4 @@
-"""The loop that flies, without a clock: it is the lockstep flight, tick for tick, and takes nothing that is wrong."""
+"""The control loop without a clock equals the lockstep flight, tick for tick, and rejects wrong messages."""
 
 import dataclasses
 import time
@@ -39,7 +39,7 @@ from retrim.transport.in_process import InProcessBus
 
 
 class Flight:
-    """A loop on a point mass with a delay of one tick; no clock."""
+    """A control loop on a point mass with a delay of one tick, without a clock."""
 
     def __init__(self, source, *, push=(0.0, 0.0, 0.0), x=None, **options):
         self.bus = InProcessBus(TOPICS)
@@ -48,13 +48,13 @@ class Flight:
         self.acting = self.accepted = np.array([9.81, 0.0, 0.0, 0.0])
         self.commands = []
 
-    def measured(self, now):
+    def measurement(self, now):
         return Sample(self.tick, self.tick * DT, now, 0.0, self.x, self.x, self.accepted)
 
     def step(self, ticks=1, *, late=0.0, change=lambda sample: sample):
         for _ in range(ticks):
             now = time.monotonic()
-            self.bus.publish("sample", change(self.measured(now - late)).pack())
+            self.bus.publish("sample", change(self.measurement(now - late)).pack())
             setpoint = self.loop.tick(now)
             self.loop.idle()
             self.commands.append(setpoint.u)
@@ -74,8 +74,8 @@ class Flight:
         return unpack_note(self.bus.latest("status").data, "status")
 
 
-def test_it_is_the_lockstep_flight_tick_for_tick():
-    """Frame, observer and regression included, on a plant with a delay, under a push."""
+def test_equals_lockstep_flight_tick_for_tick():
+    """The flight includes the frame, the observer and regression, on a plant with a delay, under a push."""
     result = setup()
     state = result.learner.init(result.new_policy(random.key(0)), random.key(1))
     push = Constant(jnp.array([0.3, -0.2, 0.4]))
@@ -90,38 +90,38 @@ def test_it_is_the_lockstep_flight_tick_for_tick():
         for tick in range(60):
             x = np.concatenate([np.asarray(leaf).ravel() for leaf in (measurement.p, measurement.R, measurement.v)])
             now = time.monotonic()
-            loop.rehearse()  # which changes nothing
+            loop.rehearse()  # the rehearsal has no effect on it
             bus.publish("sample", Sample(tick, measurement.t, now, 0.0, x, x, accepted_command).pack())
             u = loop.tick(now).u
             measurement, extract = plant.step(Command(jnp.asarray(u[0]), jnp.asarray(u[1:])))
             accepted_command = np.asarray(extract.vector())
     loop.idle()
     rows = FlightRows.unpack(bus.latest("flight").data).rows
-    # A tick is reported when the next measurement says what the plant took.
+    # A tick is reported when the next measurement contains the accepted command.
     np.testing.assert_allclose(rows[:, 3:6], log.p[:-2], atol=1e-9)
     np.testing.assert_allclose(rows[:, COMMAND], log.u[1:-1], atol=1e-9)
     np.testing.assert_allclose(rows[:, 1], log.t[:-2], atol=1e-12)
 
 
 @pytest.mark.parametrize("slow", [False, True])
-def test_only_a_controller_that_decides_at_once_is_rehearsed(monkeypatch, slow):
+def test_only_fast_controller_is_rehearsed(monkeypatch, slow):
     flight = Flight(holding())
     act, rehearsals = flight.loop.pilot.act, []
     monkeypatch.setattr(flight.loop.pilot, "act", lambda *argument: (time.sleep(0.1 * DT * slow), act(*argument))[1])
     monkeypatch.setattr(flight.loop.pilot, "rehearse", lambda *argument: rehearsals.append(argument))
     flight.loop.warm_up()
     flight.loop.rehearse()
-    assert not rehearsals  # nothing has been measured
+    assert not rehearsals  # no measurement yet
     flight.step()
     flight.loop.rehearse()
     assert bool(rehearsals) != slow
-    flight.step(late=1.0)  # the guard flies
+    flight.step(late=1.0)  # the guard has control
     rehearsals.clear()
     flight.loop.rehearse()
     assert not rehearsals
 
 
-def test_a_swap_changes_the_command_little_by_little():
+def test_swap_blends_commands():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(3)
     before = flight.commands[-1]
@@ -132,12 +132,12 @@ def test_a_swap_changes_the_command_little_by_little():
     whole = np.abs(result[-1] - before).max()
     jumps = np.abs(np.diff([before, *result], axis=0)).max(1)
     assert jumps.max() < 0.45 * whole
-    # After the blend it is the new controller's own command.
+    # After the blend, the command is that of the new controller.
     fresh = Flight(holding((1.0, 1.0)), x=flight.x)
     np.testing.assert_allclose(flight.step(), fresh.step(), atol=1e-12)
 
 
-def test_messages_that_must_not_be_used_are_refused_counted_and_named():
+def test_invalid_messages_are_refused_counted_and_reported():
     flight = Flight(holding())
     flight.step(2)
     good = flight.parameters((3.0, 3.0), 5)
@@ -161,7 +161,7 @@ def test_messages_that_must_not_be_used_are_refused_counted_and_named():
 
 
 @pytest.mark.parametrize("topic", ["parameters.policy", "sample", "order"])
-def test_damaged_messages_and_random_bytes_are_never_taken(topic):
+def test_damaged_messages_and_random_bytes_are_refused(topic):
     rng, flight = np.random.default_rng(7), Flight(holding())
     flight.step(3)
     now = time.monotonic()
@@ -189,7 +189,7 @@ def test_damaged_messages_and_random_bytes_are_never_taken(topic):
     np.testing.assert_allclose(flight.x[:3], HOME, atol=1e-6)
 
 
-def test_a_policy_that_flies_clearly_worse_is_taken_back():
+def test_clearly_worse_policy_is_rolled_back():
     flight = Flight(holding(), push=(0.3, 0.0, 0.0))
     flight.step(200)
     flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
@@ -198,12 +198,12 @@ def test_a_policy_that_flies_clearly_worse_is_taken_back():
     assert flight.loop.mode == Mode.POLICY
     flight.step(400)
     np.testing.assert_allclose(flight.x[:3], HOME + np.array([0.3 / 4.0, 0.0, 0.0]), atol=1e-3)
-    # It is stale from now on; a newer one is not.
+    # From now on it is stale; a newer one is not.
     flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
     flight.step()
     assert flight.status["refused"] == {"stale policy": 1}
     assert flight.status["versions"] == {"policy": 0}
-    # One that was trained from it is not taken; another one is.
+    # A policy trained from it is refused; a different one is accepted.
     flight.bus.publish("parameters.policy", flight.parameters((5.0, 4.0), 2, parent=1))
     flight.step()
     assert flight.status["given_up"] == [1, 2]
@@ -212,7 +212,7 @@ def test_a_policy_that_flies_clearly_worse_is_taken_back():
     assert flight.status["versions"] == {"policy": 3}
 
 
-def test_what_took_off_flies_while_learning_is_not_wanted_and_the_last_policy_after_it():
+def test_initial_policy_flies_while_learning_is_disabled():
     flight, plain = Flight(holding(), x=level(x=0.4)), Flight(holding(), x=level(x=0.4))
     flight.bus.publish("parameters.policy", flight.parameters((6.0, 5.0), 1))
     flight.step(100)
@@ -232,13 +232,14 @@ def test_what_took_off_flies_while_learning_is_not_wanted_and_the_last_policy_af
     assert flight.status["refused"] == {}
 
 
-def test_the_age_of_the_policy_is_that_of_the_one_that_flies():
+def test_policy_age_is_that_of_active_policy():
     flight = Flight(holding(), push=(0.3, 0.0, 0.0), policy_age=5.0)
     flight.step(200)
-    flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))  # learnt just now, and soon taken back
+    # a new policy, which is soon rolled back
+    flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
     flight.step(120)
     assert flight.status["given_up"] == [1]
-    assert flight.loop.mode != Mode.POLICY  # what flies is as old as the flight
+    assert flight.loop.mode != Mode.POLICY  # the active policy is as old as the flight
     assert "the policy was learnt" in flight.status["reason"]
     late = Flight(holding())
     late.step(10)
@@ -248,7 +249,7 @@ def test_the_age_of_the_policy_is_that_of_the_one_that_flies():
     assert late.status["refused"] == {"policy of a time to come": 1}
 
 
-def test_it_is_taken_back_while_fits_and_policies_keep_coming():
+def test_rollback_while_fits_and_policies_arrive():
     flight = Flight(holding(fit_result=True), push=(0.3, 0.0, 0.0))
     flight.step(200)
     for i in range(1, 120):
@@ -266,7 +267,7 @@ def test_it_is_taken_back_while_fits_and_policies_keep_coming():
     np.testing.assert_allclose(flight.x[:3], HOME + np.array([0.3 / 4.0, 0.0, 0.0]), atol=1e-3)
 
 
-def test_a_second_swap_during_a_blend_does_not_jump():
+def test_second_swap_during_blend_is_continuous():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(3)
     before = flight.commands[-1]
@@ -279,8 +280,8 @@ def test_a_second_swap_during_a_blend_does_not_jump():
     assert np.abs(np.diff(flight.commands[2:], axis=0)).max() < 0.45 * whole
 
 
-def test_a_clipped_command_is_what_the_controller_remembers():
-    class Remembers(Holds):
+def test_controller_memory_has_clipped_command():
+    class RecordsAccepted(Holds):
         def init(self, x):
             return jnp.zeros_like(x.p)
 
@@ -290,13 +291,13 @@ def test_a_clipped_command_is_what_the_controller_remembers():
         def accepted(self, memory, u):
             return jnp.full_like(memory, 1.0) * u.c
 
-    flight = Flight(plain_source(setup(), Remembers()))
+    flight = Flight(plain_source(setup(), RecordsAccepted()))
     flight.step()
     assert flight.commands[-1][0] == 30.0
     np.testing.assert_array_equal(flight.loop.pilot._memory[0], 30.0)
 
 
-def test_after_a_silence_the_policy_does_not_fly_on():
+def test_policy_does_not_resume_after_silence():
     flight = Flight(holding())
     flight.step(20)
     flight.tick += 10
@@ -306,7 +307,7 @@ def test_after_a_silence_the_policy_does_not_fly_on():
     assert flight.status["reason"] == "10 measurements were not answered"
 
 
-def test_a_missed_tick_is_counted_and_gets_no_row_of_another():
+def test_missed_tick_is_counted_without_row():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(10)
     flight.tick += 2
@@ -319,17 +320,17 @@ def test_a_missed_tick_is_counted_and_gets_no_row_of_another():
     flight.loop.land("landing")
     flight.tick += 2
     flight.step()
-    assert flight.status["missed"] == 2  # nothing of the landing counts
+    assert flight.status["missed"] == 2  # the landing does not count
 
 
-def test_it_lands_by_itself_after_its_time():
+def test_lands_after_time_limit():
     flight = Flight(holding(), seconds=1.0)
     flight.step(52)
     assert flight.loop.mode != Mode.POLICY
     assert flight.status["reason"] == "landing"
 
 
-def test_a_world_that_changes_after_a_swap_is_not_the_policys_fault():
+def test_disturbance_after_swap_causes_no_rollback():
     flight = Flight(holding())
     flight.step(100)
     flight.bus.publish("parameters.policy", flight.parameters((3.9, 3.4), 1))
@@ -347,7 +348,7 @@ def test_a_world_that_changes_after_a_swap_is_not_the_policys_fault():
         (lambda s: dataclasses.replace(s, state=np.concatenate([s.state[:12], [0.0, 20.0, 0.0]])), "speed"),
     ],
 )
-def test_a_broken_limit_gives_the_vehicle_to_the_fallback_and_lands_it(change, reason):
+def test_exceeded_limit_activates_fallback_and_lands(change, reason):
     flight = Flight(holding())
     flight.step(20)
     flight.step(1, change=change)
@@ -359,7 +360,7 @@ def test_a_broken_limit_gives_the_vehicle_to_the_fallback_and_lands_it(change, r
     assert flight.x[2] < 0.2
 
 
-def test_a_command_that_is_not_finite_is_never_issued():
+def test_nonfinite_command_is_not_issued():
     source = holding()
     flight = Flight(dataclasses.replace(source, parameters={"policy": {"gains": np.array([np.nan, 3.5])}}))
     flight.step(30)
@@ -367,7 +368,7 @@ def test_a_command_that_is_not_finite_is_never_issued():
     assert flight.status["reason"] == "the policy's command is not finite"
 
 
-def test_a_target_that_is_not_finite_is_never_told_and_the_last_one_is_held(monkeypatch):
+def test_nonfinite_target_is_replaced_by_last_target(monkeypatch):
     flight = Flight(holding())
     flight.step(20)
     monkeypatch.setattr(flight.loop.pilot, "target", lambda t: np.array([0.0, np.nan, 1.0]))
@@ -382,7 +383,7 @@ def test_a_target_that_is_not_finite_is_never_told_and_the_last_one_is_held(monk
     assert np.linalg.norm(flight.x[:3] - HOME) < 0.2
 
 
-def test_without_any_target_it_holds_where_it_is(monkeypatch):
+def test_holds_position_without_target(monkeypatch):
     flight = Flight(holding(), x=level(x=0.4))
     monkeypatch.setattr(flight.loop.pilot, "target", lambda t: np.full(3, np.inf))
     flight.step(50)
@@ -390,18 +391,18 @@ def test_without_any_target_it_holds_where_it_is(monkeypatch):
     np.testing.assert_allclose(flight.x[:3], level(x=0.4)[:3], atol=1e-6)
 
 
-def test_a_measurement_that_is_refused_is_answered_by_level_and_sink():
+def test_refused_measurement_leads_to_level_descent():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(20)
     now, modes = time.monotonic(), []
     for tick in range(20, 130):
         flight.tick, now = tick, now + DT
-        sample = dataclasses.replace(flight.measured(now), state=np.full(15, np.nan))
+        sample = dataclasses.replace(flight.measurement(now), state=np.full(15, np.nan))
         flight.bus.publish("sample", sample.pack())
         setpoint = flight.loop.tick(now)
         flight.loop.idle()
         modes.append(flight.loop.mode)
-        assert setpoint.tick == tick  # the plant takes no other
+        assert setpoint.tick == tick  # the plant accepts no other command
         assert flight.loop.stamp == Stamp(tick, sample.send_time)
         if setpoint.is_final:
             break
@@ -413,13 +414,13 @@ def test_a_measurement_that_is_refused_is_answered_by_level_and_sink():
     assert np.isfinite(FlightRows.unpack(flight.bus.latest("flight").data).rows).all()
 
 
-def test_the_last_tick_of_a_crash_is_reported():
+def test_last_tick_before_crash_is_reported():
     flight = Flight(holding())
     flight.step(20)
     flight.x = level(np.array([0.0, 0.0, -1.0]))
-    flight.bus.publish("sample", flight.measured(time.monotonic()).pack())
+    flight.bus.publish("sample", flight.measurement(time.monotonic()).pack())
     flight.bus.publish("ended", pack_note("ended", reason="crashed"))
-    flight.loop.idle()  # the sample and the end came while it was busy
+    flight.loop.idle()  # the sample and the end arrived while control was busy
     assert not flight.loop.over
     flight.loop.tick(time.monotonic())
     flight.loop.idle()
@@ -429,7 +430,7 @@ def test_the_last_tick_of_a_crash_is_reported():
     assert rows[-1, TRUE][2] == -1.0
 
 
-def test_all_ticks_are_reported_before_the_command_that_ends_the_flight(monkeypatch):
+def test_all_ticks_are_reported_before_final_command(monkeypatch):
     flight, last = Flight(holding()), []
     flight.step(20)
     flight.loop.land("landing")
@@ -447,7 +448,7 @@ def test_all_ticks_are_reported_before_the_command_that_ends_the_flight(monkeypa
     assert last[0][-1] == Mode.LANDED
 
 
-def test_without_measurements_it_levels_then_lands_by_the_clock():
+def test_levels_then_lands_by_clock_without_measurements():
     flight = Flight(holding(), state_age=0.1)
     flight.step(20)
     now = time.monotonic()
@@ -457,7 +458,7 @@ def test_without_measurements_it_levels_then_lands_by_the_clock():
     assert flight.loop.mode == Mode.DROP
     assert 100 <= modes.index(True) <= 110
     rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
-    blind = rows[rows[:, 0] > 19]  # each command that nobody asked for has a row
+    blind = rows[rows[:, 0] > 19]  # each command without a request has a row
     assert (np.diff(blind[:, 0]) <= 2).all()
     assert sorted(set(blind[:, -1])) == [Mode.BLIND, Mode.DROP]
     assert not has_measurement(blind).any()
@@ -466,17 +467,17 @@ def test_without_measurements_it_levels_then_lands_by_the_clock():
     np.testing.assert_array_equal(blind[-1, COMMAND], np.zeros(4))
 
 
-def test_a_lost_sample_holds_the_command():
+def test_lost_sample_holds_command():
     flight = Flight(holding(), x=level(x=0.4))
     flight.step(5)
     hold = flight.loop.tick(time.monotonic())
     np.testing.assert_array_equal(hold.u, flight.commands[-1])
 
 
-def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
+def test_report_has_last_ticks_and_accepted_commands():
     flight = Flight(holding(), x=level(x=0.4), window=30)
     flight.step(20)
-    flight.accepted = flight.accepted + np.eye(4)[0] / 2  # the plant took something else
+    flight.accepted = flight.accepted + np.eye(4)[0] / 2  # the plant accepted a different command
     flight.step(20)
     rows = FlightRows.unpack(flight.bus.latest("flight").data).rows
     assert rows.shape == (30, len(COLUMNS))
@@ -485,7 +486,7 @@ def test_the_report_has_the_last_ticks_and_what_the_plant_accepted():
 
 
 @pytest.mark.parametrize("slow", ["act", "target"])
-def test_a_controller_that_is_too_slow_for_its_tick_never_takes_off(monkeypatch, slow):
+def test_too_slow_controller_does_not_take_off(monkeypatch, slow):
     flight = Flight(holding())
     flight.loop.warm_up()
     part = getattr(flight.loop.pilot, slow)
@@ -494,7 +495,7 @@ def test_a_controller_that_is_too_slow_for_its_tick_never_takes_off(monkeypatch,
         flight.loop.warm_up()
 
 
-def test_land_is_an_order():
+def test_land_command():
     flight = Flight(holding())
     flight.step(20)
     flight.bus.publish("order", pack_note("order", order="land"))
@@ -504,7 +505,7 @@ def test_land_is_an_order():
     assert flight.x[2] < 0.15
 
 
-def test_parameters_of_a_learner_become_those_of_the_controller():
+def test_controller_receives_parameters_of_learner():
     result = setup()
     state = result.learner.init(result.new_policy(random.key(0)), random.key(1))
     other = result.new_policy(random.key(5))

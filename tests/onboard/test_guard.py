@@ -1,4 +1,4 @@
-"""The guard's limits, and the controller that needs no learning: it holds a place, sinks, and stops."""
+"""The guard's limits, and its fallback controller without learning: it holds a position, sinks, and stops."""
 
 import numpy as np
 import pytest
@@ -36,20 +36,20 @@ def fly_once(x, decide, push, ticks):
         (state(v=(0.0, np.nan, 0.0)), "the state is not finite"),
     ],
 )
-def test_each_limit_is_named(x, text):
+def test_each_limit_is_reported(x, text):
     assert text in LIMITS.find_violation(x)
 
 
-def test_it_hovers_by_the_same_gravity_as_the_models():
+def test_gravity_equals_that_of_models():
     assert G == STANDARD_GRAVITY
     np.testing.assert_array_equal(HOVER, Command.hover().vector())
 
 
-def test_a_flight_within_limits_breaks_none():
+def test_flight_within_limits_exceeds_none():
     assert LIMITS.find_violation(state((2.9, -2.9, 0.0), (1.3, 0.0, 0.0), (0.0, 14.0, 0.0))) is None
 
 
-def test_the_turn_is_the_smallest_that_points_the_thrust():
+def test_rotation_to_thrust_direction_is_minimal():
     rng = np.random.default_rng(0)
     for _ in range(50):
         R, along = rotation(rng.normal(size=3)), rng.normal(size=3)
@@ -61,7 +61,7 @@ def test_the_turn_is_the_smallest_that_points_the_thrust():
 
 
 @pytest.mark.parametrize("push", [(0.0, 0.0, 0.0), (2.0, -2.0, 2.0), (-2.0, 0.0, -2.0)])
-def test_it_holds_a_place_from_a_tumble_and_against_a_push(push):
+def test_holds_position_after_tumble_and_under_push(push):
     hover, last = GeometricHover(LIMITS, DT), []
 
     def decide(x, acting):
@@ -76,7 +76,7 @@ def test_it_holds_a_place_from_a_tumble_and_against_a_push(push):
 
 
 @pytest.mark.parametrize("push", [(0.0, 0.0, 0.0), (1.5, 0.0, 2.0)])
-def test_the_fallback_holds_then_sinks_then_stops(push):
+def test_fallback_holds_then_sinks_then_stops(push):
     hover = GeometricHover(LIMITS, DT)
     fallback, modes, last = Fallback(hover), [], []
 
@@ -97,7 +97,7 @@ def test_the_fallback_holds_then_sinks_then_stops(push):
     assert np.abs(path[:landing_tick, :2]).max() < 0.6
 
 
-def test_blind_it_levels_and_sinks_and_stops_after_two_seconds():
+def test_blind_fallback_levels_and_sinks_and_stops_after_two_seconds():
     fallback = Fallback(GeometricHover(LIMITS, DT))
     x = state((0.0, 0.0, 3.0), (0.4, 0.2, 0.0))
     result = [fallback.step(x, False, x[:3], land=False) for _ in range(102)]
@@ -108,7 +108,7 @@ def test_blind_it_levels_and_sinks_and_stops_after_two_seconds():
     assert R[2, 2] > rotation(np.array([0.4, 0.2, 0.0]))[2, 2]
     assert (result[50][0][1:] == 0.0).all()
     assert 0.9 * G < result[50][0][0] < G
-    # When the state is known again, the vehicle holds.
+    # When the state is available again, the vehicle holds.
     observation = Fallback(GeometricHover(LIMITS, DT))
     observation.step(x, False, x[:3], land=False)
     assert observation.step(x, True, x[:3], land=False)[1] == Mode.HOLD

@@ -1,4 +1,4 @@
-"""Whatever comes over whichever bus: what is no parameters of this controller is never flown, and nothing crashes."""
+"""On every bus, data that are not parameters of this controller are refused without a crash."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_mutated_parameters_and_random_bytes_are_refused(backend):
 
 
 def _mutate(whole, rng):
-    """Some bytes changed, or the end cut off; never the message itself."""
+    """Return the message with some changed bytes or without its end; it always differs from the original."""
     data = bytearray(whole)
     for _ in range(rng.integers(1, 4)):
         at = int(rng.integers(len(data)))

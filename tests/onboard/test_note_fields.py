@@ -1,4 +1,4 @@
-"""A note is taken whole, with fields of their types and ranges, or not at all."""
+"""A note is accepted completely, with fields of the right types and ranges, or refused."""
 
 import math
 
@@ -34,13 +34,13 @@ GOOD = {
 
 
 @pytest.mark.parametrize("kind", GOOD)
-def test_what_is_as_it_must_be_is_taken_as_it_is(kind):
+def test_valid_note_is_unchanged(kind):
     result = unpack_note(pack_note(kind, **GOOD[kind]), kind)
     np.testing.assert_equal(result, GOOD[kind])
 
 
 @pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in FIELDS for name in FIELDS[kind]])
-def test_a_field_of_any_type_is_read_or_refused_in_one_line(kind, name):
+def test_field_of_any_type_is_read_or_refused_in_one_line(kind, name):
     extract, refusals = [], []
     for value in ODD:
         try:
@@ -70,7 +70,7 @@ def test_a_field_of_any_type_is_read_or_refused_in_one_line(kind, name):
         ("order", {"epoch": -1}, "epoch = -1 must be a number from 0 to inf"),
     ],
 )
-def test_a_refusal_says_what_a_field_must_be(kind, field, must_be):
+def test_refusal_states_requirement_of_field(kind, field, must_be):
     data = pack_note(kind, **field)
     with pytest.raises(MessageError) as error:
         unpack_note(data, kind)
@@ -81,19 +81,19 @@ def test_a_refusal_says_what_a_field_must_be(kind, field, must_be):
 
 
 @pytest.mark.parametrize("fields", [[], "x", 1, None])
-def test_fields_that_are_no_table_are_refused(fields):
+def test_fields_without_table_are_refused(fields):
     with pytest.raises(MessageError, match="wish: no fields"):
         read_fields("wish", fields)
 
 
-def test_what_is_quoted_is_short_and_moves_no_cursor():
+def test_quoted_text_is_short_and_without_control_characters():
     assert format_value("\x1b]0;x\x07") == r"'\x1b]0;x\x07'"
     assert len(format_value("x" * 10_000)) == 80
     assert plain("a\x1b[2J\nb") == r"a\x1b[2J\nb"
     assert len(plain("\x00" * 10_000)) == 1000
 
 
-def test_every_stage_and_cause_passes():
+def test_every_stage_and_cause_is_valid():
     stages = [[1.0, int(stage), int(cause)] for stage in Stage for cause in Cause]
     assert read_fields("status", {"stages": stages})["stages"] == stages
     for beyond in ([1.0, max(Stage) + 1, 0], [1.0, 0, max(Cause) + 1]):

@@ -1,4 +1,4 @@
-"""The clock of the process that flies, the watchdog, the recorder and the accounts, without a clock."""
+"""The clock of the control process, the watchdog, the recorder and the timing records, without a real clock."""
 
 import errno
 import os
@@ -47,7 +47,7 @@ def sample(tick, sending, x=None):
 
 
 def steps(sending, work=0.001, ticks=60):
-    """When steps begin, for samples that are sent at ``sent(tick)``, and which sample each sees."""
+    """Return the start times of steps for samples that are sent at ``sent(tick)``, and the sample of each step."""
     schedule, observation, result = Schedule(0.0, DT), None, []
     now = 0.0
     for _ in range(ticks):
@@ -63,21 +63,21 @@ def steps(sending, work=0.001, ticks=60):
     return np.array(result, dtype=float)
 
 
-def test_steps_follow_the_samples_of_the_plant_one_by_one():
+def test_steps_follow_samples_one_by_one():
     result = steps(lambda k: k * DT)
     np.testing.assert_array_equal(result[:, 1], np.arange(60))
     np.testing.assert_allclose(result[:, 0], (np.arange(60) + PHASE) * DT, atol=1e-9)
 
 
 @pytest.mark.parametrize("rate", [0.999, 1.001])
-def test_a_clock_that_drifts_is_followed(rate):
+def test_clock_drift_is_followed(rate):
     result = steps(lambda k: k * DT * rate, ticks=500)
     np.testing.assert_array_equal(result[:, 1], np.arange(500))
     assert np.abs(result[:, 0] - result[:, 1] * DT * rate - PHASE * DT).max() < 1e-3
 
 
 @pytest.mark.parametrize("pause", [0.003, 0.009, 0.05, 1.0])
-def test_a_plant_that_stands_still_and_goes_on_is_followed_again(pause):
+def test_paused_plant_is_followed_again(pause):
     result = steps(lambda k: k * DT + (pause if k >= 20 else 0.0), ticks=160)
     last = result[-20:]
     np.testing.assert_array_equal(np.diff(last[:, 1]), 1.0)
@@ -86,20 +86,20 @@ def test_a_plant_that_stands_still_and_goes_on_is_followed_again(pause):
     assert set(range(int(last[-1, 1]))) - answer <= set(range(20, 30))
 
 
-def test_one_late_sample_moves_nothing():
+def test_single_late_sample_does_not_shift_clock():
     result = steps(lambda k: k * DT + (0.0045 if k == 20 else 0.0))
     np.testing.assert_array_equal(result[:, 1], np.arange(60))
     np.testing.assert_allclose(result[21:, 0], (np.arange(21, 60) + PHASE) * DT, atol=1e-9)
 
 
-def test_a_step_that_ends_in_the_next_tick_leaves_nothing_out():
+def test_step_that_ends_in_next_tick_skips_none():
     result = steps(lambda k: k * DT, work=DT + 1e-4)
     assert np.diff(result[:, 1]).max() <= 2.0
     short = steps(lambda k: k * DT, work=0.9 * DT)
     np.testing.assert_array_equal(short[:, 1], np.arange(60))
 
 
-def test_a_decision_that_takes_all_its_room_is_there_while_it_is_waited_for():
+def test_slow_decision_arrives_within_waiting_time():
     assert PHASE + ROOM + MARGIN <= SHARE + 1e-9
     result = steps(lambda k: k * DT, work=ROOM * DT)
     np.testing.assert_array_equal(result[:, 1], np.arange(60))
@@ -112,23 +112,23 @@ class WatchdogTest:
         plan = WatchdogPlan(Path(), LIMITS, DT, HOME, frozenset({0}), 40, os.getpid(), os.getpid())
         self.watchdog = Watchdog(plan, self.bus)
 
-    def says(self, tick, now, target=HOME):
+    def report(self, tick, now, target=HOME):
         self.bus.publish("setpoint", Setpoint(tick, now, np.array([G, 0.0, 0.0, 0.0]), np.array(target)).pack())
 
 
-def test_the_watchdog_is_silent_while_control_speaks():
+def test_watchdog_is_silent_while_control_reports():
     watchdog_test = WatchdogTest()
     for k in range(50):
         watchdog_test.bus.publish("sample", sample(k, k * DT).pack())
-        watchdog_test.says(k, k * DT)
+        watchdog_test.report(k, k * DT)
         assert watchdog_test.watchdog.check(k * DT, control_ended=False) is None
 
 
 @pytest.mark.parametrize(("loss", "within"), [(True, 0.001), (False, 0.04)])
-def test_it_commands_soon_after_control_is_gone_or_silent(loss, within):
+def test_watchdog_commands_soon_after_loss_of_control(loss, within):
     watchdog_test = WatchdogTest()
     watchdog_test.bus.publish("sample", sample(0, 0.0, level((1.0, 2.0, 1.5))).pack())
-    watchdog_test.says(0, 0.0, target=(1.0, 2.0, 1.5))
+    watchdog_test.report(0, 0.0, target=(1.0, 2.0, 1.5))
     watchdog_test.watchdog.check(0.0, control_ended=False)
     now, result = 0.0, None
     while result is None and now < 1.0:
@@ -137,37 +137,37 @@ def test_it_commands_soon_after_control_is_gone_or_silent(loss, within):
             watchdog_test.bus.publish("sample", sample(round(now / DT), now, level((1.0, 2.0, 1.5))).pack())
         result = watchdog_test.watchdog.check(now, control_ended=loss)
     assert now <= within
-    np.testing.assert_allclose(result.u, [G, 0.0, 0.0, 0.0], atol=1e-6)  # it holds where the vehicle should be
+    np.testing.assert_allclose(result.u, [G, 0.0, 0.0, 0.0], atol=1e-6)  # it holds the target position
 
 
-def test_what_is_no_command_is_silence():
+def test_invalid_command_counts_as_silence():
     watchdog_test, result = WatchdogTest(), []
     watchdog_test.bus.publish("sample", sample(0, 0.0).pack())
-    watchdog_test.says(0, 0.0)
+    watchdog_test.report(0, 0.0)
     watchdog_test.watchdog.check(0.0, control_ended=False)
     for k in range(1, 20):
         watchdog_test.bus.publish("sample", sample(k, k * DT).pack())
-        watchdog_test.says(k, k * DT, target=(0.0, np.nan, 1.0))
+        watchdog_test.report(k, k * DT, target=(0.0, np.nan, 1.0))
         result.append(watchdog_test.watchdog.check(k * DT, control_ended=False))
     assert all(each is not None for each in result[1:])
     np.testing.assert_array_equal(result[-1].target, HOME)
 
 
-def test_it_answers_measurements_whose_state_is_refused():
+def test_watchdog_responds_to_refused_measurements():
     watchdog_test = WatchdogTest()
     watchdog_test.bus.publish("sample", sample(0, 0.0).pack())
     result = [watchdog_test.watchdog.check(0.0, control_ended=True)]
     for k in range(1, 20):
         watchdog_test.bus.publish("sample", sample(k, k * DT, np.full(15, np.nan)).pack())
         result.append(watchdog_test.watchdog.check(k * DT, control_ended=True))
-    assert [each.tick for each in result] == [*range(20)]  # the plant takes no other
-    assert result[-1].u[0] < result[0].u[0]  # it sinks
+    assert [each.tick for each in result] == [*range(20)]  # the plant accepts no other command
+    assert result[-1].u[0] < result[0].u[0]  # the vehicle sinks
     message = FlightRows.unpack(watchdog_test.bus.latest("fallback.flight").data).rows
     np.testing.assert_array_equal(message[:, 0], [0])
     np.testing.assert_array_equal(message[0, COMMAND], result[0].u)
 
 
-def test_it_commands_if_control_never_spoke():
+def test_watchdog_commands_if_control_never_reported():
     watchdog_test, result = WatchdogTest(), []
     for k in range(20):
         watchdog_test.bus.publish("sample", sample(k, k * DT).pack())
@@ -175,7 +175,7 @@ def test_it_commands_if_control_never_spoke():
     assert sum(each is not None for each in result) >= 18
 
 
-def test_it_lands_the_vehicle_and_is_done():
+def test_watchdog_lands_and_ends():
     watchdog_test = WatchdogTest()
     x, acting, modes = level((0.0, 0.0, 0.6)), np.array([G, 0.0, 0.0, 0.0]), []
     for k in range(400):
@@ -197,7 +197,7 @@ def rows(first, n, mode=Mode.POLICY, step=1e-3):
     return FlightRows(setup).pack()
 
 
-def test_the_recorder_fills_gaps_from_reports_and_goes_on_after_a_kill(tmp_path):
+def test_recorder_fills_gaps_from_reports_and_continues_after_kill(tmp_path):
     bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
     recorder = Recorder(path, bus)
     bus.publish("flight", rows(0, 10))
@@ -206,21 +206,21 @@ def test_the_recorder_fills_gaps_from_reports_and_goes_on_after_a_kill(tmp_path)
     bus.publish("flight", rows(5, 20))
     assert recorder.step() == 15
     with path.open("a") as file:
-        file.write("25,0.5,0")  # torn
+        file.write("25,0.5,0")  # incomplete
     again = Recorder(path, bus)
     bus.publish("flight", rows(10, 30))
     assert again.step() == 15
     np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(40))
 
 
-def test_what_the_watchdog_flies_is_written_without_a_gap(tmp_path):
+def test_watchdog_flight_is_recorded_without_gap(tmp_path):
     watchdog_test = WatchdogTest()
     recorder = Recorder(tmp_path / "flight.csv", watchdog_test.bus)
     for k in range(30):
         now = k * DT
         watchdog_test.bus.publish("sample", sample(k, now).pack())
-        if k < 10:  # control reports with a tick of delay, and dies
-            watchdog_test.says(k, now)
+        if k < 10:  # control reports one tick late, and dies
+            watchdog_test.report(k, now)
             watchdog_test.bus.publish("flight", rows(0, k)) if k else None
         watchdog_test.watchdog.check(now, control_ended=k >= 10)
     recorder.step()
@@ -231,11 +231,11 @@ def test_what_the_watchdog_flies_is_written_without_a_gap(tmp_path):
     assert (result[10:, -1] == Mode.WATCHDOG).all()
 
 
-def test_what_control_says_after_the_watchdog_has_spoken_is_written_too(tmp_path):
+def test_late_reports_of_control_are_recorded(tmp_path):
     bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
     recorder = Recorder(path, bus)
     bus.publish("flight", rows(0, 2))
-    # control was late, and the watchdog had not seen two ticks
+    # control was late, and the watchdog missed two ticks
     bus.publish("fallback.flight", rows(4, 3, Mode.WATCHDOG, 0.0))
     assert recorder.step() == 5
     bus.publish("flight", rows(0, 5))
@@ -247,7 +247,7 @@ def test_what_control_says_after_the_watchdog_has_spoken_is_written_too(tmp_path
 
 
 @pytest.mark.parametrize("first", ["flight", "fallback.flight"])
-def test_the_account_of_a_hang_is_in_the_log_beside_who_flew(tmp_path, first):
+def test_log_has_delay_of_hang_and_active_controller(tmp_path, first):
     bus, path = InProcessBus(TOPICS), tmp_path / "flight.csv"
     own, observation = (FlightRows.unpack(rows(0, n, step=step)).rows for n, step in ((4, 1e-3), (6, 0.0)))
     own[3, [ACCOUNTS["step"], ACCOUNTS["policy_age"]]] = 0.06, 2.0  # control hung in its fourth tick
@@ -265,7 +265,7 @@ def test_the_account_of_a_hang_is_in_the_log_beside_who_flew(tmp_path, first):
     np.testing.assert_array_equal(is_from_control(result), [True] * 4 + [False] * 2)
 
 
-def test_what_is_reported_just_after_the_end_is_written(tmp_path):
+def test_reports_just_after_end_are_recorded(tmp_path):
     bus = SharedMemoryBus.create(TOPICS | {"ready.recorder": 4096})
     try:
         bus.publish("ended", pack_note("ended", reason="crashed"))
@@ -282,7 +282,7 @@ def test_what_is_reported_just_after_the_end_is_written(tmp_path):
     np.testing.assert_array_equal(read_log(tmp_path / "flight.csv")[:, 0], np.arange(3))
 
 
-def test_a_log_that_can_be_written_nowhere_ends_and_nothing_else(tmp_path):
+def test_unwritable_log_ends_only_log(tmp_path):
     bus = InProcessBus(TOPICS | {"ready.recorder": 4096})
     (tmp_path / "file").touch()
     recorder = Recorder(tmp_path / "file" / "flight.csv", bus)
@@ -305,7 +305,7 @@ def replace_fields(folder):
 
 
 @pytest.mark.parametrize("change", [remove, rename, replace_fields])
-def test_a_log_whose_folder_is_gone_goes_on_elsewhere_with_all_that_was_written(tmp_path, change):
+def test_log_of_lost_folder_continues_in_other_folder(tmp_path, change):
     bus, folder, spare = InProcessBus(TOPICS | {"ready.recorder": 4096}), tmp_path / "out", tmp_path / "spare"
     path = folder / "flight.csv"
     recorder = Recorder(path, bus, (spare,))
@@ -317,12 +317,12 @@ def test_a_log_whose_folder_is_gone_goes_on_elsewhere_with_all_that_was_written(
     result = log_path(path, (spare,))
     assert result == (spare / "flight.csv" if change is replace_fields else path)
     assert last_note(bus, "ready.recorder", "ready")["moved"].startswith(f"{path}: ")
-    bus.publish("flight", rows(10, 30))  # of a recorder that was started again
+    bus.publish("flight", rows(10, 30))  # of a restarted recorder
     assert Recorder(path, bus, (spare,)).step() == 15
     np.testing.assert_array_equal(read_log(result)[:, 0], np.arange(40))
 
 
-def test_a_log_on_a_full_disk_goes_on_in_the_first_temporary_folder_with_room(tmp_path, monkeypatch):
+def test_log_on_full_disk_continues_in_first_temporary_folder_with_space(tmp_path, monkeypatch):
     bus, spare = InProcessBus(TOPICS | {"ready.recorder": 4096}), (tmp_path / "full", tmp_path / "spare")
     path, write = tmp_path / "out" / "flight.csv", os.write
     recorder = Recorder(path, bus, spare)
@@ -333,18 +333,18 @@ def test_a_log_on_a_full_disk_goes_on_in_the_first_temporary_folder_with_room(tm
         if "spare" in os.readlink(f"/proc/self/fd/{file}"):
             return write(file, data)
         if len(data) > 1:
-            return write(file, data[: len(data) // 2])  # what fits is written all the same
+            return write(file, data[: len(data) // 2])  # the rows that fit are written
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "write", full)
     bus.publish("flight", rows(5, 20))
     assert recorder.step() == 15
-    np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(10))  # no half lines
+    np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(10))  # no incomplete lines
     np.testing.assert_array_equal(read_log(log_path(path, spare))[:, 0], np.arange(25))
     assert recorder.notice == f"{path}: No space left on device; the log goes on in {tmp_path}/spare/flight.csv"
 
 
-def test_a_lifeline_tells_at_once():
+def test_lifeline_reports_immediately():
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     line = ParentWatch(process.pid)
     assert not line.has_ended()
@@ -353,13 +353,13 @@ def test_a_lifeline_tells_at_once():
     process.wait()
 
 
-def test_cores_are_shared_out():
+def test_cores_are_distributed():
     assert cores_of("fly", {2, 3, 5}) == {2}
     assert cores_of("learn", {2, 3, 5}) == {3, 5}
     assert cores_of("fly", {4}) == cores_of("learn", {4}) == {4}
 
 
-def test_the_accounts_are_those_of_the_durations():
+def test_statistics_equal_durations():
     result = summary(np.array([1e-4] * 98 + [3e-3, 0.2]))
     assert result["p50"] == pytest.approx(0.1)
     assert result["max"] == pytest.approx(200.0)
@@ -381,7 +381,7 @@ def write(place):
 
 
 @pytest.mark.parametrize("appendix", [False, True])
-def test_a_process_takes_no_module_from_the_current_folder_but_one_that_is_only_there(tmp_path, monkeypatch, appendix):
+def test_process_imports_from_current_folder_only_if_needed(tmp_path, monkeypatch, appendix):
     name = f"own_{os.getpid()}"
     (tmp_path / f"{name}.py").write_text(OWN)
     for shadow in ("calendar", "numpy", "json", "pickle", "retrim", "jax"):

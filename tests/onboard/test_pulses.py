@@ -1,4 +1,4 @@
-"""A process that is alive and silent hangs; one that starts, computes, or sleeps with its whole machine does not."""
+"""A process that is alive and silent hangs; one that starts, computes, or sleeps with the whole machine does not."""
 
 import time
 
@@ -23,8 +23,8 @@ def bus():
     return InProcessBus({"beat.recorder": 1024, "beat.policy": 1024, "sample": 4096, "setpoint": 4096})
 
 
-def silent_after(pulses, clock, role, beat=lambda: None, until=10.0, step=0.05):
-    """Return when a role is found to hang."""
+def time_of_hang(pulses, clock, role, beat=lambda: None, until=10.0, step=0.05):
+    """Return the time after which a role is found to hang."""
     while clock.now < until:
         clock.now += step
         beat()
@@ -34,34 +34,34 @@ def silent_after(pulses, clock, role, beat=lambda: None, until=10.0, step=0.05):
 
 
 @pytest.mark.parametrize("role", ["recorder", "plant", "control"])
-def test_who_says_nothing_for_two_seconds_hangs_and_who_beats_does_not(bus, role):
+def test_silence_of_two_seconds_is_a_hang(bus, role):
     clock = Clock()
     pulses, topic = Pulses(bus, clock), {"plant": "sample", "control": "setpoint"}.get(role, f"beat.{role}")
     pulses.expect(role)
-    assert silent_after(pulses, clock, role, lambda: bus.publish(topic, b"x")) is None
-    assert silent_after(pulses, clock, role, until=20.0) == pytest.approx(10.0 + SILENCE, abs=0.11)
+    assert time_of_hang(pulses, clock, role, lambda: bus.publish(topic, b"x")) is None
+    assert time_of_hang(pulses, clock, role, until=20.0) == pytest.approx(10.0 + SILENCE, abs=0.11)
 
 
-def test_who_is_not_expected_or_not_alive_is_not_looked_at(bus):
+def test_unexpected_or_dead_processes_are_ignored(bus):
     clock = Clock()
     pulses = Pulses(bus, clock)
-    assert silent_after(pulses, clock, "recorder") is None
+    assert time_of_hang(pulses, clock, "recorder") is None
     pulses.expect("recorder")
     clock.now += 10.0
     assert pulses.hanging([]) == []
 
 
-def test_a_process_that_starts_has_its_time_until_the_first_beat_and_no_longer(bus):
+def test_starting_process_has_limited_time_until_first_heartbeat(bus):
     clock = Clock()
     pulses = Pulses(bus, clock)
     bus.publish("beat.policy", b"of the process before it")
     pulses.expect("policy", within=60.0)
-    assert silent_after(pulses, clock, "policy", until=50.0) is None
+    assert time_of_hang(pulses, clock, "policy", until=50.0) is None
     bus.publish("beat.policy", b"x")
-    assert silent_after(pulses, clock, "policy", until=60.0) == pytest.approx(50.0 + SILENCE, abs=0.2)
+    assert time_of_hang(pulses, clock, "policy", until=60.0) == pytest.approx(50.0 + SILENCE, abs=0.2)
 
 
-def test_a_machine_that_stood_still_is_no_silence(bus):
+def test_suspended_machine_is_not_silence(bus):
     clock = Clock()
     pulses = Pulses(bus, clock)
     pulses.expect("recorder")
@@ -70,7 +70,7 @@ def test_a_machine_that_stood_still_is_no_silence(bus):
         assert pulses.hanging(["recorder"]) == []
 
 
-def test_a_heart_beats_ten_times_a_second_and_only_when_its_loop_comes_by(bus):
+def test_heartbeat_is_sent_by_loop_at_ten_hertz(bus):
     clock = Clock()
     heart = Heart(bus, "recorder", clock)
     for _ in range(1000):
@@ -80,7 +80,7 @@ def test_a_heart_beats_ten_times_a_second_and_only_when_its_loop_comes_by(bus):
     Heart(bus, "watchdog", clock).beat()  # a bus without its topic
 
 
-def test_a_thread_does_not_beat_for_a_loop_that_is_late(bus):
+def test_thread_sends_no_heartbeat_for_late_loop(bus):
     clock = Clock()
     pacemaker = Pacemaker(bus, "policy", clock)
     pacemaker.touch(30.0)
@@ -93,7 +93,7 @@ def test_a_thread_does_not_beat_for_a_loop_that_is_late(bus):
     assert last_note(bus, "beat.policy")["count"] == pytest.approx(301, abs=2)
 
 
-def test_a_pacemaker_beats_beside_a_loop_that_computes(bus):
+def test_pacemaker_sends_heartbeats_during_computation(bus):
     with Pacemaker(bus, "policy") as pacemaker:
         pacemaker.touch(60.0)
         until = time.monotonic() + 20.0

@@ -1,4 +1,4 @@
-"""What the machine kept from everybody is no fault of those who fly."""
+"""Stalls of the whole machine are not attributed to the flight processes."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from retrim.onboard.stalls import MEMORY, STALL, Stalls, count_lost_ticks
 EVERY = 0.002
 
 
-def test_only_wake_ups_that_are_far_too_late_are_stalls():
+def test_only_very_late_wake_ups_are_stalls():
     stalls, now = Stalls(EVERY), 5.0
     for pause in (0.0, EVERY, EVERY + 0.9 * STALL, EVERY + 0.045, EVERY, EVERY + 0.010):
         now += pause
@@ -20,7 +20,7 @@ def test_only_wake_ups_that_are_far_too_late_are_stalls():
     assert [end - begin for begin, end in text["newest"]] == pytest.approx([0.047, 0.012])
 
 
-def test_the_newest_stay_and_a_note_of_them_fits():
+def test_newest_stalls_are_kept_and_note_fits():
     stalls = Stalls(EVERY)
     for k in range(3 * MEMORY):
         stalls.woke(1e6 + 0.0123456789 * k)
@@ -30,7 +30,7 @@ def test_the_newest_stay_and_a_note_of_them_fits():
     assert len(stalls.pack()) < 16384
 
 
-def test_a_gap_counts_once_whatever_stalls_it_overlaps():
+def test_gap_counts_once_for_overlapping_stalls():
     gaps = [(1.00, 1.04, 1), (2.00, 2.10, 4)]
     assert count_lost_ticks([], gaps, 0.02) == 0
     assert count_lost_ticks([(1.01, 1.02), (1.02, 1.05)], gaps, 0.02) == 1
