@@ -1,4 +1,4 @@
-"""Tables that train and fly nothing, and draw nothing."""
+"""Fixtures for tables without training, flights and plots."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def presets(monkeypatch):
 
 @pytest.fixture
 def imagine(monkeypatch, presets):
-    """Let a table's module train and fly nothing."""
+    """Replace training and flights of a table's module by made-up results."""
 
     def make(table, error):
         result = Imaginary(error)
@@ -28,7 +28,7 @@ def imagine(monkeypatch, presets):
 
 @pytest.fixture
 def pictures(monkeypatch, tmp_path):
-    """Pictures that are not drawn: what was asked for, by the name of the function."""
+    """Replace plotting; return the arguments of each plot by the name of its function."""
     calls = {}
 
     def watch(table, *names):

@@ -1,4 +1,4 @@
-"""The tables of the baselines' settings and of the design study, at reduced size."""
+"""Tables of the baselines' settings and of the design study, at reduced size."""
 
 import contextlib
 import importlib
@@ -24,7 +24,7 @@ from retrim.runkit.reporter import Silent
 from retrim_paper import design, tables
 from retrim_paper.cli.reproduce import COMMANDS
 
-# The package has functions of these names.
+# The package exports functions with the names of these modules.
 NAMES = ("design", "efficiency", "everything", "phase", "quick", "tuning", "vision")
 design_table, efficiency_table, everything, phase_table, quick, tuning_table, vision_table = (
     importlib.import_module(f"retrim_paper.tables.{n}") for n in NAMES
@@ -40,7 +40,7 @@ def test_every_baseline_has_a_range_for_every_setting():
 
 
 @pytest.mark.parametrize(("page", "field"), [("tuning", "settings"), ("tuning_keypoints", "settings_from_keypoints")])
-def test_settings_are_those_that_the_published_search_found(page, field):
+def test_settings_are_those_of_published_search(page, field):
     rows = json.loads((Path(__file__).parents[2] / "docs" / "results" / f"{page}.json").read_text())["rows"]
     for name, baseline in BASELINES.items():
         best = min((row for row in rows if row["method"] == name), key=lambda row: row["score"])
@@ -50,19 +50,19 @@ def test_settings_are_those_that_the_published_search_found(page, field):
 @pytest.mark.parametrize(
     ("preset", "field"), [("hover/fast", "settings"), ("vision/retrim", "settings_from_keypoints")]
 )
-def test_a_baseline_flies_with_the_settings_for_what_it_is_shown(preset, field):
+def test_baseline_settings_match_its_observation(preset, field):
     setup = Setup.from_preset(load(preset))
     assert all(each.settings_for(setup.flight_task) is getattr(each, field) for each in BASELINES.values())
 
 
 @pytest.fixture
 def one_condition(monkeypatch):
-    """The one on a reference, in wind, by measurements that are not exact."""
+    """Keep one condition: on a reference, in wind, with measurement noise."""
     monkeypatch.setitem(tuning_table.CONDITIONS, "state", tuning_table.CONDITIONS["state"][2:])
 
 
 @pytest.mark.usefixtures("one_condition")
-def test_settings_are_searched_by_their_command(tmp_path):
+def test_search_of_settings_by_its_command(tmp_path):
     words = "--methods", "indi", "--candidates", "3", "--starts", "1", "--seconds", "4", "--plant", "simple"
     out = retrim("reproduce", "tuning", *words, "--out", "t", cwd=tmp_path)
     assert "| present |" in out
@@ -76,7 +76,7 @@ def test_settings_are_searched_by_their_command(tmp_path):
 
 
 @pytest.mark.parametrize(("rotors", "own"), [(False, True), (True, True), (True, False)])
-def test_gradients_through_the_residual_change_gradients_alone(rotors, own, key):
+def test_residual_gradients_do_not_change_values(rotors, own, key):
     setup = Setup.from_preset(tiny_preset())
     x, u = random_state(key, 0.3), random_command(key)
 
@@ -89,7 +89,7 @@ def test_gradients_through_the_residual_change_gradients_alone(rotors, own, key)
     np.testing.assert_allclose(through[1].v - without[1].v, -0.5 * 0.02, rtol=0.05)
 
 
-def test_the_gradient_is_that_of_the_model_or_of_the_point_mass(key):
+def test_gradient_is_that_of_model_or_point_mass(key):
     setup, x, u = Setup.from_preset(tiny_preset()), random_state(key, 0.3), random_command(key)
 
     def jacobian(choice):
@@ -100,11 +100,11 @@ def test_the_gradient_is_that_of_the_model_or_of_the_point_mass(key):
         jacobian(design.Choice(*c, False)) for c in ((False, True), (True, True), (True, False))
     )
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), own_gradient, simple)
-    assert float(jnp.abs(own.c - simple.c).max()) > 0.1 * float(jnp.abs(simple.c).max())  # motors take their time
+    assert float(jnp.abs(own.c - simple.c).max()) > 0.1 * float(jnp.abs(simple.c).max())  # motors have a lag
 
 
-def test_the_design_study_s_rows_are_of_all_seeds_and_flights():
-    """Times are medians, relative to what was trained first; a crashed flight is counted and in no mean."""
+def test_design_study_rows_cover_all_seeds_and_flights():
+    """Times are medians relative to the first trained model; a crash is counted and excluded from the means."""
     one, other = list(design.CHOICES)[:2]
 
     def row(model, order, epoch_s, errors, compile_s=1.0):
@@ -125,7 +125,7 @@ def test_the_design_study_s_rows_are_of_all_seeds_and_flights():
     assert section.about == f"{design_table.PAPER[:1].upper()}{design_table.PAPER[1:]}."
 
 
-def test_a_policy_is_retrained_from_where_it_was():
+def test_retraining_continues_from_policy():
     setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(random.key(0))
     logs = design.fly_batch_of_policy(setup, policy, 2, 1.0, 0)
@@ -135,12 +135,12 @@ def test_a_policy_is_retrained_from_where_it_was():
     assert any(np.any(a.weight != b.weight) for a, b in zip(result.policy.layers, policy.layers, strict=True))
 
 
-def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
-    """A table that is done is not made again; one that was interrupted is; with --quick all are."""
+def test_interrupted_tables_are_continued(tmp_path, monkeypatch):
+    """A finished table is not repeated, an interrupted one is, and with --quick all are."""
     setup, dying = [], [True]
 
     def one(run, reporter, *, size=0):
-        assert run.policy_folder == tmp_path  # networks of DATT serve all tables
+        assert run.policy_folder == tmp_path  # networks of DATT are shared by all tables
         setup.append(("one", size))
 
     def two(run, reporter, *, size=0):
@@ -164,16 +164,16 @@ def test_all_tables_go_on_where_they_were_killed(tmp_path, monkeypatch):
     assert "[two](two/two.md)" in (tmp_path / "everything.md").read_text()
     table(True)
     assert setup[3:] == [("one", 1), ("two", 1)]
-    table(False)  # what a quick look made is no page of the whole
+    table(False)  # a quick run writes no page of the complete table
     assert setup[5:] == []
-    assert "quick look" not in (tmp_path / "everything.md").read_text()  # it has an overview of its own
+    assert "quick look" not in (tmp_path / "everything.md").read_text()  # it has its own overview
     assert "quick look" in (tmp_path / "everything_quick.md").read_text()
     (tmp_path / "one" / "one.md").unlink()
     table(False)
     assert setup[5:] == [("one", 9)]
 
 
-def test_what_an_interrupted_table_took_is_counted_and_what_a_killed_one_took_is_not_known(tmp_path, monkeypatch):
+def test_time_of_interrupted_table_is_counted_and_of_killed_table_unknown(tmp_path, monkeypatch):
     ends = iter(("interrupted", "interrupted", "done", "killed", "interrupted", "done"))
 
     def one(run, reporter):
@@ -194,7 +194,7 @@ def test_what_an_interrupted_table_took_is_counted_and_what_a_killed_one_took_is
 
     capture(), capture()
     assert capture() == (2, [{"table": "one", "what": "Table", "page": "one/one.md", "s": 180.0, "at_least": False}])
-    assert capture()[0] == 2  # it is made
+    assert capture()[0] == 2  # the table is computed
     (tmp_path / "one" / "one.md").unlink()
     capture(), capture()
     (row,) = capture()[1]
@@ -202,8 +202,8 @@ def test_what_an_interrupted_table_took_is_counted_and_what_a_killed_one_took_is
     assert "| at least 2.0 |" in (tmp_path / "everything.md").read_text()
 
 
-def test_a_page_that_other_code_made_since_is_made_again(tmp_path, monkeypatch):
-    """Also where this code once made the table: the folder holds one page."""
+def test_page_of_different_code_is_recomputed(tmp_path, monkeypatch):
+    """This also holds if the present code made the table earlier, since the folder contains one page."""
     codes = iter(("a", "a", "b", "a"))
 
     def one(run, reporter):
@@ -216,7 +216,7 @@ def test_a_page_that_other_code_made_since_is_made_again(tmp_path, monkeypatch):
         assert (tmp_path / "one" / "one.md").read_text() == code
 
 
-def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeypatch):
+def test_formulations_differ_as_stated(tmp_path, monkeypatch):
     sections = []
     monkeypatch.setattr(phase_table, "fly_levels", lambda document, result, **_: sections.extend(result))
     phase_table.phase(Run("test", tmp_path), Silent(), references=("circle",))
@@ -231,7 +231,7 @@ def test_readings_of_the_papers_formulation_differ_as_they_say(tmp_path, monkeyp
             phase_table.phase(Run("test", tmp_path), Silent(), **wrong)
 
 
-def test_a_table_whose_package_is_missing_is_said_to_be_left_out(tmp_path, monkeypatch):
+def test_table_without_its_package_is_reported_as_skipped(tmp_path, monkeypatch):
     def lacking(run, reporter):
         raise PlantError("method 'raptor' needs the package")
 
@@ -240,24 +240,24 @@ def test_a_table_whose_package_is_missing_is_said_to_be_left_out(tmp_path, monke
     assert "lacking, left out: method 'raptor' needs the package" in (tmp_path / "everything.md").read_text()
 
 
-def test_every_table_of_the_plan_has_the_options_that_are_planned():
+def test_planned_tables_have_planned_options():
     for make, _, full in everything.PLAN:
         assert {*full, *quick.QUICK.get(make.__name__, {})} <= set(inspect.signature(make).parameters), make.__name__
     assert "all" in COMMANDS
 
 
-def test_a_command_that_goes_on_has_a_folder_to_go_on_in():
-    """And a quick look another one, or it would write over the pages of the whole."""
+def test_resumable_command_has_fixed_folder():
+    """A quick run has a separate folder; otherwise it would overwrite the complete pages."""
     setup = {make.__name__: make for make in (*tables.TABLES, tables.everything)}
     assert set(quick.GO_ON) <= set(setup)
     folders = {str(quick.folder_of(setup[name], quick=look)) for name in quick.GO_ON for look in (False, True)}
-    assert len(folders) == 2 * len(quick.GO_ON) - 1  # that of all tables has one for quick looks
+    assert len(folders) == 2 * len(quick.GO_ON) - 1  # the command for all tables has one folder for quick runs
     assert str(quick.folder_of(tables.everything)) == "runs/reproduce-all"
     assert quick.folder_of(tables.design) is None
     assert "runs/reproduce-hover, where the command goes on by default" in quick.help_of(tables.hover)
 
 
-def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
+def test_quick_options_of_every_table_exist():
     setup = {make.__name__: make for make in tables.TABLES}
     of_paper = {"hover", "track", "vision", "reversing", "design", "efficiency", "transfer"}
     assert of_paper <= set(quick.QUICK) <= set(setup)
@@ -270,8 +270,8 @@ def test_every_table_of_the_paper_has_a_quick_look_of_options_that_it_has():
 
 
 @pytest.mark.usefixtures("one_condition")
-def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):
-    """And says in its document that it is one."""
+def test_quick_run_reduces_only_defaults(tmp_path):
+    """The document states that it is a quick run."""
     choice = {"seconds": 30.0, "starts": 8, "seeds": (4,), "quick": True}
     options, remark = quick.quick_options(tables.hover, choice)
     assert (options["seconds"], options["starts"], options["seeds"]) == (12.0, 2, (4,))
@@ -291,7 +291,7 @@ def test_a_quick_look_takes_less_of_what_nobody_asked_for(tmp_path):
     assert "unrecognized" in retrim("reproduce", "buses", "--quick", cwd=tmp_path, code=2).lower()
 
 
-def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):
+def test_cost_table_by_its_command(tmp_path, monkeypatch):
     small = brief_preset()
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small)
     monkeypatch.setattr(effort, "DECISIONS", 3)
@@ -307,8 +307,8 @@ def test_what_each_method_costs_by_its_command(tmp_path, monkeypatch):
     assert "DATT, the paper's" in out
 
 
-def test_vision_flies_what_a_preset_can(tmp_path):
-    """Baselines where a pose filter gives a state, an observer where there is a frame."""
+def test_vision_methods_depend_on_preset(tmp_path):
+    """Baselines need a pose filter, and an observer needs a frame."""
     flyable = {name: set(vision_table._flyable(named_presets.PRESETS[name])) for name in vision_table.TITLES}
     assert set(BASELINES) | {"base-do", "lora"} <= flyable["vision/retrim"]
     assert set(BASELINES) <= flyable["vision/occluded"]
@@ -320,8 +320,8 @@ def test_vision_flies_what_a_preset_can(tmp_path):
     assert "method 'indi' needs the state, and preset 'vision/paper' shows keypoints" in text
 
 
-def test_re_training_goes_on_from_chunk_to_chunk_and_forgets_the_first(monkeypatch):
-    """Which compiles: what it came to is not kept, and its time is told apart."""
+def test_retraining_continues_over_chunks_and_discards_first(monkeypatch):
+    """The first chunk compiles: its result is discarded, and its time is reported separately."""
     setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(random.key(0))
     logs = design.fly_batch_of_policy(setup, policy, 2, 1.0, 0)

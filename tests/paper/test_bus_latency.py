@@ -1,4 +1,4 @@
-"""The other ends of the buses whose latency is measured: what is sent, where, and that nothing is left behind."""
+"""Processes that measure the latency of buses: their messages, addresses, and cleanup."""
 
 import itertools
 import os
@@ -21,8 +21,8 @@ time.sleep(60)
 """
 
 
-class Sent(Bus):
-    """What was published, and when."""
+class RecordingBus(Bus):
+    """A bus that records published messages and their times."""
 
     closed = False
 
@@ -45,23 +45,23 @@ def quick(monkeypatch):
         monkeypatch.setattr(latency, name, value)
 
 
-def test_messages_carry_their_number_and_when_they_were_sent(quick):
-    bus = Sent()
+def test_messages_contain_number_and_time(quick):
+    bus = RecordingBus()
     began = time.monotonic_ns()
     latency.write(bus, 100)
-    assert [topic for topic, *_ in bus.messages] == ["message"] * 5  # those that do not count, too
+    assert [topic for topic, *_ in bus.messages] == ["message"] * 5  # including messages that do not count
     assert {len(data) for _, data, _ in bus.messages} == {100}
     assert [int.from_bytes(data[:8], "little") for _, data, _ in bus.messages] == [0, 1, 2, 3, 4]
     stamps = [int.from_bytes(data[8:16], "little") for _, data, _ in bus.messages]
-    assert stamps[0] - began > 0.05e9  # both ends find each other first
+    assert stamps[0] - began > 0.05e9  # both ends connect first
     for stamp, (*_, sending) in zip(stamps, bus.messages, strict=True):
         assert 0 <= sending - stamp < 0.5e9
     assert all(b - a > 0.009e9 for a, b in itertools.pairwise(stamps))
 
 
 @pytest.mark.parametrize("where", ["folder/of/a/bus", "zenoh:127.0.0.1:7447"])
-def test_the_other_process_joins_the_bus_that_it_is_told_and_leaves_it(where, monkeypatch):
-    bus, calls = Sent(), []
+def test_other_process_joins_and_leaves_given_bus(where, monkeypatch):
+    bus, calls = RecordingBus(), []
 
     class Address:
         @staticmethod
@@ -92,7 +92,7 @@ def test_the_other_process_joins_the_bus_that_it_is_told_and_leaves_it(where, mo
     assert calls == ([where, 500] if "/" in where else [where, (latency.TOPICS, False), 500])
 
 
-def test_a_rosmaster_answers_before_it_is_used_and_is_gone_afterwards(tmp_path, monkeypatch):
+def test_rosmaster_is_ready_before_use_and_ends_afterwards(tmp_path, monkeypatch):
     program = tmp_path / "rosmaster"
     program.write_text(MASTER.format(python=sys.executable))
     program.chmod(0o755)
@@ -108,7 +108,7 @@ def test_a_rosmaster_answers_before_it_is_used_and_is_gone_afterwards(tmp_path, 
 
 
 @pytest.mark.parametrize("allowance", [True, False])
-def test_two_machines_are_namespaces_with_a_cable_that_are_taken_away(allowance, monkeypatch):
+def test_two_machines_are_connected_namespaces_and_removed(allowance, monkeypatch):
     process = []
 
     def run(words, **_):
@@ -121,13 +121,13 @@ def test_two_machines_are_namespaces_with_a_cable_that_are_taken_away(allowance,
     with latency.two_machines() as machines:
         if not allowance:
             assert machines is None
-            assert len(process) == 1  # the rest is not tried
+            assert len(process) == 1  # the remaining commands are not tried
         else:
             host, inside = machines
             assert " ".join(inside) == f"ip netns exec {name}"
             assert any(words.startswith(f"ip addr add {host}/24 dev ") for words in process)
             there = [words for words in process if words.startswith(f"ip netns exec {name} ip link set")]
-            assert len(there) == 2  # the cable's end, and its own loopback
+            assert len(there) == 2  # the end of the cable, and the loopback of the namespace
     assert process[-1] == f"ip netns del {name}"
     monkeypatch.setattr(latency.shutil, "which", lambda name: None)
     process.clear()

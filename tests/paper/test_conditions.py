@@ -1,4 +1,4 @@
-"""The conditions of the gauntlet are what their names say."""
+"""The conditions of the gauntlet have the content that their names state."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ AGREE = ("disturbance", "plant", "sensors", "reference", "thrust_error", "delay"
 
 
 def numbers(vehicle):
-    """Numbers of a vehicle that make it another one; of a built one, or of one from a file."""
+    """Return the numbers that characterise a vehicle, built or from a file."""
     names = ("mass", "inertia", "arm", "thrust_max", "motor_tau", "drag_area")
     return {name: np.asarray(getattr(vehicle, name), dtype=float) for name in names}
 
@@ -25,7 +25,7 @@ def ratios(spec, like):
     return {name: mine[name] / theirs[name] for name in mine}
 
 
-def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
+def test_hover_condition_is_disturbance_with_one_change():
     result = conditions(PRESETS["hover/retrim"])
     for name, scenario in result.items():
         what, _, where = name.partition("/")
@@ -50,7 +50,7 @@ def test_a_condition_at_hover_is_its_disturbance_with_one_thing_changed():
     }
 
 
-def test_a_fault_condition_has_one_fault_beside_a_push():
+def test_fault_condition_is_push_with_one_fault():
     result = fault_conditions(PRESETS["hover/retrim"])
     assert set(FAULTS) - {NO_FAULT} <= set(result)
     for name, scenario in result.items():
@@ -64,7 +64,7 @@ def test_a_fault_condition_has_one_fault_beside_a_push():
 
 
 @pytest.mark.parametrize("preset", ["hover/retrim", "track/retrim"])
-def test_other_sensors_measure_every_condition_that_names_none_and_has_some(preset):
+def test_sensor_option_replaces_default_sensors_only(preset):
     ideal, rough = conditions(PRESETS[preset]), conditions(PRESETS[preset], "rough")
     assert {scenario.sensors for scenario in rough.values()} == {"rough"}
     for name, scenario in ideal.items():
@@ -75,7 +75,7 @@ def test_other_sensors_measure_every_condition_that_names_none_and_has_some(pres
 
 
 @pytest.mark.parametrize(("preset", "own"), [("track/retrim", small), ("track/fast", kingfisher)])
-def test_every_reference_is_flown_in_every_weather_and_the_first_on_other_vehicles(preset, own):
+def test_references_are_flown_in_every_wind_and_first_one_on_other_vehicles(preset, own):
     base = PRESETS[preset]
     references = base.track.reference.split("+")
     result = conditions(base)
@@ -98,14 +98,14 @@ def test_every_reference_is_flown_in_every_weather_and_the_first_on_other_vehicl
         np.testing.assert_allclose(ratio, 1.0)
 
 
-def test_a_vehicle_of_one_s_own_has_conditions_like_itself():
+def test_conditions_of_custom_vehicle_are_similar_vehicles():
     heavy = changed(PRESETS["track/retrim"], vehicle="large")
     slow = next(s.vehicle for name, s in conditions(heavy).items() if name.endswith("/slow-motors"))
     assert slow.mass == pytest.approx(0.6, rel=0.05)
 
 
 def test_random_vehicles_are_plausible_and_differ():
-    """0.7 to 1.6 times the mass; inertia as the mass, thrust and motors within a third or a factor of two of it."""
+    """Mass varies from 0.7 to 1.6, inertia with the mass, and thrust and motors within factors of 1.33 and 2."""
     result = [conditions(PRESETS["hover/retrim"])[f"step/random-{n}"].vehicle for n in range(3)]
     message = [ratios(spec, small()) for spec in result]
     for of in message:

@@ -1,4 +1,4 @@
-"""Pages of searches, costs and numbers of flights: what they ask for, and what they lay out of it."""
+"""Pages of searches, costs and numbers of flights: the requested flights, and the content of the page."""
 
 import importlib
 
@@ -17,14 +17,14 @@ from retrim.runkit.reporter import Silent
 from retrim.runkit.stopwatch import Stopwatch
 from retrim_paper.design import Retraining
 
-# The package has functions of these names.
+# The package exports functions with the names of these modules.
 NAMES = ("design", "efficiency", "scaling", "tuning")
 design, efficiency, scaling, tuning = (importlib.import_module(f"retrim_paper.tables.{name}") for name in NAMES)
 SEEDS = (0, 3)
 
 
-def test_scaling_flies_as_many_as_were_asked_for_and_forgets_them(tmp_path, presets, pictures, monkeypatch):
-    """Half of them adapt; errors count as they land, crashes apart."""
+def test_scaling_flies_requested_number_and_discards_flights(tmp_path, presets, pictures, monkeypatch):
+    """Half of the flights adapt; errors count when flights finish, and crashes are counted separately."""
     done, setup = Imaginary(lambda spec: None if spec.start == 0 and spec.method == "full" else 0.25), []
 
     class Fleet:
@@ -66,13 +66,13 @@ def test_scaling_flies_as_many_as_were_asked_for_and_forgets_them(tmp_path, pres
 
 
 @pytest.mark.parametrize("flights", [(), (0,), (6,), (4, -4)])
-def test_numbers_of_flights_that_cannot_be_are_refused_before_training(flights, tmp_path, monkeypatch):
+def test_invalid_numbers_of_flights_are_refused_before_training(flights, tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "train_all", lambda *_: pytest.fail("trains"))
     with pytest.raises(ConfigError, match="must be a positive multiple of 4"):
         scaling.scaling(Run("test", tmp_path), Silent(), flights=flights, seconds=8.0)
 
 
-def test_rows_of_scaling_are_rates():
+def test_scaling_rows_are_rates():
     class Watch(Stopwatch):
         compile_s, total_s = 3.0, 5.0
 
@@ -85,7 +85,7 @@ def test_rows_of_scaling_are_rates():
     assert scaling._time(3 * 86_400.0) == "3.0 days"
 
 
-def test_the_lines_of_scaling_are_flights_by_time(tmp_path, pictures):
+def test_scaling_lines_are_flights_by_time(tmp_path, pictures):
     pictures(scaling, "panel_figure", "save")
     rows = [
         {"flights": n, "seconds": 10.0, "compile_s": 3.4, "run_s": took, "peak_mb": 512.3, "crashes": n // 4}
@@ -96,8 +96,8 @@ def test_the_lines_of_scaling_are_flights_by_time(tmp_path, pictures):
     assert section.about == "11 of 44 flights crashed."
 
 
-def test_a_search_for_settings_flies_every_candidate_under_every_condition(tmp_path, monkeypatch):
-    """Its score is the root mean square after 3 s, the mean over conditions; a crash counts a metre."""
+def test_search_flies_every_candidate_under_every_condition(tmp_path, monkeypatch):
+    """The score is the root mean square after 3 s, averaged over conditions; a crash counts as one metre."""
     trajectory = []
 
     def fly_together(plants, pilots, starts, *, ticks, stop):
@@ -106,14 +106,14 @@ def test_a_search_for_settings_flies_every_candidate_under_every_condition(tmp_p
 
     t = 0.02 * np.arange(301)
 
-    def scored(setup, spec, log):
+    def score(setup, spec, log):
         if log % 4 == 3:  # the second start of every second candidate
             return flight(3.0, terminated=True, seconds=1.0)
         return flight(np.where(t > 3.0 + 1e-9, 0.3, 5.0), seconds=6.0)
 
     monkeypatch.setattr(tuning, "fly_together", fly_together)
     monkeypatch.setattr(tuning, "cut_at_termination", lambda task, log: log)
-    monkeypatch.setattr(tuning, "score_flight", scored)
+    monkeypatch.setattr(tuning, "score_flight", score)
     tuning.tuning(
         Run("test", tmp_path), Silent(), methods=("indi", "mppi"), candidates=5, starts=2, seconds=6.0, seed=7
     )
@@ -121,7 +121,7 @@ def test_a_search_for_settings_flies_every_candidate_under_every_condition(tmp_p
     for plants, _, starts, ticks in trajectory:
         assert ticks == 300
         assert len(plants) == len(starts)
-        np.testing.assert_array_equal(starts[0].p, starts[2].p)  # every candidate flies from the same starts
+        np.testing.assert_array_equal(starts[0].p, starts[2].p)  # all candidates have the same starts
         assert np.any(starts[0].p != starts[1].p)
     result = results(tmp_path, "tuning.json")["rows"]
     np.testing.assert_allclose([row["score"] for row in result if row["method"] == "indi"], [0.3, 0.65] * 3)
@@ -136,7 +136,7 @@ def test_a_search_for_settings_flies_every_candidate_under_every_condition(tmp_p
     assert "from 2 starts (seed 7)" in text
 
 
-def test_the_best_settings_stand_below_the_present_ones():
+def test_best_settings_are_listed_below_present_ones():
     section = tuning._section("indi", [{"k": 1.0}, {"k": 2.0}, {"k": 3.0}, {"k": 4.0}], np.array([0.4, 0.3, 0.1, 0.2]))
     assert section.columns == ("settings", "k", "score [m]")
     assert section.rows == (
@@ -144,7 +144,7 @@ def test_the_best_settings_stand_below_the_present_ones():
     )  # fmt: skip
 
 
-def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets, monkeypatch):
+def test_design_study_covers_every_choice_and_seed(tmp_path, presets, monkeypatch):
     done, log_records, trainings, watching = Imaginary(None), [], [], Watching()
     monkeypatch.setattr(design, "train_all", done.train)
 
@@ -152,12 +152,12 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
         log_records.append((policy, n, seconds, seed))
         return [f"log {seed}.{k}" for k in range(n)]
 
-    def retrained(setup, policy, logs, key, choice, *, epochs):
+    def retrain(setup, policy, logs, key, choice, *, epochs):
         trainings.append((policy, tuple(logs), choice, epochs, jax.random.key_data(key).tolist()))
         return Retraining(f"re-{policy}", 2.0, [0.5, 0.7], 0.25)
 
     monkeypatch.setattr(design, "fly_batch_of_policy", fly)
-    monkeypatch.setattr(design, "retrain", retrained)
+    monkeypatch.setattr(design, "retrain", retrain)
     monkeypatch.setattr(design, "cut_at_termination", lambda task, log: log)
     monkeypatch.setattr(design, "score_flight", lambda setup, spec, log: flight(0.1 * (1 + spec.seed), seconds=4.0))
     design.design(Run("test", tmp_path), watching, seeds=SEEDS, starts=5, epochs=30)
@@ -185,8 +185,8 @@ def test_the_design_study_asks_for_every_choice_of_every_seed(tmp_path, presets,
         np.testing.assert_allclose(row["errors"], [0.1 * (1 + row["seed"])] * 5)
 
 
-def test_costs_are_laid_out_as_they_were_measured(tmp_path, presets, monkeypatch):
-    """Training without its compiling; updates with theirs; a decision in milliseconds; DATT trained afresh."""
+def test_cost_page_has_measured_values(tmp_path, presets, monkeypatch):
+    """Training excludes compilation, updates include it, a decision is in milliseconds, and DATT is trained again."""
     calls = []
 
     def train(setup, seed, *, reporter, stop):

@@ -1,4 +1,4 @@
-"""DATT sees what does not depend on the place, its banded product is a convolution, and training lowers the error."""
+"""DATT's observation is translation-invariant, its banded product is a convolution, and training lowers the error."""
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ def problem(n=8):
     return DattProblem(jnp.asarray(reference_bank(0, n)), jnp.array(TAU), vehicle.command_min, vehicle.command_max)
 
 
-def test_a_banded_product_is_a_convolution(key):
+def test_banded_product_is_convolution(key):
     k_x, k_w, k_b = random.split(key, 3)
     points, kernel, bias = random.normal(k_x, (10, 3)), random.normal(k_w, (3, 3, 8)), random.normal(k_b, (8,))
     plain = jax.jit(lambda points, taps: lax.conv_general_dilated(points.T[None], taps, (1,), "VALID")[0].T)
@@ -34,7 +34,7 @@ def test_a_banded_product_is_a_convolution(key):
     np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
-def test_what_it_sees_does_not_depend_on_the_place(key):
+def test_observation_is_translation_invariant(key):
     k_x, k_u, k_a = random.split(key, 3)
     x, u, d = random_state(k_x), random_command(k_u), jnp.array([0.5, -0.2, 0.1])
     ahead, shift = random.normal(k_a, (10, 3)), jnp.array([3.0, -2.0, 7.0])
@@ -45,7 +45,7 @@ def test_what_it_sees_does_not_depend_on_the_place(key):
     np.testing.assert_allclose(here, there, atol=1e-12)
 
 
-def test_commands_are_within_the_limits_and_zero_is_hover(key):
+def test_commands_are_within_limits_and_zero_is_hover(key):
     low, high = small().command_min, small().command_max
     actions = jnp.concatenate([20.0 * random.normal(key, (8, 4)), jnp.zeros((1, 4))])
     u = np.asarray(jax.jit(jax.vmap(lambda action: datt_command(action, low, high).vector()))(actions))
@@ -53,19 +53,19 @@ def test_commands_are_within_the_limits_and_zero_is_hover(key):
     np.testing.assert_allclose(u[-1], Command.hover().vector())
 
 
-def test_references_are_as_long_as_an_episode_and_go_nowhere_at_once():
+def test_references_last_an_episode_and_start_at_rest():
     bank = reference_bank(3, 16)
     assert bank.shape[1] > ticks_of(0.02)
     assert np.isfinite(bank).all()
     assert (np.abs(bank).max(axis=(0, 1)) < 4.0).all()
     assert (bank[:, 0] == 0.0).all()
-    assert np.abs(np.diff(bank, axis=1)).max() < 0.02 * 5.0  # no more than 5 m/s
+    assert np.abs(np.diff(bank, axis=1)).max() < 0.02 * 5.0  # at most 5 m/s
     assert (bank == reference_bank(3, 16)).all()
     assert (bank != reference_bank(4, 16)).any()
 
 
-def test_an_episode_is_a_flight_of_the_lagged_model(key):
-    """What disturbs stays within what training knows; the reward falls with the distance; it is cut off in time."""
+def test_episode_is_flight_of_lagged_model(key):
+    """Disturbances stay in the range of training, the reward decreases with distance, and the episode ends on time."""
     setup = problem()
     s = eqx.filter_jit(setup.reset)(key)
     step = eqx.filter_jit(setup.step)
@@ -78,8 +78,8 @@ def test_an_episode_is_a_flight_of_the_lagged_model(key):
     assert np.abs(after.d).max() <= MAX_DISTURBANCE
 
 
-def test_it_learns_and_is_a_controller(key):
-    """Every part of the network moves; that PPO finds what it should is shown on a task with a known answer."""
+def test_training_changes_all_parts_and_gives_controller(key):
+    """Every part of the network changes; the convergence of PPO is tested on a task with a known solution."""
     setup, fresh = problem(4), eqx.filter_jit(lambda key: DattNet.of(key=key))(key)
     settings = PpoSettings(envs=16, steps=8, minibatches=2, epochs=2)
     ((after, message),) = ppo(setup, PpoState.of(setup, fresh, key, settings), settings, steps=16 * 8)

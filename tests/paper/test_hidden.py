@@ -28,7 +28,7 @@ def population():
     return draw_vehicles(300, seed=5)
 
 
-def test_every_vehicle_lies_in_the_ranges(population):
+def test_vehicles_are_within_ranges(population):
     ranges = {
         "mass": (0.03, 3.0), "rate_lag": (0.015, 0.15), "delay": (0.0, 0.06), "damping": (0.4, 1.2),
         "thrust_gain": (0.6, 1.6), "thrust_to_weight": (1.39, 8.1),
@@ -39,7 +39,7 @@ def test_every_vehicle_lies_in_the_ranges(population):
         assert high - 0.25 * (high - low) < values.max() <= high, name
 
 
-def test_vehicles_grow_as_a_whole(population):
+def test_vehicle_parameters_scale_with_size(population):
     """Mass grows with the cube of the arm, inertia with the fifth power, and lag and delay with the size."""
     arm, mass, inertia = (
         np.array(values)
@@ -52,13 +52,15 @@ def test_vehicles_grow_as_a_whole(population):
     assert np.corrcoef(size, [v.delay for v in population])[0, 1] > 0.8
 
 
-def test_more_vehicles_begin_with_the_same_ones(population):
+def test_larger_population_extends_smaller_one(population):
     assert draw_vehicles(3, seed=5) == population[:3]
     assert draw_vehicles(3, seed=6) != population[:3]
 
 
-def test_the_plant_is_the_vehicle(population):
-    """Second order, with its lag, damping, gain and delay; nothing of it is in the preset."""
+def test_plant_has_parameters_of_vehicle(population):
+    """The plant is of second order, with the lag, damping, gain and delay of the vehicle, which the preset does not
+    contain.
+    """
     for vehicle in population[:3]:
         plant = vehicle.scenario("early-step").make("small")
         response = plant.simulation.model.response
@@ -68,7 +70,7 @@ def test_the_plant_is_the_vehicle(population):
         assert float(make_vehicle(vehicle.spec).mass) == pytest.approx(vehicle.spec.mass)
 
 
-def test_flights_of_vehicles_that_differ_in_numbers_are_one_program(population):
+def test_vehicles_with_different_numbers_share_program(population):
     preset = brief_preset()
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     scenarios = [vehicle.scenario("early-step") for vehicle in population[:4]]
@@ -80,7 +82,7 @@ def test_flights_of_vehicles_that_differ_in_numbers_are_one_program(population):
     np.testing.assert_allclose(flight[2].log.p, alone[0].log.p, atol=1e-5)
 
 
-def test_another_vehicle_with_other_numbers_stated_is_another_program(population):
+def test_vehicles_with_different_stated_keys_need_different_programs(population):
     first = population[0].scenario("none")
     silent = dataclasses.replace(first, vehicle=dataclasses.replace(population[1].spec, rate_damping=None))
     assert first.without_numbers() == population[1].scenario("none").without_numbers()
@@ -94,7 +96,7 @@ def test_another_vehicle_with_other_numbers_stated_is_another_program(population
         ("track/retrim", ["Figure-8 of 10 s", "Figure-8 of 5.5 s"], ("rmse_m", "peak_m")),
     ],
 )
-def test_the_table_has_a_row_for_each_flight(tmp_path, imagine, pictures, monkeypatch, preset, courses, columns):
+def test_table_has_row_for_each_flight(tmp_path, imagine, pictures, monkeypatch, preset, courses, columns):
     hidden = importlib.import_module("retrim_paper.tables.hidden")
     pictures(hidden, "vehicle_map")
     monkeypatch.setattr(hidden.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
@@ -112,7 +114,7 @@ def test_the_table_has_a_row_for_each_flight(tmp_path, imagine, pictures, monkey
     assert "| `" + preset + "` | INDI | not known | 12 of 12 | ∞ / ∞ / ∞ |" in text
 
 
-def test_what_cannot_be_flown_is_refused_before_training(tmp_path):
+def test_unflyable_options_are_refused_before_training(tmp_path):
     run = Run("test", tmp_path)
     for words, message in (
         ({"count": 0}, "count must be 1 to 10000 vehicles, got 0"),
@@ -124,7 +126,7 @@ def test_what_cannot_be_flown_is_refused_before_training(tmp_path):
             gauntlet.gauntlet(run, Silent(), vehicles="hidden", **words)
 
 
-def test_the_published_page_has_every_kind_of_method():
+def test_published_page_has_every_kind_of_method():
     for task in ("hover", "track"):
         result = entrants_of(task, "any", ())
         assert result == ENTRANTS[task]

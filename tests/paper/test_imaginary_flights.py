@@ -1,4 +1,4 @@
-"""What pages ask to be trained and flown, and what they lay out of it; a test gives every flight its error."""
+"""Requested training and flights of pages, and the content of the pages; the tests set the error of every flight."""
 
 import importlib
 import json
@@ -15,7 +15,7 @@ from retrim.runkit.document import Document
 from retrim.runkit.reporter import Silent
 from retrim_paper.ablation_options import CONTROL, OFF, ON
 
-# The package has functions of these names.
+# The package exports functions with the names of these modules.
 NAMES = ("ablation", "gauntlet", "levels", "plants", "reversing")
 ablation, gauntlet, levels, plants, reversing = (
     importlib.import_module(f"retrim_paper.tables.{name}") for name in NAMES
@@ -24,10 +24,13 @@ SEEDS, STARTS, SECONDS = (0, 3), 2, 30.0
 
 
 @pytest.mark.parametrize(("cores", "together"), [(2, (("step",), ("none",))), (16, (("step", "none"),))])
-def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
+def test_gauntlet_flies_every_condition_and_shows_means_and_worst(
     tmp_path, imagine, pictures, monkeypatch, cores, together
 ):
-    """Methods in the order asked; a flight that crashed is infinite in its mean, and counted. Many cores fly more."""
+    """Methods are in the given order; a crash makes the mean infinite and is counted.
+
+    With many cores, flights run together.
+    """
     ramp, make = np.linspace(0.0, 3.0, 1501), Scenario.make
 
     def installed(scenario, *words, **more):
@@ -61,7 +64,7 @@ def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
         for metric in gauntlet.METRICS:
             crashes = result[name, "indi", metric]
             assert (crashes["value"], crashes["worst"], crashes["crashes"]) == (None, None, 1)
-        # the last 2 s of a ramp of 0.1 m/s end at 3 m; starts 0 of two seeds have 0.1 and 0.4 m
+        # the last 2 s of a ramp of 0.1 m/s end at 3 m; the first starts of two seeds have 0.1 and 0.4 m
         assert result[name, "base", "steady"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 2.9) / 4, abs=2e-3)
         assert result[name, "base", "late"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 1.75) / 4, abs=2e-3)
         assert result[name, "base", "peak"]["value"] == pytest.approx((0.1 + 0.4 + 2 * 3.0) / 4)
@@ -77,7 +80,7 @@ def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
     assert (list(lines), tuple(columns), np.shape(values)) == (["step", "none"], methods, (3, 2, 2))
     np.testing.assert_array_equal(values[:, :, 0], np.inf)
     np.testing.assert_allclose(values[1, :, 1], result["none", "base", "peak"]["value"])
-    # the best and the worst flight of the last method, beside the other's from the same start
+    # the best and the worst flight of the last method, next to the other method from the same start
     ((_, (best, worst)), _), = message["panel_figure"]  # fmt: skip
     assert (best.title, worst.title) == ("best: step, start 0", "worst: none, start 1")
     assert [curve.label for curve in best.curves] == ["indi", "base"]
@@ -85,8 +88,8 @@ def test_the_gauntlet_flies_every_condition_and_shows_means_and_the_worst(
     np.testing.assert_allclose(worst.curves[1].y[-1], 3000.0)
 
 
-def test_the_gauntlet_of_faults_compares_adapting_with_not_adapting(tmp_path, imagine, pictures, monkeypatch):
-    """Adapted flights crash where the base policy survives in one condition, and are as good as it in the other."""
+def test_fault_gauntlet_compares_adaptation_with_base(tmp_path, imagine, pictures, monkeypatch):
+    """Adapted flights crash in one condition where the base policy survives, and are equally good in the other."""
     pictures(gauntlet, "heat_map", "panel_figure")
     monkeypatch.setattr(gauntlet.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
     done = imagine(gauntlet, lambda spec: None if (spec.scenario.fault, spec.method) == ("late", "full") else 0.1)
@@ -109,7 +112,7 @@ def test_the_gauntlet_of_faults_compares_adapting_with_not_adapting(tmp_path, im
         gauntlet.gauntlet(run, Silent(), sensors="rough", faults=True)
 
 
-def test_a_gauntlet_of_plants_that_are_not_installed_is_refused_before_training(tmp_path, imagine, monkeypatch):
+def test_gauntlet_without_installed_plants_is_refused_before_training(tmp_path, imagine, monkeypatch):
     def lacking(*_, **__):
         raise PlantError("its package is not here")
 
@@ -120,8 +123,8 @@ def test_a_gauntlet_of_plants_that_are_not_installed_is_refused_before_training(
     assert not done.trainings
 
 
-def test_the_gauntlet_tells_recoveries_from_each_change(tmp_path, imagine, pictures, monkeypatch):
-    """The step comes at 8 s; who is within 2 cm a second later took a second."""
+def test_gauntlet_reports_recovery_from_each_change(tmp_path, imagine, pictures, monkeypatch):
+    """The step is at 8 s; an error within 2 cm one second later means a recovery time of one second."""
     t = 0.02 * np.arange(1501)
     pictures(gauntlet, "heat_map", "panel_figure")
     monkeypatch.setattr(gauntlet.plots, "save", lambda *_: (tmp_path / "x.png", tmp_path / "x.svg"))
@@ -130,11 +133,11 @@ def test_the_gauntlet_tells_recoveries_from_each_change(tmp_path, imagine, pictu
     result = {(row["scenario"], row["metric"]): row["value"] for row in results(tmp_path, "results.json")["rows"]}
     assert result["step", "recovery_2cm"] == pytest.approx(1.0)
     assert result["step", "recovery_5cm"] == 0.0
-    assert result["none", "recovery_2cm"] == pytest.approx(9.0)  # nothing changes: from the start
+    assert result["none", "recovery_2cm"] == pytest.approx(9.0)  # without a change, recovery is counted from the start
     assert result["none", "recovery_5cm"] == pytest.approx(0.5)
 
 
-def test_plants_have_a_section_each_with_a_column_for_each_method(tmp_path, imagine, monkeypatch):
+def test_each_plant_has_section_with_column_per_method(tmp_path, imagine, monkeypatch):
     setup = (
         ("a", Scenario(plant="simple"), ("none", "large")), ("b", Scenario(vehicle="large"), ("wind",)),
         ("c", Scenario(plant="mujoco"), ("none",)),
@@ -167,8 +170,8 @@ def test_plants_have_a_section_each_with_a_column_for_each_method(tmp_path, imag
 
 
 @pytest.mark.parametrize("task", ["hover", "track"])
-def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tmp_path, imagine):
-    """A column for each reference and disturbance; policies of which only adaptation differs are trained once."""
+def test_ablation_trains_distinct_policies_and_has_line_per_lever(task, tmp_path, imagine):
+    """A column per reference and disturbance; presets that differ only in adaptation share a policy."""
     place = {name: k for k, name in enumerate(ablation.DISTURBANCES[task])}
 
     def error(spec):
@@ -205,8 +208,8 @@ def test_the_ablation_trains_what_differs_and_has_a_line_for_each_lever(task, tm
             assert preset.track.reference == scenarios[0].reference
 
 
-def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
-    """Levers that were flown whole are not flown again; other seeds, starts or lengths are."""
+def test_interrupted_ablation_is_continued(tmp_path, imagine, monkeypatch):
+    """Finished levers are not repeated; different seeds, starts or lengths are flown."""
     every = len([*CONTROL, *OFF["hover"], *CONTROL, *ON["hover"]])
     done = imagine(ablation, lambda spec: 0.1)
 
@@ -228,7 +231,7 @@ def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch)
     flight, part = fly(until=4)
     assert flight == 4
     flight, again = fly()
-    assert flight == every - 3  # the fourth was cut
+    assert flight == every - 3  # the fourth was interrupted
     assert part == again[: len(part)]
     assert again == fly(tmp_path / "whole")[1]
     assert "An earlier run had made 3 of the parts" in (tmp_path / "cut" / "ablation_hover.md").read_text()
@@ -237,20 +240,18 @@ def test_an_ablation_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch)
         assert fly(**other)[0] == every
 
 
-def test_a_section_of_levels_flies_policies_and_rivals_and_orders_them_as_asked(
-    tmp_path, imagine, pictures, monkeypatch
-):
+def test_section_flies_policies_and_baselines_in_given_order(tmp_path, imagine, pictures, monkeypatch):
     preset = brief_preset()
     place = {"none": 0.0, "small": 0.2, "large": 0.5}
     share = {"datt": 0.01, "base": 0.02, "indi": 0.03}
     done = imagine(levels, lambda spec: place[spec.scenario.disturbance] + share[spec.method] * (1 + spec.start))
     text, calls = pictures(levels, "picture"), []
 
-    def rival(preset, seeds, run, reporter, *, steps):
+    def baseline(preset, seeds, run, reporter, *, steps):
         calls.append((preset, seeds, steps))
         return {seed: f"net {seed}" for seed in seeds}
 
-    monkeypatch.setitem(levels.RIVALS, "datt", rival)
+    monkeypatch.setitem(levels.RIVALS, "datt", baseline)
     section = levels.Levels(
         "title", preset, Scenario(plant="simple"), "stem", ("datt", "base", "indi"), {"base": ("1", "2", "3")},
         {"none": "calm", "small": "breathed on", "large": "pushed"}, ("datt", "indi"),
@@ -278,7 +279,7 @@ def test_a_section_of_levels_flies_policies_and_rivals_and_orders_them_as_asked(
     assert {(row["preset"], row["section"]) for row in result} == {(preset.name, "title")}
 
 
-def test_errors_around_reversals_are_those_of_whole_flights(tmp_path, imagine, pictures):
+def test_errors_around_reversals_use_complete_flights(tmp_path, imagine, pictures):
     message = pictures(reversing, "picture")
     done = imagine(reversing, lambda spec: None if (spec.method, spec.start) == ("indi", 0) else 0.1 + spec.seed)
     reversing.reversing(Run("test", tmp_path), Silent(), plant="simple", seeds=SEEDS, seconds=45.0, starts=STARTS)
@@ -297,13 +298,13 @@ def test_errors_around_reversals_are_those_of_whole_flights(tmp_path, imagine, p
     assert "| reversed at 30 s, base policy | 1.600 ± 1.732 |" in text
     assert "2 of 24 flights crashed." in text
     assert "base policy 1.600; " in text
-    assert "INDI -" in text  # two of four crashed: the median is beyond what was flown
+    assert "INDI -" in text  # two of four flights crashed: the median is infinite
     ((display, *_), _), = message["picture"]  # fmt: skip
     assert {f.spec.method for f in display} == {"base", "full"}
 
 
-def test_where_nothing_that_is_drawn_has_landed_the_rest_is_kept(tmp_path, imagine, monkeypatch):
-    """As after a Ctrl-C early on: other methods' flights have landed, and no picture can be made."""
+def test_results_are_kept_without_flights_to_plot(tmp_path, imagine, monkeypatch):
+    """After an early interruption, flights of other methods have finished, and no plot is possible."""
     done = imagine(reversing, lambda spec: 0.1)
     fly = reversing.fly_all
     fly_indi = lambda *a, **k: Flights([f for f in fly(*a, **k).flights if f.spec.method == "indi"], True)  # noqa: E731

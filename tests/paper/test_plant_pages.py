@@ -1,4 +1,4 @@
-"""Pages about the plant, the plants of others, a push that reverses and the buses, at reduced size."""
+"""Pages about the plant, other simulators, a reversing push and the buses, at reduced size."""
 
 import importlib
 import json
@@ -20,7 +20,7 @@ from retrim_paper.published import compare_published
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
-# The package has functions of these names.
+# The package exports functions with the names of these modules.
 buses, model, plants, reversing = (
     importlib.import_module(f"retrim_paper.tables.{name}") for name in ("buses", "model", "plants", "reversing")
 )
@@ -34,12 +34,12 @@ def at(curve, x):
     return np.interp(x, curve.x, curve.y)
 
 
-def test_figures_of_the_rotor_are_near_published_ones():
+def test_rotor_figures_are_near_published_values():
     for row in compare_published():
         assert row["ours"] == pytest.approx(row["published"], rel=0.03 if row["source"] == "Agilicious" else 0.12), row
 
 
-def test_thrust_and_inflow_lie_on_published_points():
+def test_thrust_and_inflow_match_published_points():
     result = curves(model.thrust_panel())
     ours, theirs, points = (result[n] for n in ("blade elements", "published thrust map", "Agilicious' own model"))
     assert np.all(np.diff(ours.x) > 0)
@@ -53,11 +53,11 @@ def test_thrust_and_inflow_lie_on_published_points():
     ruled, plain = inflow["with the vortex-ring rule"], inflow["momentum theory alone"]
     exact = inflow["fine quadrature, bracketing search"]
     np.testing.assert_allclose(at(ruled, exact.x), exact.y, rtol=0.01)
-    np.testing.assert_array_equal(ruled.y[ruled.x < 0], plain.y[plain.x < 0])  # the rule is of descent
+    np.testing.assert_array_equal(ruled.y[ruled.x < 0], plain.y[plain.x < 0])  # the published rule applies to descent
     assert np.any(ruled.y[ruled.x > 0] > plain.y[plain.x > 0] + 0.1)
 
 
-def test_drag_grows_with_speed_and_most_of_it_is_the_rotors():
+def test_drag_grows_with_speed_and_is_mostly_rotor_drag():
     result = curves(model.drag_panel())
     for name in ("small", "kingfisher"):
         whole, rotors = result[f"{name}: rotors and body"], result[f"{name}: rotors"]
@@ -66,14 +66,14 @@ def test_drag_grows_with_speed_and_most_of_it_is_the_rotors():
         assert np.all(whole.y[1:] >= rotors.y[1:] - 1e-6)
         assert at(rotors, 3.0) > 0.5 * at(whole, 3.0)
         body, fast = (at(whole, v) - at(rotors, v) for v in (5.0, 10.0))
-        assert fast == pytest.approx(4.0 * body, rel=0.01)  # by the square of the speed
+        assert fast == pytest.approx(4.0 * body, rel=0.01)  # proportional to the square of the speed
         np.testing.assert_allclose((whole.x[0], whole.x[-1]), (0.0, 10.0))
     assert at(result["kingfisher: rotors"], 3.0) == pytest.approx(
         at(result["kingfisher, published: 0.24 1/s"], 3.0), rel=0.15
     )
 
 
-def test_steps_are_answered_and_a_battery_sags():
+def test_step_responses_and_battery_sag():
     rates = curves(model.rate_panel())
     assert set(rates) == {f"{name}, {axis}" for name in model.QUADROTORS for axis in ("roll", "yaw")}
     for name in model.QUADROTORS:
@@ -97,7 +97,7 @@ def test_steps_are_answered_and_a_battery_sags():
     assert sag.y[-1] - sag.y[0] == pytest.approx(-0.2 * 9.81, rel=0.1)  # a fifth less thrust
 
 
-def test_the_model_s_page_has_each_figure_and_its_deviation(tmp_path, monkeypatch):
+def test_model_page_has_each_figure_and_deviation(tmp_path, monkeypatch):
     panel = model.sag_panel()
     for name in ("thrust", "drag", "inflow", "rate", "step", "sag"):
         monkeypatch.setattr(model, f"{name}_panel", lambda: panel)
@@ -110,7 +110,7 @@ def test_the_model_s_page_has_each_figure_and_its_deviation(tmp_path, monkeypatc
     assert results(tmp_path, "model.json")["rows"] == rows
 
 
-def test_plants_of_others_by_their_command(tmp_path, monkeypatch):
+def test_plants_page_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", brief_preset())
     groups = [("a", "simple", ("none", "wind")), ("b", "mujoco", ("none",)), ("c", "rotorpy", ("none",))]
     setup = tuple((title, Scenario(plant=plant), disturbances) for title, plant, disturbances in groups)
@@ -137,14 +137,14 @@ def test_plants_of_others_by_their_command(tmp_path, monkeypatch):
     assert "no plant 'kite'" in retrim("reproduce", "plants", "--plant", "kite", cwd=tmp_path, code=1)
 
 
-def test_every_group_of_plants_is_a_scenario_that_can_be_made():
+def test_every_plant_group_builds_a_scenario():
     for title, scenario, disturbances in plants.groups():
         assert title.startswith(scenario.plant)
         assert disturbances
     assert len({title for title, *_ in plants.groups()}) == len(plants.groups())
 
 
-def test_a_group_of_plants_is_what_its_title_says():
+def test_plant_group_matches_its_title():
     result = {title: scenario for title, scenario, _ in plants.groups()}
     text = {
         "on the large one": {"vehicle": "large"}, "on the kingfisher": {"vehicle": "kingfisher"},
@@ -158,7 +158,7 @@ def test_a_group_of_plants_is_what_its_title_says():
     assert all(any(words in title for title in result) for words in text)
 
 
-def test_a_push_that_reverses_by_its_command(tmp_path, monkeypatch):
+def test_reversing_page_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", brief_preset())
     monkeypatch.setattr(reversing, "PERIOD", 1.0)
     monkeypatch.setattr(reversing, "METHODS", {"base": "base policy", "full": "**adapted**"})
@@ -184,18 +184,18 @@ def test_messages_between_two_processes_are_timed(monkeypatch):
         took = latency.measure_latencies(bus, latency.other_process(str(bus.folder)), 500)
     finally:
         bus.remove()
-    assert len(took) == 3  # the first two are not counted
+    assert len(took) == 3  # the first two do not count
     assert all(0.0 < seconds < 0.5 for seconds in took)
 
 
-def test_latencies_of_buses_by_their_command(tmp_path, monkeypatch):
+def test_bus_latencies_by_their_command(tmp_path, monkeypatch):
     calls = []
 
-    def measured(bus, words, size):
+    def measure(bus, words, size):
         calls.append((type(bus).__name__, words[-1], size))
         return [] if size > 1e6 else [1e-3, 3e-3]
 
-    monkeypatch.setattr(buses, "measure_latencies", measured)
+    monkeypatch.setattr(buses, "measure_latencies", measure)
     monkeypatch.setattr(buses, "rosmaster", nullcontext)
     monkeypatch.setattr(buses, "two_machines", nullcontext)
     watching = Watching()

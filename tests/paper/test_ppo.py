@@ -1,4 +1,4 @@
-"""PPO: advantages as defined, a known task solved, an episode that is cut off judged by what would have come."""
+"""PPO: advantages as defined, a solved task with a known optimum, and bootstrapping at truncated episodes."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ A, B, NOISE, EFFORT, DISCOUNT = 0.9, 0.5, 0.1, 0.5, 0.9
 
 
 class Linear(eqx.Module):
-    """x' = A x + B a + noise, rewarded by -(x^2 + EFFORT a^2); cut off after 20 steps."""
+    """x' = A x + B a + noise, with the reward -(x^2 + EFFORT a^2), truncated after 20 steps."""
 
     def reset(self, key):
         return random.uniform(key, (), minval=-1.0, maxval=1.0), jnp.array(0)
@@ -33,7 +33,7 @@ class Linear(eqx.Module):
 
 
 class Gain(eqx.Module):
-    """A linear policy and a quadratic value: what the optimum is made of."""
+    """A linear policy and a quadratic value, the forms of the optimum."""
 
     gain: jax.Array
     value: jax.Array
@@ -44,14 +44,14 @@ class Gain(eqx.Module):
 
 
 def optimum():
-    """Gain and value of the discounted linear-quadratic regulator, by iterating Riccati's equation."""
+    """Return gain and value of the discounted linear-quadratic regulator, by iterating Riccati's equation."""
     p = 1.0
     for _ in range(500):
         p = 1.0 + DISCOUNT * A**2 * p - (DISCOUNT * A * B * p) ** 2 / (EFFORT + DISCOUNT * B**2 * p)
     return -DISCOUNT * A * B * p / (EFFORT + DISCOUNT * B**2 * p), -p * (1.0 - DISCOUNT)
 
 
-def test_it_solves_a_regulator_with_a_known_answer(key):
+def test_solves_regulator_with_known_optimum(key):
     settings = PpoSettings(envs=64, steps=32, minibatches=4, epochs=4, learning_rate=0.02, discount=DISCOUNT)
     net = Gain(jnp.zeros(1), jnp.zeros(2), jnp.full(1, -1.0))
     learner_state = list(ppo(Linear(), PpoState.of(Linear(), net, key, settings), settings, steps=64 * 32 * 160))
@@ -61,7 +61,7 @@ def test_it_solves_a_regulator_with_a_known_answer(key):
     assert float(net.value[1]) == pytest.approx(curvature, rel=0.25)
     assert len(figures) == 160
     assert figures[-1]["reward"] > figures[0]["reward"]
-    assert float(net.log_std[0]) < -1.5  # noise costs, so that it goes
+    assert float(net.log_std[0]) < -1.5  # noise has a cost, so it decreases
 
 
 def observe(key, over):
@@ -73,8 +73,8 @@ def observe(key, over):
 
 
 @pytest.mark.parametrize("ends", [(), (3,), (0, 5, 7)])
-def test_advantages_are_returns_less_values_and_steps_of_the_value(ends, key):
-    """lambda = 1: discounted returns up to the end of the episode; lambda = 0: temporal differences."""
+def test_advantages_are_returns_minus_values_or_temporal_differences(ends, key):
+    """For lambda = 1, discounted returns up to the end of the episode; for lambda = 0, temporal differences."""
     over = jnp.zeros(8, dtype=bool).at[jnp.array(ends, dtype=int)].set(True)
     rows, last = observe(key, over), jnp.array([0.7])
     reward, value = np.asarray(rows.outcome.reward)[:, 0], np.asarray(rows.value)[:, 0]
@@ -89,13 +89,13 @@ def test_advantages_are_returns_less_values_and_steps_of_the_value(ends, key):
     np.testing.assert_allclose(advantages(rows, last, 0.9, 0.0)[:, 0], differences, atol=1e-12)
 
 
-def test_densities_add_up_to_one():
+def test_densities_integrate_to_one():
     mean, log_std = jnp.array([0.3]), jnp.array([-0.7])
     x = jnp.linspace(-6.0, 6.0, 4001)
     density = jnp.exp(jax.vmap(lambda a: log_prob(a[None], mean, log_std))(x))
     assert float(jnp.sum(density) * (x[1] - x[0])) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_samples_that_do_not_fill_the_minibatches_are_refused():
+def test_indivisible_sample_count_is_refused():
     with pytest.raises(ValueError, match="PPO: 10 x 3 samples cannot be split into 4 batches"):
         PpoSettings(envs=10, steps=3, minibatches=4)

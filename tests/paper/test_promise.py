@@ -1,4 +1,4 @@
-"""The promise table: pairs of flights, bounds by the better of base policy and observer, and no credit for luck."""
+"""The promise table: pairs of flights, bounds by the better of base policy and observer, and no credit for chance."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from retrim_paper.tables.promise import promise_rows, promise_section
 
 
 def flights(**errors):
-    """Flights by method and start: steady errors [m], None for a crash."""
+    """Return flights by method and start: steady-state errors [m], None for a crash."""
     result = []
     for method, by_start in errors.items():
         for start, error in enumerate(by_start):
@@ -23,7 +23,7 @@ def row(**errors):
     return result
 
 
-def test_the_bound_is_of_the_better_of_base_and_observer():
+def test_bound_uses_better_of_base_and_observer():
     result = row(base=[0.10, 0.20], base_do=[0.02, 0.04], full=[0.03, 0.04])
     assert result["bound"] == pytest.approx(1.2 * 0.03 + 0.005)
     assert result["steady"] == pytest.approx(0.035)
@@ -33,14 +33,14 @@ def test_the_bound_is_of_the_better_of_base_and_observer():
     assert not row(base=[0.02], base_do=[None], full=[0.0291])["holds"]
 
 
-def test_a_crash_counts_if_the_base_policy_survives_the_same_start():
+def test_crash_counts_if_base_policy_survives_same_start():
     result = row(base=[None, 0.1], base_do=[0.1, 0.1], full=[0.05, None])
     assert (result["crashes"], result["crashes_base"], result["crashed_although_base_survived"]) == (1, 1, 1)
     assert not result["holds"]
     assert row(base=[None, 0.1], base_do=[0.1, 0.1], full=[None, 0.1])["holds"]
 
 
-def test_all_adapting_methods_of_all_conditions_have_a_row_and_words():
+def test_all_adaptive_methods_and_conditions_have_row_and_text():
     group = flights(base=[0.1], base_do=[0.1], full=[0.05], lora=[None])
     rows = promise_rows({"late": group, "gaps": group})
     assert [(r["scenario"], r["method"]) for r in rows] == [

@@ -1,4 +1,4 @@
-"""RAPTOR on board: its network computes what its package computes, and its motors are ours."""
+"""RAPTOR as an onboard method: its network equals that of its package, and its motors are those of the plant."""
 
 import importlib
 
@@ -30,7 +30,7 @@ def policies():
     return Setup.from_preset(tiny_preset()).new_policy(random.key(0))
 
 
-def test_the_network_computes_what_its_package_computes(net, key):
+def test_network_equals_package(net, key):
     theirs, hidden = foundation_policy.Raptor(), net.start
     theirs.reset()
     step = jax.jit(lambda hidden, o: net(hidden, o))
@@ -41,7 +41,7 @@ def test_the_network_computes_what_its_package_computes(net, key):
 
 @pytest.fixture(scope="module")
 def sample_flight(net):
-    """States after some seconds of hover, by the heading of the goal and what is commanded from outside."""
+    """Return states after some seconds of hover, by the heading of the goal and the external command."""
 
     def fly(x0, heading, outside):
         here = hover_task().setpoint(jnp.array(0.0))
@@ -57,7 +57,7 @@ def sample_flight(net):
     return jax.jit(fly)
 
 
-def test_it_comes_to_hover_facing_where_it_should_and_listens_to_nobody(sample_flight):
+def test_hovers_with_goal_heading_and_ignores_external_commands(sample_flight):
     x0 = State.at(jnp.array(GOAL) + jnp.array([0.6, -0.4, 0.3]))
     path = sample_flight(x0, jnp.array(0.5), Command.hover(float))
     assert float(jnp.max(jnp.linalg.norm(path.p[-50:] - jnp.array([GOAL]), axis=1))) < 0.15
@@ -67,8 +67,8 @@ def test_it_comes_to_hover_facing_where_it_should_and_listens_to_nobody(sample_f
     np.testing.assert_array_equal(other.p, path.p)
 
 
-def test_it_does_not_care_which_way_is_north(sample_flight):
-    """Goal, vehicle and heading turned about the vertical by an angle: the path is turned by it."""
+def test_flight_is_equivariant_to_heading(sample_flight):
+    """If goal, vehicle and heading are rotated about the vertical, the path is rotated by the same angle."""
     turn, offset = 1.1, jnp.array([0.5, 0.2, -0.2])
     Q = so3.rotz(jnp.array(turn))
     at = jnp.array(GOAL)
@@ -78,7 +78,7 @@ def test_it_does_not_care_which_way_is_north(sample_flight):
     np.testing.assert_allclose(turned_flight.p - at[None], (path.p - at[None]) @ Q.T, atol=1e-5)
 
 
-def test_it_flies_as_a_method_and_commands_no_rates(policies):
+def test_flies_as_method_without_rate_commands(policies):
     preset = tiny_preset(vehicle="kingfisher")
     fleet = Fleet(preset, policies, [Scenario()], methods=["raptor"], starts=2, seconds=4.0)
     flights = fleet.run().flights
@@ -90,13 +90,13 @@ def test_it_flies_as_a_method_and_commands_no_rates(policies):
 @pytest.mark.parametrize(
     ("scenario", "text"), [(Scenario(plant="simple"), "plant 'bem' alone"), (Scenario(sensors="rough"), "'ideal'")]
 )
-def test_what_it_cannot_fly_is_refused_before_anything_flies(scenario, text, policies):
+def test_unsupported_scenario_is_refused_before_flight(scenario, text, policies):
     with pytest.raises(ConfigError, match=text):
         Fleet(tiny_preset(), policies, [scenario], methods=["raptor"])
 
 
-def test_it_flies_beside_others_by_its_command(tmp_path, monkeypatch, as_a_user):
-    table = importlib.import_module("retrim_paper.tables.raptor")  # the package has a function of that name
+def test_flies_with_other_methods_by_its_command(tmp_path, monkeypatch, as_a_user):
+    table = importlib.import_module("retrim_paper.tables.raptor")  # the package exports a function of that name
     monkeypatch.setattr(table, "DISTURBED", {"none": "calm"})
     words = "--methods", "raptor", "--vehicles", "kingfisher", "--seeds", "0", "--starts", "1"
     retrim("reproduce", "raptor", *words, "--seconds", "2", "--out", "t", cwd=tmp_path)

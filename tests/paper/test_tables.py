@@ -1,4 +1,4 @@
-"""Tables at reduced size, and what stands in them."""
+"""Tables at reduced size, and their content."""
 
 import dataclasses
 import importlib
@@ -31,7 +31,7 @@ from retrim_paper.datt import training as rivals
 from retrim_paper.tables.levels import Levels, fly_levels
 from retrim_paper.tables.reversing import METHODS, _errors, _moments, _section
 
-# The package has functions of some of these names.
+# The package exports functions with the names of some of these modules.
 TABLES = "retrim_paper.tables"
 fast, levels, scaling = (importlib.import_module(f"{TABLES}.{name}") for name in ("fast", "levels", "scaling"))
 
@@ -41,12 +41,12 @@ LEVELS = ("none", "small", "large")
 
 
 def make_untrained(preset, seeds, run, reporter):
-    """In place of training, where it does not matter how well a policy flies."""
+    """Return untrained policies, for tests in which the quality of the policy does not matter."""
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     return Study(preset, dict.fromkeys(seeds, policy), (0.1,) * len(seeds))
 
 
-def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
+def test_hover_table_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/fast", brief_preset())
     words = "--presets", "fast", "--seeds", "0", "3", "--seconds", "1", "--starts", "1", "--plant", "simple"
     words += "--methods", "base", "indi", "full"
@@ -68,7 +68,7 @@ def test_a_table_of_hover_by_its_command(tmp_path, monkeypatch):
     assert (tmp_path / "t" / "hover_fast.png").stat().st_size > 10_000
 
 
-def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path, monkeypatch):
+def test_tracking_section_has_cross_track_error_and_rows_of_paper(tmp_path, monkeypatch):
     monkeypatch.setattr(levels, "train_all", make_untrained)
     preset = brief_preset("track/preview", track={"reference": "circle"})
     scenario = Scenario(plant="simple", reference="circle")
@@ -94,10 +94,11 @@ def test_a_section_of_tracking_has_cross_track_and_the_papers_rows(tmp_path, mon
     assert "behind [s]" in figures.columns
 
 
-def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
-    """What is finished is not flown again, and the table is the same; another size, or other code, is flown.
+def test_interrupted_run_is_continued(tmp_path, imagine, monkeypatch):
+    """Finished sections are not repeated, and the table is equal; for a different size or different code, they are
+    repeated.
 
-    No flight is like an earlier one, so that a section that is flown again is another one.
+    Every flight is different, so that a repeated section is distinguishable.
     """
     errors = itertools.count(1)
     done = imagine(levels, lambda spec: None if spec.method == "indi" else 0.01 * next(errors))
@@ -114,7 +115,7 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
     )
 
     def table(*sections, starts=1):
-        """Fly, and return the plants that were flown, and the table."""
+        """Fly, and return the plants of the flights, and the table."""
         done.flights.clear()
         document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
         fly_levels(document, sections, starts=starts, seconds=1.0)
@@ -130,7 +131,7 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
     unfinished.parent.mkdir()
     unfinished.touch()
     assert table(one, two) == ([], whole)
-    assert unfinished.exists()  # a reused section leaves the flights of an unfinished one
+    assert unfinished.exists()  # a reused section keeps the flights of an unfinished one
     assert "An earlier run had made 2 of the parts" in (tmp_path / "table.md").read_text()
     flight, other = table(one, two, starts=2)
     assert flight == ["simple", "bem"]
@@ -142,7 +143,7 @@ def test_a_run_goes_on_where_it_was_killed(tmp_path, imagine, monkeypatch):
     assert table(one)[0] == ["simple"]
 
 
-def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, monkeypatch):
+def test_section_is_recomputed_for_each_changed_input(tmp_path, monkeypatch):
     base = Levels("title", brief_preset(), Scenario(plant="simple"), "x", ("indi", "datt"))
     calls = []
     monkeypatch.setattr(levels, "_fly_section", lambda *a, **k: calls.append(0) or (TableSection((), ()), []))
@@ -162,13 +163,14 @@ def test_a_section_is_made_again_for_every_thing_that_it_follows_from(tmp_path, 
     ]  # fmt: skip
     assert [fly(section) for section in sections] == [1] * len(sections)
     assert [fly(seeds=(1,)), fly(starts=2), fly(seconds=2.0), fly(datt_steps=2)] == [1] * 4
-    assert fly(dataclasses.replace(base, methods=("indi", "geometric")), datt_steps=2) == 0  # nobody there is trained
+    # no training takes place here
+    assert fly(dataclasses.replace(base, methods=("indi", "geometric")), datt_steps=2) == 0
     assert fly() == 0
     monkeypatch.setattr(levels, "file_digests", lambda *names: {"my_wind:breeze": "changed"})
     assert fly() == 1
 
 
-def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypatch):
+def test_section_depends_on_vehicle_file_and_module(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("my_quad.py").write_text("from retrim.physics.vehicle import small as make\n")
@@ -184,7 +186,7 @@ def test_a_vehicle_of_a_file_or_a_module_is_one_of_the_things(tmp_path, monkeypa
     assert dump(with_vehicle(preset, "my.toml")) != before
 
 
-def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
+def test_progress_of_flights_is_complete(tmp_path):
     preset, watching = brief_preset(), Watching()
     study = Study(preset, {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}, ())
     flight = fly_all(study, [Scenario(plant="simple")], Run("test", tmp_path), watching,
@@ -194,7 +196,7 @@ def test_progress_of_flights_goes_from_nothing_to_all(tmp_path):
     assert watching.shares == sorted(watching.shares)
 
 
-def test_what_does_not_fit_together_is_refused_before_training():
+def test_inconsistent_options_are_refused_before_training():
     refuse = partial(refuse_misfits, load("hover/fast"), starts=1, seconds=1.0)
     refuse([Scenario()], methods=["base"])
     with pytest.raises(ConfigError, match="no method 'best'"):
@@ -209,7 +211,7 @@ def test_what_does_not_fit_together_is_refused_before_training():
         refuse_misfits(load("hover/fast"), [Scenario()], methods=["base"], starts=0, seconds=1.0)
 
 
-def test_a_section_follows_from_the_files_behind_its_names(tmp_path, monkeypatch):
+def test_section_depends_on_files_behind_its_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my_wind.py").write_text("def breeze(key, size):\n    pass\n")
     Path("lap.csv").write_text("t,x,y,z\n")
@@ -229,8 +231,8 @@ def small_datt(monkeypatch):
 
 
 @pytest.mark.usefixtures("small_datt")
-def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
-    """Of a seed and a vehicle; a file that is damaged, or made by code that has changed, is made again."""
+def test_datt_is_trained_once_per_folder(tmp_path, monkeypatch):
+    """Training is repeated for a different seed, vehicle or code, and for a damaged file."""
     text = []
     reporter = Silent()
     reporter.say = text.append
@@ -252,8 +254,8 @@ def test_datt_is_trained_once_for_a_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("small_datt")
-def test_a_training_of_datt_that_is_cut_goes_on_where_it_was(tmp_path):
-    """To the same network, to the bit; also where its state cannot be read, when it begins anew."""
+def test_interrupted_datt_training_is_continued(tmp_path):
+    """The network is equal bit for bit; if the saved state is unreadable, training starts again."""
     preset, size, text = load("hover/retrim"), rivals.DATT_PPO["envs"] * rivals.DATT_PPO["steps"], []
 
     def train(name, stops_at=2.0):
@@ -279,8 +281,8 @@ def test_a_training_of_datt_that_is_cut_goes_on_where_it_was(tmp_path):
         jax.tree.map(np.testing.assert_array_equal, *(eqx.filter(n[0], eqx.is_array) for n in (whole, other)))
 
 
-def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_path, monkeypatch):
-    """Another of these is another file; what is learnt goes on from update to update."""
+def test_datt_file_depends_on_vehicle_lag_steps_and_seed(tmp_path, monkeypatch):
+    """A change of one of these gives a different file; the learned state continues from update to update."""
     preset, watching, calls = load("hover/retrim"), Watching(), []
 
     def ppo(problem, state, settings, *, steps):
@@ -323,8 +325,8 @@ def test_a_network_of_datt_is_of_its_vehicle_its_lag_its_steps_and_its_seed(tmp_
 
 
 @pytest.mark.usefixtures("small_datt")
-def test_baselines_fly_without_a_trained_policy(tmp_path, monkeypatch):
-    """One flight of each, DATT too, and nothing is trained for policies that nobody flies."""
+def test_baselines_need_no_trained_policy(tmp_path, monkeypatch):
+    """Each baseline flies once, including DATT, and no unused policy is trained."""
     monkeypatch.setattr(levels, "train_all", lambda *_: pytest.fail("a policy is trained"))
     section = Levels(
         "x", load("hover/retrim"), Scenario(plant="simple"), "x", ("indi", "datt"), levels={"none": "calm"}
@@ -336,8 +338,8 @@ def test_baselines_fly_without_a_trained_policy(tmp_path, monkeypatch):
     assert [row[0] for row in document.sections[0].rows] == ["INDI", "DATT"]
 
 
-def test_a_table_of_fast_flight_flies_a_file_too(tmp_path, monkeypatch):
-    """The race line that comes with the examples uses what the kingfisher can do, and no more."""
+def test_fast_table_accepts_trajectory_file(tmp_path, monkeypatch):
+    """The race line of the examples is at the limits of the kingfisher."""
     line = Path(__file__).parents[2] / "examples" / "race.csv"
     preset = brief_preset("track/fast", track={"reference": "circle=8", "gravity_copies": 0})
     setup = Setup.from_preset(preset, str(line))
@@ -355,7 +357,7 @@ def test_a_table_of_fast_flight_flies_a_file_too(tmp_path, monkeypatch):
     assert document.sections[0].columns[2] == "wind of 4 m/s"
 
 
-def test_an_interrupted_table_flies_nothing_more(tmp_path):
+def test_interrupted_table_stops_flights(tmp_path):
     run = Run("test", tmp_path)
     run.stop.set()
     assert train_all(tiny_preset(), [0, 1], run, Silent()).policies == {}
@@ -368,7 +370,7 @@ def test_an_interrupted_table_flies_nothing_more(tmp_path):
     assert results(tmp_path, "table.json")["interrupted"]
 
 
-def test_a_training_of_a_table_ends_soon_after_it_is_stopped(tmp_path):
+def test_training_of_table_ends_soon_after_stop(tmp_path):
     run = Run("test", tmp_path)
     watching = Watching(lambda share: share and run.stop.set())
     preset = brief_preset(pretrain={"num_updates": 30})
@@ -377,7 +379,7 @@ def test_a_training_of_a_table_ends_soon_after_it_is_stopped(tmp_path):
     assert nothing == 0.0 < first < 1.0
 
 
-def test_every_section_is_written_when_it_is_added(tmp_path):
+def test_every_section_is_written_when_added(tmp_path):
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0, 4], Silent(), {"more": 1})
     document.add(TableSection(("a", "b"), (("1", "2"),), "First", "About it."), [{"x": 1}])
     assert "## First\n\nAbout it.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n" in (tmp_path / "table.md").read_text()
@@ -388,7 +390,7 @@ def test_every_section_is_written_when_it_is_added(tmp_path):
     assert document.run.pages == [tmp_path / "table.md"]
 
 
-def test_a_page_begins_with_results_and_ends_with_provenance(tmp_path):
+def test_page_begins_with_results_and_ends_with_provenance(tmp_path):
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0, 4], Silent())
     document.add(TableSection(("a",), (("1",),), "First"))
     page = (tmp_path / "table.md").read_text()
@@ -399,14 +401,14 @@ def test_a_page_begins_with_results_and_ends_with_provenance(tmp_path):
         assert fact not in results_only
 
 
-def test_errors_are_read_around_reversals_and_updates(tmp_path):
-    """A reversal every 15 s; updates start every 5 s and fly a second later."""
+def test_errors_around_reversals_and_updates(tmp_path):
+    """Reversals occur every 15 s; updates start every 5 s and take effect a second later."""
     moments, updates = _moments(Adapt(), 60.0)
     assert updates == [1, 2, 3]
     np.testing.assert_allclose(moments, [[15, 16, 21, 26, 30], [30, 31, 36, 41, 45], [45, 46, 51, 56, 60]])
     t = DT * np.arange(3001)
     ramp = dataclasses.replace(flight(t, flight=log(t=t)))
-    # fifty ticks, that of the moment last
+    # fifty ticks, the last one at that moment
     np.testing.assert_allclose(_errors(ramp, moments), moments - 0.49, atol=1e-9)
     errors = {method: [] for method in METHODS} | {"full": [_errors(ramp, moments)] * 2}
     section = _section(errors, moments, updates, "", tmp_path / "x.png")
@@ -422,8 +424,8 @@ def test_errors_are_read_around_reversals_and_updates(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["hover", "track", "phase", "vision", "fast", "transfer", "raptor"])
-def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
-    """Plant, methods, seeds, starts, length: nothing is lost between an option and a flight."""
+def test_table_uses_all_options(name, tmp_path, monkeypatch):
+    """Plant, methods, seeds, starts and length reach the flights."""
     table = importlib.import_module(f"{TABLES}.{name}")
     plan = []
     monkeypatch.setattr(table, "fly_levels", lambda document, sections, **how: plan.append((document, sections, how)))
@@ -437,14 +439,14 @@ def test_a_table_flies_what_it_was_asked_to(name, tmp_path, monkeypatch):
         assert (document.name, tuple(document.seeds)) == (name, (3, 4))
         assert how == {key: calls[key] for key in ("starts", "seconds", "datt_steps") if key in calls}
         assert sections
-        assert len({section.stem for section in sections}) == len(sections)  # no picture is written over
+        assert len({section.stem for section in sections}) == len(sections)  # no plot is overwritten
         for section in sections:
             assert {scenario.plant for scenario in section.scenarios} == {calls.get("plant", "bem")}
             assert tuple(section.methods) in (("indi",), ())
         assert any(section.methods for section in sections)
 
 
-def test_raptor_flies_beside_policies_that_were_trained_for_its_vehicles(tmp_path, monkeypatch):
+def test_raptor_flies_with_policies_trained_for_its_vehicles(tmp_path, monkeypatch):
     table, plan = importlib.import_module(f"{TABLES}.raptor"), []
     monkeypatch.setattr(table, "fly_levels", lambda document, sections, **how: plan.extend(sections))
     table.raptor(Run("test", tmp_path), Silent(), vehicles=("kingfisher", "large"))
@@ -459,8 +461,8 @@ def test_raptor_flies_beside_policies_that_were_trained_for_its_vehicles(tmp_pat
         assert section.title.endswith(section.preset.vehicle)
 
 
-def test_many_machines_are_limited_by_flying_then_by_the_network_then_by_the_scheduler():
-    """A million flights: time falls with the machines until it is that of what they share."""
+def test_scaling_is_limited_by_flights_then_network_then_scheduler():
+    """For a million flights, time decreases with the number of machines down to that of their shared parts."""
 
     def longest(run_s, size):
         rows = [{"flights": 1000, "run_s": run_s, "flight_bytes": size, "compile_s": 60.0}]

@@ -31,7 +31,7 @@ def medians(**millimetres):
         ({"observer": 9.0, "geometric": 11.0, "adapted": 7.0}, "learning helps a little; observer is simpler"),
     ],
 )
-def test_the_verdict_follows_from_the_numbers(figures, verdict):
+def test_verdict_follows_from_numbers(figures, verdict):
     assert decide(medians(**figures), NONE_LOST) == verdict
 
 
@@ -42,7 +42,7 @@ def test_lost_flights_decide_before_errors():
     assert "INDI" not in decide(figures, NONE_LOST | {"INDI": 1})
 
 
-def test_a_cell_shows_lost_flights_and_millimetres():
+def test_cell_shows_lost_flights_and_millimetres():
     assert _cell(np.array([0.002, 0.002, 0.002])) == "2.0 (2.0 to 2.0)"
     text = _cell(np.array([0.002, 0.003, np.inf]))
     assert text.startswith("3.0 (2.0 to ∞)")
@@ -51,7 +51,7 @@ def test_a_cell_shows_lost_flights_and_millimetres():
 
 
 @pytest.mark.parametrize(("lowest", "touches"), [(0.99, False), (0.97, True)])
-def test_a_contact_with_the_table_counts_as_a_loss(lowest, touches):
+def test_contact_with_table_counts_as_loss(lowest, touches):
     """The table is 2 cm below a vehicle at 1 m."""
     p = np.array([[1.5, 0.0, 1.0], [1.5, 0.0, lowest], [1.5, 0.0, 1.0]])
     states = States(p, np.stack([np.eye(3)] * 3), np.zeros((3, 3)))
@@ -62,8 +62,8 @@ def test_a_contact_with_the_table_counts_as_a_loss(lowest, touches):
 
 
 @pytest.mark.parametrize(("pace", "error"), [(4.0, 0.05), (3.0, np.inf)])
-def test_the_error_of_the_last_lap_counts_if_the_lap_is_fast(pace, error):
-    """The figure-8 begins its laps of 5 s at 3 s; the first one is flown at a pace of 1."""
+def test_error_of_last_lap_counts_if_lap_is_fast(pace, error):
+    """The figure-8 begins its laps of 5 s at 3 s; the first lap has a pace of 1."""
     t = 0.02 * np.arange(1001)
     phase = np.where(t < 10.0, t, 10.0 + pace * (t - 10.0))
     states = States(np.zeros((1001, 3)), np.stack([np.eye(3)] * 1001), np.zeros((1001, 3)))

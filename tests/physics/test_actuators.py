@@ -1,4 +1,4 @@
-"""Actuator lag: the exact step response at ticks, the mean over a tick, gradients, and no residual of its own."""
+"""Actuator lag: the exact step response at ticks, the mean over a tick, gradients, and a zero residual."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def commands(key, n):
 
 @jax.jit
 def fly_once(model, s, us):
-    """All states of the model, the first included."""
+    """Return all states of the model, including the first."""
 
     def tick(s, u):
         return model.step(s, u, STILL), s
@@ -34,7 +34,7 @@ def fly_once(model, s, us):
     return jax.tree.map(lambda all_, last: jnp.concatenate([all_, last[None]]), states, end)
 
 
-def test_without_lag_it_is_the_base_model(key):
+def test_zero_lag_equals_base_model(key):
     x, us = random_state(key), commands(key, 10)
     plain, quick = fly_once(PointMass(DT), x, us), fly_once(lag_model(1e-9), lag_model(1e-9).init(x), us)
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(quick.inner), strict=True):
@@ -62,7 +62,7 @@ def test_hover_is_an_equilibrium():
 
 
 def fine(x, us, tau, h=1e-3):
-    """Eq. (1) under a command that creeps towards ``us``, in steps of 1 ms: midpoint in time."""
+    """Integrate Eq. (1) under a command that approaches ``us``, in steps of 1 ms by the midpoint rule."""
     acting, states = Command.hover().vector(), [x]
     base, expected = PointMass(h), np.stack([np.append(c, w) for c, w in zip(us.c, us.omega, strict=True)])
     step = jax.jit(base.step)
@@ -75,8 +75,8 @@ def fine(x, us, tau, h=1e-3):
     return stack_trees(states)
 
 
-def test_thrust_over_a_tick_is_its_mean(key):
-    """Without turning, velocity is exact: only the integral of thrust counts."""
+def test_thrust_over_tick_is_its_mean(key):
+    """Without rotation, the velocity is exact, since only the integral of thrust matters."""
     us = jax.tree.map(lambda leaf: leaf if leaf.ndim == 1 else jnp.zeros_like(leaf), commands(key, 8))
     x = random_state(key)
     result, true = fly_once(lag_model(), lag_model().init(x), us).inner, fine(x, us, TAU)
@@ -86,7 +86,7 @@ def test_thrust_over_a_tick_is_its_mean(key):
     assert float(jnp.abs(end_only.v - true.v).max()) > 0.01
 
 
-def test_close_to_fine_steps_while_turning(key):
+def test_close_to_fine_integration_while_rotating(key):
     us, x = commands(key, 8), random_state(key)
     result, true = fly_once(lag_model(), lag_model().init(x), us).inner, fine(x, us, TAU)
     assert float(jnp.abs(result.v - true.v).max()) < 0.02
@@ -100,15 +100,15 @@ def test_external_acceleration_is_not_delayed():
     np.testing.assert_allclose(with_push.inner.v, [0.04, 0.0, 0.0], atol=1e-12)
 
 
-def test_what_is_hidden_stays(key):
+def test_hidden_state_is_kept(key):
     s = LagState(random_state(key), ActuatorState.at(random_command(key)))
     after = lag_model().with_state(s, State.at(jnp.array(GOAL)))
     jax.tree.map(np.testing.assert_array_equal, after.actuators, s.actuators)
     np.testing.assert_array_equal(lag_model().state(after).p, GOAL)
 
 
-def test_gradients_against_finite_differences(key):
-    """Of a mixture of the state after three ticks, along random directions in state, commands and tau."""
+def test_gradients_equal_finite_differences(key):
+    """The function is a mixture of the state after three ticks; directions are random in state, commands and tau."""
     kx, ku, kw, kd = random.split(key, 4)
     start = (random_state(kx), commands(ku, 3), jnp.array(TAU))
     weights = random.normal(kw, (15,))
@@ -131,11 +131,11 @@ def test_gradients_against_finite_differences(key):
         ahead, behind = (mixture(jax.tree.map(lambda a, d, s=s: a + s * d, start, way)) for s in (h, -h))
         expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
         assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-5)
-    assert float(jnp.abs(slope[2])) > 1e-3  # tau matters
+    assert float(jnp.abs(slope[2])) > 1e-3  # tau has an effect
 
 
-def test_wraps_and_is_wrapped(key):
-    """A residual around it acts at once; behind a straight-through estimator its lag is kept."""
+def test_composition_with_wrappers(key):
+    """A residual around it acts immediately; behind a straight-through estimator its lag is kept."""
     push = lambda x, u: jnp.array([1.0, 0.0, 0.0])  # noqa: E731
     x, u = State.at(jnp.array(GOAL)), Command(jnp.array(15.0), jnp.zeros(3))
     model = Hybrid(lag_model(), push)
@@ -145,14 +145,14 @@ def test_wraps_and_is_wrapped(key):
     t = through.step(through.init(x), u, STILL)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), t, s)
     gain = jax.jit(jax.jacobian(lambda c: through.step(through.init(x), replace_fields(u, c=c), STILL).inner.v[2]))(u.c)
-    assert float(gain) == pytest.approx(DT)  # of the model behind, which has no lag
+    assert float(gain) == pytest.approx(DT)  # of the inner model, which has no lag
 
 
-# ---- no residual of its own
+# ---- zero residual
 
 
 def window(key, n, delay):
-    """A flight that the lagged model made; commands act ``delay`` ticks after they were issued."""
+    """Return a flight of the lagged model; commands act ``delay`` ticks after they were issued."""
     issued_commands = commands(key, n)
     acting = stack_trees(
         [Command.hover()] * delay + [jax.tree.map(lambda l, k=k: l[k], issued_commands) for k in range(n - delay)]
@@ -163,15 +163,15 @@ def window(key, n, delay):
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
-def test_a_lagged_flight_leaves_no_residual(delay, key):
+def test_lagged_flight_has_zero_residual(delay, key):
     rows = residual_targets(window(key, 40, delay), lag_model(), delay_ticks=delay)
     np.testing.assert_allclose(rows.a_res, 0.0, atol=1e-10)
     unaware = residual_targets(window(key, 40, delay), PointMass(DT), delay_ticks=delay)
     assert float(jnp.abs(unaware.a_res).max()) > 0.3
 
 
-def test_a_window_from_mid_flight_settles(key):
-    """What acts at its first tick is not known; the mistake dies with the lag: 4 % after five ticks."""
+def test_residual_of_window_from_mid_flight_decays(key):
+    """The command that acts at its first tick is unknown; the error decays with the lag to 4 % after five ticks."""
     late = jax.tree.map(lambda leaf: leaf[23:], window(key, 80, 1))
     away = np.linalg.norm(residual_targets(late, lag_model(), delay_ticks=1).a_res, axis=1)
     assert away[0] > 0.05
@@ -179,8 +179,8 @@ def test_a_window_from_mid_flight_settles(key):
     assert away[35:].max() < 1e-6
 
 
-def test_a_filling_window_settles_too(key):
-    """In front the oldest tick is repeated, invalid; soon after take-off nothing is left of that."""
+def test_residual_of_partly_filled_window_decays(key):
+    """The oldest tick is repeated in front and marked invalid, and has no effect soon after take-off."""
     whole = window(key, 60, 1)
     padding = jax.tree.map(lambda leaf: jnp.concatenate([jnp.repeat(leaf[:1], 20, axis=0), leaf]), whole)
     padding = replace_fields(padding, valid=jnp.arange(80) >= 20)
@@ -190,8 +190,8 @@ def test_a_filling_window_settles_too(key):
     assert away[57:].max() < 1e-6
 
 
-def test_rates_lag_as_thrust_does():
-    """R after a tick of a roll command: the mean rate, exactly, since the axis stays."""
+def test_rates_lag_like_thrust():
+    """The rotation after a tick of a roll command follows exactly from the mean rate, since the axis is constant."""
     u = Command(jnp.array(9.81), jnp.array([2.0, 0.0, 0.0]))
     s = lag_model().step(lag_model().init(State.at(jnp.array(GOAL))), u, STILL)
     angle = 2.0 * (DT - TAU * (1.0 - np.exp(-DT / TAU)))

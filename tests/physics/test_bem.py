@@ -1,4 +1,4 @@
-"""Physics that the blade-element plant must obey, for all vehicles."""
+"""Physical laws of the blade-element plant, for all vehicles."""
 
 import jax
 import jax.numpy as jnp
@@ -33,42 +33,42 @@ VEHICLES = {"small": small, "large": large, "kingfisher": kingfisher}
 G, ZERO = 9.81, np.zeros(3)
 
 
-def strong(tree):
-    """Without weak types: one program serves all tests."""
+def strongly_typed(tree):
+    """Return the tree without weak types, so that one program serves all tests."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), tree, is_leaf=lambda node: isinstance(node, list))
 
 
 @pytest.fixture(params=list(VEHICLES))
 def bem(request):
-    """No thrust error."""
-    return strong(BemQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0))
+    """Return the model of each vehicle, without a thrust error."""
+    return strongly_typed(BemQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0))
 
 
 def effects(**values):
-    return ExternalEffects.of(jnp.dtype(float), **strong(values))
+    return ExternalEffects.of(jnp.dtype(float), **strongly_typed(values))
 
 
 def command(c=G, omega=ZERO):
-    return Command(*strong((c, omega)))
+    return Command(*strongly_typed((c, omega)))
 
 
 def state(v=ZERO, rotation=ZERO):
-    p, rotation, v = strong((ZERO, rotation, v))
+    p, rotation, v = strongly_typed((ZERO, rotation, v))
     return State(p, so3.exp(rotation), v)
 
 
 def body(x, motors, omega=ZERO):
-    return RotorState(x, *strong((omega, motors, ZERO, ZERO)))
+    return RotorState(x, *strongly_typed((omega, motors, ZERO, ZERO)))
 
 
 @jax.jit
 def start(model, x):
-    return strong(model.init(x))
+    return strongly_typed(model.init(x))
 
 
 @jax.jit
 def path(model, s, u, effects):
-    """Every millisecond of two seconds."""
+    """Return the states of every millisecond of two seconds."""
 
     def millisecond(s, _):
         after = model.substep(s, u, effects)
@@ -83,14 +83,14 @@ def at(path, ms):
 
 @jax.jit
 def loads(model, b, motors, effects):
-    """Steady loads at rotor speeds ``motors``, and what the blades give."""
+    """Return steady loads at rotor speeds ``motors``, and those of the blades."""
     above = jax.tree.map(lambda leaf: jnp.full(4, leaf), Inflow.above(motors.dtype))
     has_settled = lax.fori_loop(0, 9, lambda _, inflow: model.rotors(b, motors, inflow, effects.wind)[1], above)
     blades, _ = model.rotors(b, motors, has_settled, effects.wind)
     return model.loads(b, motors, blades, effects), blades
 
 
-def hovering(model, x=None, **options):
+def hover_state(model, x=None, **options):
     motors = start(model, state()).body.motors
     return loads(model, body(x or state(), motors), motors, effects(**options))[0]
 
@@ -102,21 +102,21 @@ def test_hover_balance(bem):
     p = path(bem, start(bem, state()), command(), effects())
     np.testing.assert_allclose(p.body.x.p, 0.0, atol=1e-9)
     np.testing.assert_allclose(p.body.x.R[-1], np.eye(3), atol=1e-12)
-    force, torque = hovering(bem)
+    force, torque = hover_state(bem)
     np.testing.assert_allclose(force, [0, 0, float(bem.vehicle.mass) * G], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("error", [-0.035, 0.035])
-def test_thrust_error_is_the_stated_acceleration(bem, error):
-    wrong = strong(BemQuadrotor.of(bem.vehicle, 0.02, thrust_error=error))
-    assert float(hovering(wrong).force[2] / bem.vehicle.mass) == pytest.approx((1 + error) * G, rel=1e-9)
+def test_thrust_error_gives_stated_acceleration(bem, error):
+    wrong = strongly_typed(BemQuadrotor.of(bem.vehicle, 0.02, thrust_error=error))
+    assert float(hover_state(wrong).force[2] / bem.vehicle.mass) == pytest.approx((1 + error) * G, rel=1e-9)
     v = path(wrong, start(wrong, state()), command(), effects()).body.x.v
     assert float(v[19, 2]) == pytest.approx(error * G * 0.02, rel=0.02)
 
 
 def test_mirror_symmetry(bem, key):
-    """Left and right are the same: mirror start, command and wind in y, and the flight is mirrored."""
+    """If start, command and wind are mirrored in y, the flight is mirrored."""
     M = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
     x, u, wind = random_state(key, 0.3), random_command(key), jnp.array([1.0, 2.0, 0.5])
     mirror = jax.jit(lambda x: State(M @ x.p, M @ x.R @ M, M @ x.v))(x)
@@ -126,12 +126,12 @@ def test_mirror_symmetry(bem, key):
     np.testing.assert_allclose(t.R, M @ s.R @ M, atol=1e-10)
 
 
-def test_only_the_motion_through_the_air_counts(bem):
+def test_only_airspeed_matters(bem):
     v, rotation = jnp.array([2.0, -1.0, 0.5]), [0.1, 0.2, 0.3]
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12),
-        hovering(bem, state(v, rotation)),
-        hovering(bem, state(ZERO, rotation), wind=-v),
+        hover_state(bem, state(v, rotation)),
+        hover_state(bem, state(ZERO, rotation), wind=-v),
     )
     u, s = command(10.0, [1.0, 0.5, -0.5]), start(bem, state(v, rotation))
     flying = path(bem, s, u, effects()).body.x
@@ -142,7 +142,7 @@ def test_only_the_motion_through_the_air_counts(bem):
 
 
 def test_terminal_velocity(bem):
-    """A fall with idling rotors approaches the speed at which drag and idle thrust carry the weight."""
+    """A fall with idling rotors approaches the speed at which drag and idle thrust balance the weight."""
     s, speeds = start(bem, state()), []
     for _ in range(5):
         s = at(path(bem, s, command(0.0), effects()), 2000)
@@ -156,12 +156,12 @@ def test_terminal_velocity(bem):
 # ---- air
 
 
-def test_air_takes_energy(bem, key):
-    """Body drag and in-plane forces brake what meets them, turning or not: the power of the whole is theirs."""
+def test_air_dissipates_energy(bem, key):
+    """Body drag and in-plane forces oppose the airflow, with or without rotation, and account for the whole power."""
     for k in random.split(key, 20):
         x, omega = random_state(k, 5.0), np.asarray(random.normal(k, (3,)))
         b, through = body(x, 1000.0 * np.ones(4), omega), np.asarray(x.R).T @ np.asarray(x.v)
-        drag, in_plane, (force, torque) = jax.tree.map(np.asarray, braking(bem, b))
+        drag, in_plane, (force, torque) = jax.tree.map(np.asarray, dissipative_loads(bem, b))
         of_body = drag @ through
         hubs = through + np.cross(omega, bem.places())
         of_rotors = -bem_module.IN_PLANE_GAIN * in_plane @ np.linalg.norm(hubs[:, :2], axis=1)
@@ -171,8 +171,8 @@ def test_air_takes_energy(bem, key):
 
 
 @jax.jit
-def braking(model, b):
-    """Drag of the body, in-plane forces, and the loads of these two alone."""
+def dissipative_loads(model, b):
+    """Return drag of the body, in-plane forces, and the loads of these two only."""
     _, blades = loads(model, b, b.motors, effects())
     alone = blades._replace(thrust=jnp.zeros(4), torque=jnp.zeros(4))
     return model.body_drag(b, jnp.zeros(3)), blades.in_plane, model.loads(b, b.motors, alone, effects())
@@ -183,7 +183,7 @@ def braking(model, b):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_rate_step_response(bem, axis):
-    """Reaches 63 % in 60 ms (yaw 200 ms), overshoots by less than 35 % (no feed-forward), holds the other rates."""
+    """Rates reach 63 % in 60 ms (yaw 200 ms) and overshoot by less than 35 %; the other rates are constant."""
     rates = path(bem, start(bem, state()), command(G, np.eye(3)[axis]), effects()).body.omega
     assert rates[200 if axis == 2 else 60, axis] > 0.63
     assert rates[:, axis].max() < 1.35
@@ -198,21 +198,22 @@ def test_commands_are_limited(bem):
     assert (p.motors >= vehicle.motor_min).all()
     assert jnp.abs(p.omega[:, 0]).max() < 1.5 * vehicle.omega_max[0]
     full = path(bem, start(bem, state()), command(1e4), effects()).body.motors[-1]
-    expected = jnp.sqrt(vehicle.thrust_max / (4.0 * bem.loop.thrust_map))  # the small one's controllers end below it
+    # the controllers of the small vehicle stay below it
+    expected = jnp.sqrt(vehicle.thrust_max / (4.0 * bem.loop.thrust_map))
     np.testing.assert_allclose(full, min(expected, vehicle.esc.speed(jnp.array(1.0))), rtol=1e-6)
 
 
 @pytest.mark.parametrize("rotor", range(4))
-def test_a_weak_rotor_lets_its_corner_sink(bem, rotor):
+def test_weak_rotor_lowers_its_corner(bem, rotor):
     gain = np.ones(4)
     gain[rotor] = 0.8
-    force, torque = hovering(bem, gain=gain)
+    force, torque = hover_state(bem, gain=gain)
     np.testing.assert_array_equal(np.sign(torque), -np.array(SIGNS)[:, rotor])
     np.testing.assert_allclose(force[2], 0.95 * float(bem.vehicle.mass) * G)
     np.testing.assert_allclose(torque[0], 0.2 * force[2] / 3.8 / bem_module.FRAME_FACTOR * bem.places()[rotor, 1] * -1)
 
 
-def test_payload_slows_the_climb(bem):
+def test_payload_slows_climb(bem):
     m, dm = float(bem.vehicle.mass), 0.07
     s = path(bem, start(bem, state()), command(15.0), effects())
     gain = [path(bem, at(s, 20), command(15.0), effects(mass=k)).body.x.v[0] - s.body.x.v[19] for k in (0.0, dm)]
@@ -220,14 +221,14 @@ def test_payload_slows_the_climb(bem):
     assert float(thrusts[1] / thrusts[0]) == pytest.approx(m / (m + dm), rel=1e-9)
 
 
-def test_angular_momentum_is_kept(bem):
-    """Rotors that give no force: gyroscopic torque and yaw reaction only pass momentum between body and rotors."""
+def test_angular_momentum_is_conserved(bem):
+    """Without rotor forces, gyroscopic torque and yaw reaction only exchange momentum between body and rotors."""
     vehicle, yaw = bem.vehicle, jnp.array(SIGNS[2], dtype=float)
     none = BladeForces(*(jnp.zeros(4) for _ in range(3)))
     still = replace_fields(bem, vehicle=replace_fields(vehicle, drag_area=1e-12 * jnp.ones(3)))
 
     def momentum(b):
-        rotors = -vehicle.rotor_inertia * jnp.sum(yaw * b.motors)  # the front-right one turns towards +z
+        rotors = -vehicle.rotor_inertia * jnp.sum(yaw * b.motors)  # the front-right rotor turns towards +z
         return b.x.R @ (vehicle.inertia * b.omega + jnp.array([0.0, 0.0, 1.0]) * rotors)
 
     def millisecond(b, i):
@@ -249,9 +250,9 @@ def test_angular_momentum_is_kept(bem):
 # ---- as a model
 
 
-def test_loads_may_be_held_over_a_millisecond(monkeypatch):
-    """Half the step moves a 10 s hover in wind, from half a metre away, by less than a millimetre."""
-    model = strong(BemQuadrotor.of(small(), 0.02))
+def test_loads_can_be_constant_over_a_millisecond(monkeypatch):
+    """Half the step changes a 10 s hover in wind, from half a metre away, by less than a millimetre."""
+    model = strongly_typed(BemQuadrotor.of(small(), 0.02))
     windy = effects(wind=[2.0, 1.0, 0.0])
 
     def tick(s, _, *, n):
@@ -283,8 +284,8 @@ def tick(model, s, x, u, weights):
     return jax.value_and_grad(number, argnums=(0, 1))(x, u)
 
 
-def test_gradients_over_the_envelope(bem, key):
-    """Finite, and equal to differences: fast and slow, in all attitudes, from idle to full thrust, and at rest."""
+def test_gradients_equal_finite_differences(bem, key):
+    """Gradients are checked at high and low speed, in all attitudes, from idle to full thrust, and at rest."""
     vehicle = bem.vehicle
     for k in random.split(key, 8):
         x, weights = random_state(k, 6.0), random.normal(k, (15,))
@@ -302,9 +303,9 @@ def test_gradients_over_the_envelope(bem, key):
 
 
 def test_hybrid_and_straight_through(key):
-    """The value of the blade-element model with a residual, the gradient of Eq. (1)."""
+    """The value is that of the blade-element model with a residual, and the gradient that of Eq. (1)."""
     x, u, push = random_state(key, 0.3), random_command(key), jnp.array([0.5, 0.0, -1.0])
-    model, weights = strong(BemQuadrotor.of(small(), 0.02)), jnp.arange(15.0)
+    model, weights = strongly_typed(BemQuadrotor.of(small(), 0.02)), jnp.arange(15.0)
     s = start(model, x)
 
     def slope(model, s):
@@ -325,10 +326,10 @@ def test_tick_must_be_whole_milliseconds(dt):
 
 
 @pytest.mark.parametrize("name", ["small", "large"])
-def test_the_integral_removes_the_steady_rate_error_of_a_weak_rotor(name):
-    """With the firmware's scaling the integral holds the commanded rates against a constant torque."""
-    bem = strong(BemQuadrotor.of(VEHICLES[name](), 0.02))
+def test_integral_removes_steady_rate_error_of_weak_rotor(name):
+    """With the firmware's scaling, the integral term holds the commanded rates against a constant torque."""
+    bem = strongly_typed(BemQuadrotor.of(VEHICLES[name](), 0.02))
     weak = effects(gain=[0.9, 1.0, 1.0, 1.0])
     rates = path(bem, start(bem, state()), command(), weak).body.omega
-    assert np.abs(rates[:200]).max() > 0.05  # the torque is felt
+    assert np.abs(rates[:200]).max() > 0.05  # the torque has an effect
     np.testing.assert_allclose(rates[-1], 0.0, atol=0.01)

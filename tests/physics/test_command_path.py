@@ -1,4 +1,4 @@
-"""The command path: delay, thrust lag and rate loop as one value, against analytical answers and fine simulations."""
+"""The command path: delay, thrust lag and rate loop in one object, compared with closed forms and fine simulations."""
 
 import dataclasses
 import itertools
@@ -26,7 +26,7 @@ def commands(key, n):
 
 @eqx.filter_jit
 def follow(path, us, start, dt=DT):
-    """Means over each tick and states at its end, of commands that are held over a tick."""
+    """Return means over each tick and states at its end, for commands that are constant over a tick."""
 
     def tick(s, u):
         mean, s = path(s, u, dt)
@@ -37,7 +37,7 @@ def follow(path, us, start, dt=DT):
 
 @eqx.filter_jit
 def advance(response, s, u, time):
-    """Integral of what acts over a duration, and the state at its end."""
+    """Return the integral of the response over a duration, and the state at its end."""
     away, end = response(s, u, time)
     return jax.tree.map(lambda target, each: time * target + each, response.target(u), away), end
 
@@ -63,7 +63,7 @@ def test_first_order_step(lag):
 
 @pytest.mark.parametrize("zeta", [0.4, 0.5, 0.7, 0.95, 0.999999, 1.0, 1.000001, 1.05, 1.2, 3.0])
 def test_second_order_step(zeta):
-    """The textbook's formula, for a damping on either side of the critical one."""
+    """The closed form is that of textbooks, for damping ratios below and above one."""
     lag, times = 0.08, np.linspace(0.0, 0.6, 61)
     _, s = step_response(ActuatorResponse.of(0.0, lag, inverse_damping=1.0 / zeta), jnp.asarray(times))
     omega_n = 2.0 * zeta / lag
@@ -73,14 +73,15 @@ def test_second_order_step(zeta):
     else:
         swing = np.cos(omega_n * root * times) + zeta / root * np.sin(omega_n * root * times)
         remainder = np.real(np.exp(-zeta * omega_n * times) * swing)
-    np.testing.assert_allclose(s.command.omega[:, 0], 1.0 - remainder, atol=2e-10)  # the textbook cancels near 1
+    # the closed form is inaccurate near 1
+    np.testing.assert_allclose(s.command.omega[:, 0], 1.0 - remainder, atol=2e-10)
     overshoot = float(s.command.omega[:, 0].max()) - 1.0
     expected = np.exp(-np.pi * zeta / np.sqrt(1.0 - zeta**2)) if zeta < 1.0 else 0.0
     assert overshoot == pytest.approx(expected, abs=5e-3)
 
 
-def exact(response, state, u, h, axis):
-    """Rate, slope and integral about an axis by the exponential of the loop's matrix."""
+def matrix_exponential(response, state, u, h, axis):
+    """Return rate, slope and integral about an axis from the exponential of the loop's matrix."""
     tau, kappa, gain = (float(x[axis]) for x in (response.rate_lag, response.inverse_damping, response.rate_gain))
     target, sigma = gain * float(u.omega[axis]), (0.5 * tau * kappa) ** 2
     matrix = np.zeros((4, 4))  # of [w, w', integral, 1]
@@ -91,8 +92,8 @@ def exact(response, state, u, h, axis):
 
 
 @pytest.mark.parametrize("h", [1e-4, 0.002, 0.02, 0.2])
-def test_response_equals_the_matrix_exponential(h):
-    """From any state, slope included, with a gain; three dampings at once."""
+def test_response_equals_matrix_exponential(h):
+    """The start is any state with a slope and a gain; three dampings are tested at once."""
     response = ActuatorResponse.of(
         0.03, jnp.array([0.05, 0.12, 0.3]), inverse_damping=jnp.array([2.5, 1.02, 0.6]), rate_gain=0.8
     )
@@ -100,10 +101,10 @@ def test_response_equals_the_matrix_exponential(h):
     total, end = advance(response, state, STEP, jnp.array(h))
     for axis in range(3):
         result = (end.command.omega[axis], end.slope[axis], total.omega[axis])
-        np.testing.assert_allclose(result, exact(response, state, STEP, h, axis), rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(result, matrix_exponential(response, state, STEP, h, axis), rtol=1e-9, atol=1e-11)
 
 
-def test_first_order_is_the_limit_of_the_second():
+def test_second_order_converges_to_first_order():
     times = jnp.linspace(0.001, 0.3, 50)
     plain = step_response(ActuatorResponse.of(0.05, 0.07), times)
     for kappa, off in ((1e-2, 1e-3), (1e-4, 1e-7)):
@@ -112,13 +113,13 @@ def test_first_order_is_the_limit_of_the_second():
             np.testing.assert_allclose(a, b, atol=off)
 
 
-def test_no_lag_is_the_identity():
+def test_zero_lag_is_identity():
     total, end = advance(ActuatorResponse.of(), REST, STEP, jnp.array(DT))
     jax.tree.map(np.testing.assert_array_equal, end, ActuatorState.at(STEP))
     np.testing.assert_allclose(total.vector(), DT * STEP.vector(), rtol=1e-15)
 
 
-def test_nothing_happens_in_no_time():
+def test_zero_duration_changes_nothing():
     response = ActuatorResponse.of(0.03, 0.05, inverse_damping=1.4)
     state = ActuatorState(STEP, jnp.array([0.5, -1.0, 2.0]))
     total, end = advance(response, state, Command(jnp.array(5.0), jnp.ones(3)), jnp.array(0.0))
@@ -136,7 +137,7 @@ def test_steps_compose():
         np.testing.assert_allclose(a, b, rtol=1e-11)
 
 
-def test_gains_scale_what_is_reached():
+def test_gains_scale_final_value():
     response = ActuatorResponse.of(0.02, 0.03, thrust_gain=0.7, rate_gain=jnp.array([1.2, 0.9, 0.5]))
     _, end = advance(response, REST, STEP, jnp.array(5.0))
     assert float(end.command.c) == pytest.approx(8.4)
@@ -147,8 +148,8 @@ def test_gains_scale_what_is_reached():
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5, 10])
-def test_whole_ticks_are_the_queue_of_old(ticks, key):
-    """Bit by bit: a command acts so many ticks after it was issued, and hover commands act before."""
+def test_whole_ticks_equal_queue(ticks, key):
+    """Bit for bit: a command acts after that many ticks, and hover commands act before."""
     us = commands(key, 30)
     path = CommandPath.of(ticks * DT)
 
@@ -164,12 +165,12 @@ def test_whole_ticks_are_the_queue_of_old(ticks, key):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("dt", [0.002, 0.01, 0.02, 0.03])
-def test_whole_ticks_are_whole_in_every_precision(dt, dtype):
+def test_whole_ticks_are_exact_in_every_precision(dt, dtype):
     n = np.arange(queue_length(dt))
     np.testing.assert_array_equal(jax.jit(whole_steps, static_argnums=1)(jnp.asarray(n * dt, dtype), dt), n)
 
 
-def test_a_fractional_delay_is_a_mean_of_two_commands(key):
+def test_fractional_delay_is_mean_of_two_commands(key):
     us = commands(key, 12)
     mean, _ = follow(CommandPath.of(0.026), us, Command.hover(float))
     late = np.concatenate([np.full(2, 9.81), us.c])
@@ -178,8 +179,8 @@ def test_a_fractional_delay_is_a_mean_of_two_commands(key):
 
 @pytest.mark.parametrize("delay", [0.0, 0.0037, 0.02, 0.0333, 0.117, 0.2])
 @pytest.mark.parametrize("kappa", [0.0, 0.9, 2.5])
-def test_a_path_equals_a_fine_simulation(delay, kappa, key):
-    """Of 20 exact steps a tick, in each of which one command acts, or two one after the other."""
+def test_path_equals_fine_simulation(delay, kappa, key):
+    """The simulation takes 20 exact steps per tick; in each, one command acts, or two in succession."""
     us = commands(key, 25)
     response = ActuatorResponse.of(0.04, jnp.array([0.03, 0.08, 0.2]), inverse_damping=kappa, rate_gain=1.1)
     mean, states = follow(CommandPath.of(delay, response), us, Command.hover(float))
@@ -201,7 +202,7 @@ def test_a_path_equals_a_fine_simulation(delay, kappa, key):
             total = np.zeros(4)
 
 
-def test_a_delay_beyond_the_queue_is_the_longest(key):
+def test_delay_beyond_queue_is_clipped(key):
     us = commands(key, 20)
     longest, longer = (follow(CommandPath.of(delay), us, Command.hover(float))[0] for delay in (0.2, 0.35))
     jax.tree.map(np.testing.assert_array_equal, longer, longest)
@@ -216,8 +217,8 @@ def mixture(path, us, start, weights):
 
 
 @pytest.mark.parametrize("kappa", [0.3, 0.97, 1.0, 1.03, 2.0])
-def test_gradients_against_finite_differences(kappa, key):
-    """In commands, start, delay, lags, gains and damping; near the critical damping, too."""
+def test_gradients_equal_finite_differences(kappa, key):
+    """Gradients with respect to commands, start, delay, lags, gains and damping, including near-critical damping."""
     response = ActuatorResponse.of(0.05, jnp.array([0.03, 0.06, 0.2]), inverse_damping=kappa, thrust_gain=1.1)
     arguments = (CommandPath.of(0.033, response), commands(key, 8), random_command(random.key(5)))
     cost = jax.jit(lambda arguments: mixture(*arguments, jnp.array([0.7])))
@@ -238,7 +239,7 @@ def test_gradients_against_finite_differences(kappa, key):
 @pytest.mark.parametrize(
     ("lag", "kappa", "delay"), [(0.0, 0.0, 0.0), (0.05, 0.0, 0.02), (1e-7, 3.0, 0.2), (5.0, 1.0, 0.1)]
 )
-def test_gradients_are_finite_at_the_edges(lag, kappa, delay, key):
+def test_gradients_are_finite_at_boundaries(lag, kappa, delay, key):
     response = ActuatorResponse.of(lag, lag, inverse_damping=kappa)
     arguments = (CommandPath.of(delay, response), commands(key, 5), Command.hover(float))
     for dtype in (jnp.float64, jnp.float32):
@@ -247,7 +248,7 @@ def test_gradients_are_finite_at_the_edges(lag, kappa, delay, key):
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
 
 
-def test_another_path_is_never_another_program(key):
+def test_new_path_needs_no_compilation(key):
     traces = []
 
     @eqx.filter_jit
@@ -267,7 +268,7 @@ def test_another_path_is_never_another_program(key):
     assert len(traces) == 1
 
 
-def test_a_batch_equals_its_members(key):
+def test_batch_equals_members(key):
     us = commands(key, 15)
     paths = [
         CommandPath.of(delay, ActuatorResponse.of(0.03, lag, inverse_damping=kappa))

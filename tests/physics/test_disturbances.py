@@ -1,4 +1,4 @@
-"""What disturbs a flight: finite in every dtype, additive, repeatable, with the statistics that they state."""
+"""Disturbances are finite in every dtype, additive and repeatable, and have their stated statistics."""
 
 import dataclasses
 
@@ -43,23 +43,23 @@ def at(*p):
 
 
 def over(disturbance, times, x=None):
-    """At many times."""
+    """Return the effects at many times."""
     x = at(0.0, 0.0, 1.0) if x is None else x
     return jax.jit(jax.vmap(lambda t: disturbance(t, x)))(jnp.asarray(times, dtype=x.p.dtype))
 
 
-def same(a, b, **tolerance):
+def assert_equal(a, b, **tolerance):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), a, b)
 
 
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize("name", DISTURBANCES)
-def test_all(name, double):
-    """Finite, of the right shapes, in the dtype of the state, jitted and mapped, in flight and after an hour."""
+def test_every_disturbance_is_finite(name, double):
+    """Effects have the right shapes and the dtype of the state, with jit and vmap, in flight and after an hour."""
     with jax.enable_x64(double):
         disturbance = DISTURBANCES[name](random.key(1), None)
         assert isinstance(disturbance, Disturbance)
-        times = [*np.arange(0.0, 12.0, 0.05), 100.0, 3600.0]  # a kick lasts a tenth of a second
+        times = [*np.arange(0.0, 12.0, 0.05), 100.0, 3600.0]  # a kick lasts 0.1 s
         result = over(disturbance, times, at(1.9 if name == "downwash" else 0.3, -0.2, 1.0))
         for field, shape in SHAPES.items():
             value = getattr(result, field)
@@ -71,7 +71,7 @@ def test_all(name, double):
         assert all(jax.tree.leaves(quiet)) == (name == "none")
 
 
-def test_together_adds_and_gains_multiply(key):
+def test_sum_adds_forces_and_multiplies_gains(key):
     t, x = jnp.array(1.0), random_state(key)
     parts = (
         Constant(jnp.array([1.0, 2.0, 3.0])),
@@ -86,14 +86,14 @@ def test_together_adds_and_gains_multiply(key):
     np.testing.assert_allclose(both.wind, [3.0, 0.0, 0.0])
     np.testing.assert_allclose(both.gain, [0.45, 1.0, 1.0, 1.0])
     np.testing.assert_allclose(both.inertia, payload_inertia(0.07))
-    same(SumOfDisturbances(parts[::-1])(t, x), both)
-    same(SumOfDisturbances(())(t, x), ExternalEffects.calm(x.p.dtype))
+    assert_equal(SumOfDisturbances(parts[::-1])(t, x), both)
+    assert_equal(SumOfDisturbances(())(t, x), ExternalEffects.calm(x.p.dtype))
 
 
-def test_push_lifts_a_function(key):
+def test_push_from_function(key):
     x = random_state(key)
     result = Push(lambda t, x: t * x.v)(jnp.array(2.0), x)
-    same(result, ExternalEffects.of(x.p.dtype, push=2.0 * x.v))
+    assert_equal(result, ExternalEffects.of(x.p.dtype, push=2.0 * x.v))
 
 
 # ---- random walk
@@ -103,29 +103,29 @@ def test_random_walk_stays_within_bounds_and_is_continuous(key):
     walk = RandomWalk.of(2.0, 1.0, key=key, n=600)
     push = over(walk, np.arange(0.0, 59.9, 0.01)).push
     np.testing.assert_array_equal(push[0], 0.0)
-    assert 0.95 < jnp.abs(push).max() <= 1.0  # it meets the bounds, and turns there
+    assert 0.95 < jnp.abs(push).max() <= 1.0  # it is reflected at the bounds
     per_step = jnp.abs(jnp.diff(walk.points, axis=0)).max()
     assert jnp.abs(jnp.diff(push, axis=0)).max() <= 0.1 * per_step * (1 + 1e-9)
     np.testing.assert_allclose(push[::10], walk.points[:599], atol=1e-9)
 
 
-def test_random_walk_spreads_as_stated(key):
+def test_random_walk_has_stated_variance(key):
     ends = jax.vmap(lambda k: RandomWalk.of(0.5, 100.0, key=k, n=41).points)(random.split(key, 2000))
     np.testing.assert_allclose(jnp.std(ends[:, 10], axis=0), 0.5, rtol=0.06)  # after one second
-    np.testing.assert_allclose(jnp.std(ends[:, 40], axis=0), 1.0, rtol=0.06)  # after four
+    np.testing.assert_allclose(jnp.std(ends[:, 40], axis=0), 1.0, rtol=0.06)  # after four seconds
 
 
-def test_random_walk_repeats_and_is_retraced(key):
+def test_random_walk_is_periodic_and_symmetric(key):
     walk = RandomWalk.of(0.5, 1.0, key=key, n=101)  # 10 s
-    same(walk, RandomWalk.of(0.5, 1.0, key=key, n=101))
+    assert_equal(walk, RandomWalk.of(0.5, 1.0, key=key, n=101))
     assert not np.allclose(walk.points, RandomWalk.of(0.5, 1.0, key=random.key(1), n=101).points)
     t = np.linspace(0.0, 10.0, 50)
-    same(over(walk, 20.0 - t), over(walk, t), atol=1e-9)
-    same(over(walk, 20.0 + t), over(walk, t), atol=1e-9)
+    assert_equal(over(walk, 20.0 - t), over(walk, t), atol=1e-9)
+    assert_equal(over(walk, 20.0 + t), over(walk, t), atol=1e-9)
 
 
 @pytest.mark.parametrize("bad", [{"bound": 0.0}, {"rate": -1.0}, {"every": 0.0}, {"n": 1}])
-def test_impossible_walks(bad, key):
+def test_invalid_walks_are_refused(bad, key):
     with pytest.raises(ValueError, match=r"RandomWalk: .* cannot be"):
         RandomWalk.of(**{"rate": 0.5, "bound": 1.0, "key": key, **bad})
 
@@ -141,7 +141,7 @@ def turbulence(key):
     return Turbulence.of(jnp.array(V), jnp.asarray(L), jnp.asarray(SIGMA), key=key)
 
 
-def test_turbulence_has_the_stated_variance_and_no_mean(turbulence, key):
+def test_turbulence_has_stated_variance_and_zero_mean(turbulence, key):
     gusts = jax.jit(jax.vmap(turbulence))(random.uniform(key, (40_000,), maxval=1e6))
     np.testing.assert_allclose(jnp.std(gusts, axis=0), SIGMA, rtol=0.02)
     np.testing.assert_allclose(jnp.mean(gusts, axis=0) / SIGMA, 0.0, atol=0.02)
@@ -149,8 +149,8 @@ def test_turbulence_has_the_stated_variance_and_no_mean(turbulence, key):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_turbulence_has_drydens_spectra(turbulence, axis):
-    """Energy below a frequency: of the sinusoids, and of the integrated spectrum (MIL-F-8785C)."""
+def test_turbulence_has_dryden_spectra(turbulence, axis):
+    """The energy below a frequency equals that of the integrated spectrum (MIL-F-8785C)."""
     l, result = L[axis] / V, np.asarray(turbulence.rate[:, axis])
     for limit in (0.3 / l, 1.0 / l, 3.0 / l, 10.0 / l):
         w = np.linspace(0.0, limit, 20_001)
@@ -159,7 +159,7 @@ def test_turbulence_has_drydens_spectra(turbulence, axis):
         assert np.mean(result < limit) == pytest.approx(np.trapezoid(across if axis else along, w), abs=1.1 / 64)
 
 
-def test_dryden_blows_along_its_mean(key):
+def test_dryden_wind_is_along_its_mean(key):
     dryden = Dryden.of(jnp.array([3.0, 4.0, 0.0]), key=key)
     times = random.uniform(key, (40_000,), maxval=1e6)
     gusts = over(dryden, times).wind @ AXES.T - np.array([[5.0, 0.0, 0.0]])
@@ -172,7 +172,7 @@ def test_dryden_blows_along_its_mean(key):
 @pytest.mark.parametrize(
     ("mean", "altitude"), [((0, 0, 0), 10.0), ((0, 0, 5), 10.0), ((3, 0, 1), 10.0), ((3, 0, 0), 9.0 * FEET)]
 )
-def test_dryden_refuses(mean, altitude, key):
+def test_invalid_dryden_parameters_are_refused(mean, altitude, key):
     with pytest.raises(ValueError, match=r"Dryden: mean = .* must be horizontal and not zero"):
         Dryden.of(jnp.array(mean, dtype=float), key=key, altitude=altitude)
 
@@ -183,12 +183,12 @@ def fan(key, **changes):
 
 
 def jet(fan, along, off=0.0):
-    """Wind without gusts, in the jet's axes, at points relative to the outlet."""
+    """Return the wind without gusts, in the axes of the jet, at points relative to the outlet."""
     p = np.stack(np.broadcast_arrays(np.atleast_1d(along), off, 0.0), axis=1) @ AXES
     return jax.jit(jax.vmap(lambda p: fan(jnp.array(0.0), State.at(fan.outlet + p)).wind))(jnp.asarray(p)) @ AXES.T
 
 
-def test_jet_decays_and_ends_behind_the_fan(key):
+def test_jet_decays_and_is_zero_behind_fan(key):
     along = np.array([0.5, 1.0, 2.0, 4.0])
     wind = jet(fan(key), along)
     np.testing.assert_allclose(wind[:, 0], 6.0 * 0.3 / (0.3 + 0.1 * along), rtol=1e-3)
@@ -197,17 +197,17 @@ def test_jet_decays_and_ends_behind_the_fan(key):
     assert float(jet(fan(key), 1.0, 2.0)[0, 0]) < 1e-3
 
 
-def test_speed_at_the_outlet(key):
+def test_speed_at_outlet(key):
     assert float(jet(fan(key), 0.0)[0, 0]) == pytest.approx(6.0, rel=0.05)
 
 
-def test_jet_keeps_its_momentum(key):
+def test_jet_conserves_momentum(key):
     off = np.linspace(0.0, 5.0, 2001)
     flux = [np.trapezoid(jet(fan(key), along, off)[:, 0] ** 2 * off, off) for along in (1.0, 2.0, 4.0)]
     np.testing.assert_allclose(flux, flux[0], rtol=1e-3)
 
 
-def test_jet_is_as_turbulent_as_stated(key):
+def test_jet_has_stated_turbulence(key):
     jet, times, two_metres = fan(key, intensity=0.2), random.uniform(key, (40_000,), maxval=1e6), at(2.2, 3.6, 1.0)
     wind = over(jet, times, two_metres).wind @ AXES.T / (6.0 * 0.3 / 0.5)
     np.testing.assert_allclose(jnp.mean(wind, axis=0), [1.0, 0.0, 0.0], atol=0.02)
@@ -216,14 +216,14 @@ def test_jet_is_as_turbulent_as_stated(key):
 
 
 @pytest.mark.parametrize("bad", [{"speed": 0.0}, {"width": -1.0}, {"intensity": 1.0}, {"direction": (0.0, 0.0, 1.0)}])
-def test_impossible_fans(bad, key):
+def test_invalid_fans_are_refused(bad, key):
     with pytest.raises(ValueError, match=r"Fan: .* cannot be"):
         fan(key, **bad)
 
 
 @jax.jit
 def acceleration(model, effects):
-    """Of a hovering vehicle, when the inflow has settled."""
+    """Return the acceleration of a hovering vehicle after the inflow has settled."""
     x, zero = at(0.0, 0.0, 1.0), jnp.zeros(3)
     motors = jnp.sqrt(model.vehicle.mass * 9.81 / (4.0 * model.loop.thrust_map)) * jnp.ones(4)
     body = RotorState(x, zero, motors, zero, zero)
@@ -233,8 +233,8 @@ def acceleration(model, effects):
     return model.loads(body, motors, blades, effects).force / model.vehicle.mass
 
 
-def test_wind_pushes_through_the_aerodynamics():
-    """Downwind, with 0.3 to 1 m/s^2 for every m/s; the model learns of it in no other way."""
+def test_wind_acts_through_aerodynamics():
+    """The acceleration is downwind, 0.3 to 1 m/s^2 for every m/s; the wind has no other effect on the model."""
     effects = SteadyWind(jnp.array([2.0, -1.0, 0.0]))(jnp.array(0.0), at(0.0, 0.0, 1.0))
     np.testing.assert_array_equal(effects.push, 0.0)
     rate = np.asarray(acceleration(BemQuadrotor.of(small(), 0.02), effects)[:2]) / np.array([2.0, -1.0])
@@ -242,7 +242,7 @@ def test_wind_pushes_through_the_aerodynamics():
     assert (rate < 1.0).all()
 
 
-# ---- trouble
+# ---- loads and failures
 
 
 def test_payload_is_picked_up_and_dropped():
@@ -256,8 +256,8 @@ def test_payload_is_picked_up_and_dropped():
 
 @pytest.mark.parametrize("ahead", [0.05, -0.08])
 @pytest.mark.parametrize("kind", [LinearDragQuadrotor, BemQuadrotor])
-def test_a_load_off_the_centre_shifts_the_centre_of_mass(kind, ahead):
-    """The torque about the common centre of mass is that of the thrusts with shifted levers."""
+def test_off_centre_load_shifts_centre_of_mass(kind, ahead):
+    """The torque about the common centre of mass is that of the thrusts with shifted arms."""
     model, place = kind.of(small(), 0.02, thrust_error=0.0), at(0.0, 0.0, 1.0)
     off, under = (Payload.of(0.07, ahead=a)(jnp.array(0.0), place) for a in (ahead, 0.0))
     under = dataclasses.replace(under, inertia=off.inertia)
@@ -269,7 +269,7 @@ def test_a_load_off_the_centre_shifts_the_centre_of_mass(kind, ahead):
     np.testing.assert_allclose(torque, [0.0, shift * lift, 0.0], atol=1e-3 * abs(shift * lift))  # nose down
 
 
-def test_battery_sags_to_a_floor():
+def test_battery_sags_to_minimum():
     gain = over(BatterySag(jnp.array(0.01), jnp.array(0.8)), [0.0, 10.0, 20.0, 1e4]).gain
     np.testing.assert_allclose(gain, np.tile([[1.0], [0.9], [0.8], [0.8]], 4))
     for rate, floor in ((-0.1, 0.8), (0.1, 0.0), (0.1, 1.1)):
@@ -278,6 +278,6 @@ def test_battery_sags_to_a_floor():
 
 
 @pytest.mark.parametrize(("rotor", "share"), [(4, 0.9), (-1, 0.9), (0, 0.0), (0, 1.1)])
-def test_impossible_rotors(rotor, share):
+def test_invalid_rotors_are_refused(rotor, share):
     with pytest.raises(ValueError, match="WeakRotor: rotor = "):
         WeakRotor.of(rotor, share)

@@ -1,4 +1,4 @@
-"""Eq. (1), its integrator's order, and what flows backward through hybrid and straight-through models."""
+"""Eq. (1), the order of its integrator, and gradients through hybrid and straight-through models."""
 
 import equinox as eqx
 import jax
@@ -23,12 +23,12 @@ from retrim.physics import (
 )
 
 G = 9.81
-# One program each, instead of one for each operation.
+# Compiled programs: without jit, each operation would be compiled separately.
 rate = jax.jit(f_a)
 step = eqx.filter_jit(lambda model, x, u, a_ext: model.step(x, u, a_ext))
 
 
-def test_f_a_is_equation_1_in_numpy(key):
+def test_acceleration_equals_equation_1_in_numpy(key):
     for k in random.split(key, 5):
         x, u = random_state(k), random_command(k)
         a_ext = np.array([0.5, -1.0, 2.0])
@@ -42,7 +42,7 @@ def test_f_a_is_equation_1_in_numpy(key):
 
 @jax.jit
 def generic_rk4(x, u, a_ext, h):
-    """Runge-Kutta 4 on the manifold, stage by stage; the model has it with equal stages merged."""
+    """Runge-Kutta 4 on the manifold, stage by stage; the model merges equal stages."""
 
     def move(rate, h):
         return State(x.p + h * rate.p, so3.mul(x.R, so3.exp(h * rate.omega)), x.v + h * rate.v)
@@ -65,7 +65,7 @@ def test_step_is_runge_kutta_4(key):
 
 
 def spin(t, w, c):
-    """Closed form: from rest, thrust c, constant roll rate w."""
+    """Return the closed form from rest with thrust c and constant roll rate w."""
     p = [0, -c * (t / w - np.sin(w * t) / w**2), c * (1 - np.cos(w * t)) / w**2 - G * t**2 / 2]
     v = [0, -c * (1 - np.cos(w * t)) / w, c * np.sin(w * t) / w - G * t]
     return np.array(p), np.array(v)
@@ -82,7 +82,7 @@ def fly_once(dt, seconds, u, x=None):
 @pytest.mark.parametrize(
     ("c", "w", "tolerance"), [(0.0, 1e-3, 1e-12), (9.81, 1e-3, 1e-9), (12.0, 2.0, 2e-8), (20.0, 6.0, 1e-5)]
 )
-def test_against_closed_forms(c, w, tolerance):
+def test_step_equals_closed_forms(c, w, tolerance):
     x = fly_once(0.02, 1.0, Command(jnp.array(c), jnp.array([w, 0.0, 0.0])))
     p, v = spin(1.0, w, c)
     np.testing.assert_allclose(x.p, p, atol=tolerance)
@@ -104,14 +104,14 @@ def test_order_of_accuracy_is_four():
     np.testing.assert_allclose(orders, 4.0, atol=0.15)
 
 
-def test_rotation_does_not_drift():
+def test_rotation_stays_orthogonal():
     x = fly_once(0.02, 3.0, Command(jnp.array(10.0), jnp.array([3.0, -2.0, 1.0])))
     R = np.asarray(x.R)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_one_step_of_the_published_check():
-    """F = 5 N on 0.192 kg, from rest: 3.246 mm up in one tick, with and without a residual that is zero."""
+def test_published_single_step():
+    """F = 5 N on 0.192 kg, from rest: 3.246 mm up in one tick, with and without a residual of zero."""
     u, x = Command(jnp.array(5.0 / 0.192), jnp.zeros(3)), State.at(jnp.zeros(3))
     for model in (PointMass(0.02), Hybrid(PointMass(0.02), lambda x, u: jnp.zeros(3))):
         assert model.step(x, u, jnp.zeros(3)).p[2] == pytest.approx(3.246e-3, abs=5e-7)
@@ -123,7 +123,7 @@ def network(key):
 
 
 def flat_step(model, a_ext):
-    """(x, u) as one vector -> x as one vector; for Jacobians."""
+    """Return the step as a function of one vector (x, u) to one vector x, for Jacobians."""
 
     @jax.jit
     def step(y):
@@ -134,13 +134,13 @@ def flat_step(model, a_ext):
 
 
 def differences(step, y, h=1e-6):
-    """Its Jacobian by finite differences."""
+    """Return its Jacobian by finite differences."""
     columns = jax.jit(jax.vmap(lambda e: (step(y + h * e) - step(y - h * e)) / (2 * h)))
     return np.asarray(columns(jnp.eye(19))).T
 
 
-def test_no_gradient_through_the_residual(key):
-    """The Jacobian is the analytical model's, by finite differences, while the value has the residual."""
+def test_residual_has_no_gradient(key):
+    """The Jacobian is that of the analytical model by finite differences, and the value includes the residual."""
     x, u, a_ext = random_state(key), random_command(key), jnp.array([0.3, 0.0, -0.2])
     residual = network(key)
     y = jnp.concatenate([x.vector(), u.vector()])
@@ -152,7 +152,7 @@ def test_no_gradient_through_the_residual(key):
     np.testing.assert_allclose(J[12:15, 12:15], np.eye(3), atol=1e-15)  # dv+/dv, although the residual depends on v
 
 
-def test_backprop_option_differentiates_the_residual(key):
+def test_backprop_option_differentiates_residual(key):
     x, u = random_state(key), random_command(key)
     y = jnp.concatenate([x.vector(), u.vector()])
     through = flat_step(Hybrid(PointMass(0.02), network(key), backprop=True), jnp.zeros(3))
@@ -161,8 +161,8 @@ def test_backprop_option_differentiates_the_residual(key):
     assert abs(J[12:15, 12:15] - np.eye(3)).max() > 1e-3
 
 
-def test_straight_through_has_one_models_value_and_the_others_gradient(key):
-    """Across different state types: forward a rotor-level model, backward Eq. (1)."""
+def test_straight_through_has_value_of_first_and_gradient_of_second_model(key):
+    """The state types differ: a rotor-level model forward, and Eq. (1) backward."""
     x, u, a_ext = random_state(key, 0.3), random_command(key), jnp.array([0.5, 0.0, 0.0])
     rotors, simple = LinearDragQuadrotor.of(small(), 0.02), PointMass(0.02)
     model = StraightThrough(rotors, simple)
@@ -172,7 +172,7 @@ def test_straight_through_has_one_models_value_and_the_others_gradient(key):
     value, expected, slope, wanted_slope = ways(y)
     np.testing.assert_array_equal(value, expected)
     np.testing.assert_allclose(slope, wanted_slope, atol=1e-15)
-    # over two ticks too: what is hidden in the forward state carries no gradient
+    # also over two ticks: the hidden part of the forward state has no gradient
     two = lambda m: lambda u: m.state(m.step(m.step(m.init(x), u, a_ext), u, a_ext)).v  # noqa: E731
 
     def surrogate(u):
@@ -186,7 +186,7 @@ def test_straight_through_has_one_models_value_and_the_others_gradient(key):
     )
 
 
-def test_straight_through_refuses_two_rates():
+def test_straight_through_refuses_different_ticks():
     with pytest.raises(ValueError, match=r"forward\.dt = 0\.02 s, backward\.dt = 0\.01 s"):
         StraightThrough(PointMass(0.02), PointMass(0.01))
 

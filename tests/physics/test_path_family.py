@@ -1,4 +1,4 @@
-"""A family of command paths: coordinates and paths are inverse, beliefs are true and change slowly."""
+"""A family of command paths: coordinates and paths are inverse, and beliefs are calibrated and change slowly."""
 
 import equinox as eqx
 import jax
@@ -21,12 +21,12 @@ def again(at):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_coordinates_are_the_inverse_of_the_path(seed):
+def test_coordinates_invert_path(seed):
     at = random.uniform(random.key(seed), (COORDINATES,), minval=-1.0, maxval=1.0)
     np.testing.assert_allclose(again(at), at, atol=1e-5)
 
 
-def test_the_ends_of_the_coordinates_are_the_ends_of_the_ranges():
+def test_coordinates_cover_ranges():
     fast, slow = FAMILY.path(-jnp.ones(COORDINATES)), FAMILY.path(jnp.ones(COORDINATES))
     assert float(fast.delay) == pytest.approx(0.0, abs=1e-7)
     assert float(slow.delay) == pytest.approx(0.1, rel=1e-5)
@@ -41,7 +41,7 @@ def members():
     return jax.jit(jax.vmap(FAMILY.draw))(random.split(random.key(0), 4000))
 
 
-def test_the_drawn_vehicle_lies_within_its_belief(members):
+def test_sampled_vehicle_is_within_its_belief(members):
     path, belief = members.path, members.belief
     low, high = jax.vmap(lambda each: each.ends)(belief)
     for i, values in ((0, path.delay), (1, path.response.rate_lag[:, 0]), (3, path.response.thrust_lag)):
@@ -51,8 +51,8 @@ def test_the_drawn_vehicle_lies_within_its_belief(members):
         assert np.all(values <= last * (1 + 1e-4) + 1e-6)
 
 
-def test_a_belief_is_neither_too_narrow_nor_too_wide(members):
-    """Where the vehicle lies within its interval is uniform."""
+def test_belief_is_calibrated(members):
+    """The position of the vehicle within its interval is uniform."""
     low, high = jax.vmap(lambda each: each.ends)(members.belief)
     at = 2.0 * members.path.delay / 0.1 - 1.0
     wide = np.asarray(high[:, 0] - low[:, 0]) > 0.05
@@ -61,14 +61,14 @@ def test_a_belief_is_neither_too_narrow_nor_too_wide(members):
     assert np.all(np.abs(counts - wide.sum() / 10) < 5.0 * np.sqrt(wide.sum() / 10))
 
 
-def test_no_drawn_rate_loop_is_slower_than_the_least_frequency(members):
+def test_sampled_rate_loops_exceed_minimum_frequency(members):
     kappa, lag = members.path.response.inverse_damping[:, 0], members.path.response.rate_lag[:, 0]
     frequency = 2.0 / (np.maximum(kappa, 1e-6) * lag)
     assert frequency.min() > 4.0 * 0.999
-    assert kappa.max() > 2.0  # fast loops do ring
+    assert kappa.max() > 2.0  # fast loops ring
 
 
-def test_a_belief_changes_by_its_pace_and_arrives():
+def test_belief_changes_at_its_pace_and_converges():
     belief, there = PathBelief.unknown(), PathBelief.between(0.2 * jnp.ones(4), 0.3 * jnp.ones(4))
     for _ in range(30):
         before, belief = belief, belief.towards(there, 0.05)
@@ -77,7 +77,7 @@ def test_a_belief_changes_by_its_pace_and_arrives():
     np.testing.assert_allclose(belief.vector(), there.vector(), atol=1e-6)
 
 
-def test_a_belief_beyond_the_family_is_its_edge():
+def test_belief_beyond_family_is_clipped():
     belief = PathBelief.between(jnp.array([-5.0, 2.0, -0.5, 0.0]), jnp.array([-2.0, 9.0, jnp.inf, 0.5]))
     np.testing.assert_allclose(belief.centre, [-1.0, 1.0, 0.25, 0.25])
     np.testing.assert_allclose(belief.half_width, [0.0, 0.0, 0.75, 0.25])
@@ -93,6 +93,6 @@ def test_a_belief_beyond_the_family_is_its_edge():
         ({"least_frequency": float("nan")}, "least_frequency"),
     ],
 )
-def test_impossible_ranges_are_refused(settings, name):
+def test_invalid_ranges_are_refused(settings, name):
     with pytest.raises(ValueError, match=name):
         PathFamily.of(**settings)

@@ -1,4 +1,4 @@
-"""Blade-element momentum theory against golden numbers, an independent quadrature, and its own balance."""
+"""Blade-element momentum theory, compared with golden numbers, an independent quadrature, and its momentum balance."""
 
 import json
 from pathlib import Path
@@ -29,31 +29,31 @@ FLIGHT = ((500.0, 3000.0), (0.5, 10.0), (-5.0, 5.0))
 
 @pytest.fixture(params=list(MAKE))
 def prop(request):
-    return strong(MAKE[request.param]())
+    return strongly_typed(MAKE[request.param]())
 
 
-def strong(prop):
-    """No weak types: one program for all tests."""
+def strongly_typed(prop):
+    """Return the tree without weak types, so that one program serves all tests."""
     return jax.tree.map(lambda leaf: leaf.astype(float), prop)
 
 
-class Cold(NamedTuple):
+class ColdStart(NamedTuple):
     forces: BladeForces
     inflow: Inflow
-    v_i: jax.Array  # in the end
+    v_i: jax.Array  # converged
     slopes: tuple  # of thrust, in-plane force and torque with respect to omega, v_hor, v_ver
 
 
 @jax.jit
-def cold(prop, omega, v_hor, v_ver):
-    """One program for all tests: values and gradients, from far away."""
+def cold_start(prop, omega, v_hor, v_ver):
+    """Return values and gradients from a distant start; one program serves all tests."""
 
     def one(*at):
         forces, result = rotor(prop, *at, Inflow.above(at[0].dtype), steps=16)
         return jnp.stack(forces), (forces, result, vortex_ring(result, at[2]))
 
     slopes, values = jax.vmap(jax.jacfwd(one, argnums=(0, 1, 2), has_aux=True))(omega, v_hor, v_ver)
-    return Cold(*values, slopes)
+    return ColdStart(*values, slopes)
 
 
 @jax.jit
@@ -62,7 +62,7 @@ def sections(prop, omega, v_hor, v_ver, v_i):
 
 
 def pad(*numbers):
-    """To 256 points, so that one compiled program serves all tests."""
+    """Pad to 256 points, so that one compiled program serves all tests."""
     return tuple(jnp.resize(jnp.asarray(n, dtype=float), 256) for n in numbers)
 
 
@@ -75,19 +75,20 @@ def points(key, box):
 
 
 @pytest.mark.parametrize("case", range(12))
-def test_golden(case):
+def test_golden_values(case):
     c = GOLDEN["cases"][case]
-    forces, result, v_i, _ = cold(strong(five_inch()), *pad(c["mot"], c["v_hor"], c["v_ver"]))
+    forces, result, v_i, _ = cold_start(strongly_typed(five_inch()), *pad(c["mot"], c["v_hor"], c["v_ver"]))
     near = lambda ours, name: np.testing.assert_allclose(ours[:4], c[name], rtol=0.025)  # noqa: E731
     near(forces.thrust, "thrust")
     near(forces.torque, "torque")
     near(v_i, "vind")
-    if case != 9:  # there the reference's search ends at the limit of its bracket, 30 m/s; the root is beyond
+    if case != 9:  # there the search of the reference ends at its limit, 30 m/s; the root is larger
         near(result.v_i, "vind_momentum")
     np.testing.assert_allclose(3.0 * forces.in_plane[:4], c["hforce"], atol=0.015)
 
 
-# An implementation with exact arctangents and 30 x 32 points: v_hor, v_ver [m/s], v_i [m/s], T [N], Q [Nm], 3H [N].
+# From an implementation with exact arctangents and 30 x 32 points: v_hor, v_ver [m/s], v_i [m/s], T [N], Q [Nm], 3H
+# [N].
 TABLE = {
     five_inch: (
         1109.15,
@@ -132,7 +133,7 @@ TABLE = {
 def test_regression(make):
     omega, rows = TABLE[make]
     v_hor, v_ver, v_i, T, Q, H3 = np.array(rows, dtype=float).T
-    forces, _, result, _ = cold(strong(make()), *pad(omega, v_hor, v_ver))
+    forces, _, result, _ = cold_start(strongly_typed(make()), *pad(omega, v_hor, v_ver))
     n = len(rows)
     np.testing.assert_allclose(result[:n], v_i, rtol=3e-3)
     np.testing.assert_allclose(forces.thrust[:n], T, rtol=3e-3)
@@ -145,18 +146,18 @@ def test_hover_coefficients(make, c_T, kappa):
     coefficient = jax.jit(hover_coefficient)
     result = [float(coefficient(make(), jnp.array(omega))) for omega in (800.0, 1500.0, 4000.0)]
     assert result[0] == pytest.approx(c_T, rel=0.01)
-    np.testing.assert_allclose(result, result[0], rtol=1e-3)  # the same at every speed
-    forces = cold(strong(make()), *pad(1500.0, 0.0, 0.0)).forces
+    np.testing.assert_allclose(result, result[0], rtol=1e-3)  # equal at every speed
+    forces = cold_start(strongly_typed(make()), *pad(1500.0, 0.0, 0.0)).forces
     assert float(forces.torque[0] / forces.thrust[0]) == pytest.approx(kappa, rel=0.01)
 
 
 # ---- laws
 
 
-def test_momentum_balance_at_the_largest_root(prop, key):
-    """T = 2 rho A v_i |V|; at every larger v_i the air takes more momentum than the blades give."""
+def test_momentum_balance_at_largest_root(prop, key):
+    """T = 2 rho A v_i |V|; at every larger v_i the momentum change exceeds the force of the blades."""
     omega, v_hor, v_ver = points(key, ENVELOPE)
-    result = cold(prop, omega, v_hor, v_ver).inflow
+    result = cold_start(prop, omega, v_hor, v_ver).inflow
 
     def balance(v):
         momentum = 2.0 * AIR_DENSITY * prop.area * v * jnp.sqrt(v_hor**2 + (v_ver - v) ** 2)
@@ -164,14 +165,14 @@ def test_momentum_balance_at_the_largest_root(prop, key):
 
     balances = jnp.isclose(*balance(result.v_i), rtol=1e-6, atol=1e-8)
     assert balances[v_ver < 1.2 * result.v_h].all()
-    assert jnp.mean(balances) > 0.99  # in fast descent two roots may meet, and Newton's steps grow slow
+    assert jnp.mean(balances) > 0.99  # in fast descent two roots may meet, and Newton's method converges slowly
     for above in np.geomspace(1e-3, 30.0, 30):
         thrust, momentum = balance(result.v_i + above)
         assert (thrust < momentum).all()
 
 
-def by_the_book(prop, omega, v_hor, v_ver, v_i, *, radii=30, azimuths=32):
-    """The integrals as the article prints them: angles by arctangent, one point at a time."""
+def reference_integrals(prop, omega, v_hor, v_ver, v_i, *, radii=30, azimuths=32):
+    """Return the integrals as published: angles by arctangent, one point at a time."""
     nodes, weights = np.polynomial.legendre.leggauss(radii)
     x = 0.5 * (nodes + 1.0)[:, None]
     R, chord_root, chord_tip = float(prop.radius), float(prop.chord_root), float(prop.chord_tip)
@@ -188,21 +189,23 @@ def by_the_book(prop, omega, v_hor, v_ver, v_i, *, radii=30, azimuths=32):
     return (scale * axial).sum(), (scale * tangential * sin_psi).sum(), (scale * r * tangential).sum()
 
 
-def test_quadrature(prop, key):
-    """48 evaluations per rotor are enough."""
+def test_quadrature_converges(prop, key):
+    """48 evaluations per rotor suffice."""
     omega, v_hor, v_ver = points(key, FLIGHT)
-    forces, _, v_i, _ = cold(prop, omega, v_hor, v_ver)
-    fine = np.array([by_the_book(prop, *(float(n[i]) for n in (omega, v_hor, v_ver, v_i))) for i in range(64)])
+    forces, _, v_i, _ = cold_start(prop, omega, v_hor, v_ver)
+    fine = np.array([reference_integrals(prop, *(float(n[i]) for n in (omega, v_hor, v_ver, v_i))) for i in range(64)])
     for ours, book in zip(forces, fine.T, strict=True):
         np.testing.assert_allclose(ours[:64], book, rtol=1e-3, atol=5e-5)
 
 
-def test_warm_start(prop, key):
-    """After a millisecond of motors at 40 rad/s per ms and 4 g, two steps find what sixteen find from far away."""
+def test_warm_start_equals_cold_start(prop, key):
+    """After a millisecond of motors at 40 rad/s per ms and 4 g, two steps give the result of sixteen from a distant
+    start.
+    """
     k, l = random.split(key)
     before = points(k, ((800.0, 3000.0), *FLIGHT[1:]))
     after = tuple(n + d for n, d in zip(before, points(l, ((-40.0, 40.0), (-0.04, 0.04), (-0.04, 0.04))), strict=True))
-    start, (far, has_settled, *_) = cold(prop, *before).inflow, cold(prop, *after)
+    start, (far, has_settled, *_) = cold_start(prop, *before).inflow, cold_start(prop, *after)
     near, result = warm(prop, *after, start)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), (near, result), (far, has_settled))
 
@@ -210,12 +213,13 @@ def test_warm_start(prop, key):
 # ---- gradients
 
 
-def test_gradients_are_those_of_the_root(prop, key):
+def test_gradients_equal_implicit_differentiation(prop, key):
     at = points(key, FLIGHT)
-    for i, exact in enumerate(cold(prop, *at).slopes):
+    for i, exact in enumerate(cold_start(prop, *at).slopes):
         step = 1e-3 if i == 0 else 1e-5
         high, low = (
-            jnp.stack(cold(prop, *(n + s * step if j == i else n for j, n in enumerate(at))).forces, 1) for s in (1, -1)
+            jnp.stack(cold_start(prop, *(n + s * step if j == i else n for j, n in enumerate(at))).forces, 1)
+            for s in (1, -1)
         )
         np.testing.assert_allclose(exact, (high - low) / (2.0 * step), rtol=1e-5, atol=1e-8)
 
@@ -225,21 +229,21 @@ def warm(prop, omega, v_hor, v_ver, start):
     return jax.vmap(lambda *at: rotor(prop, *at))(omega, v_hor, v_ver, start)
 
 
-def test_no_gradient_through_the_warm_start(prop):
+def test_warm_start_has_no_gradient(prop):
     at = tuple(jnp.array([n]) for n in (1500.0, 2.0, 1.0))
     far, near = (jax.tree.map(lambda leaf: leaf[None], Inflow(v, v)) for v in (jnp.array(8.0), jnp.array(7.0)))
     total = lambda start: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(warm(prop, *at, start)))  # noqa: E731
-    assert total(far) != total(near)  # which two steps do not make equal to the last digit
+    assert total(far) != total(near)  # two steps do not make them equal to the last digit
     jax.tree.map(lambda leaf: np.testing.assert_array_equal(leaf, 0.0), jax.jit(jax.grad(total))(far))
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_finite_and_bounded_everywhere(prop, key, dtype):
-    """Also at the corners, where the flow reverses, the rotor idles or the air rests."""
+    """The corners are included: reversed flow, an idle rotor, and still air."""
     corners = jnp.meshgrid(*(jnp.linspace(a, b, 5) for a, b in ENVELOPE))
     for at in (points(key, ENVELOPE), pad(*(c.ravel() for c in corners))):
         with jax.enable_x64(dtype == jnp.float64):
-            forces, result, v_i, slopes = cold(*jax.tree.map(lambda leaf: leaf.astype(dtype), (prop, *at)))
+            forces, result, v_i, slopes = cold_start(*jax.tree.map(lambda leaf: leaf.astype(dtype), (prop, *at)))
             assert forces.thrust.dtype == dtype
             assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((forces, slopes)))
             assert (jnp.abs(forces.thrust) < 60.0).all()

@@ -1,4 +1,4 @@
-"""The simulated rate loop: the platform's settings where they suit, else settings that follow from the vehicle."""
+"""The simulated rate loop: settings of the platform if they suit the vehicle, otherwise derived settings."""
 
 import dataclasses
 
@@ -38,7 +38,7 @@ def size_of(name, motor_tau):
 
 @eqx.filter_jit
 def fly_once(model, axis):
-    """Body rate under a step of 1 rad/s at hover thrust, tick by tick."""
+    """Return the body rate under a step of 1 rad/s at hover thrust, tick by tick."""
     expected = jnp.zeros(3).at[axis].set(1.0)
 
     def tick(s, _):
@@ -49,14 +49,14 @@ def fly_once(model, axis):
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_published_vehicles_keep_the_settings_of_the_platform(name):
+def test_published_vehicles_use_platform_settings(name):
     loop = BemQuadrotor.of(PUBLISHED[name](), 0.02).loop
     assert eqx.tree_equal(loop, Betaflight.of(loop.thrust_map))
     simple = LinearDragQuadrotor.of(PUBLISHED[name](), 0.02).loop
     np.testing.assert_array_equal([simple.kp, simple.ki, simple.kd], [[25, 25, 12.5], [37] * 3, [0.05, 0.05, 0.0]])
 
 
-def test_so_does_every_vehicle_of_the_gauntlet_at_hover():
+def test_gauntlet_vehicles_use_platform_settings_at_hover():
     vehicles = [flight.vehicle for flight in conditions(PRESETS["hover/retrim"]).values() if flight.vehicle is not None]
     assert len(vehicles) >= 6
     for vehicle in vehicles:
@@ -67,8 +67,8 @@ def test_so_does_every_vehicle_of_the_gauntlet_at_hover():
 
 @pytest.mark.parametrize("motor_tau", [0.02, 0.05, 0.1])
 @pytest.mark.parametrize("name", SIZES)
-def test_the_simulated_vehicle_answers_a_step_as_foretold(name, motor_tau):
-    """It overshoots by less than 40 %, from 35 g to 10 kg; the platform's settings overshoot by up to 200 %."""
+def test_simulated_step_response_equals_prediction(name, motor_tau):
+    """The overshoot is below 40 % from 35 g to 10 kg; with the platform's settings it is up to 200 %."""
     vehicle = size_of(name, motor_tau)
     model = BemQuadrotor.of(vehicle, 0.02)
     for axis, foretold in enumerate(step_responses(vehicle)):
@@ -79,7 +79,7 @@ def test_the_simulated_vehicle_answers_a_step_as_foretold(name, motor_tau):
 
 
 @pytest.mark.parametrize("motor_tau", [0.02, 0.05, 0.1])
-def test_the_simple_plant_answers_a_step_with_little_overshoot(motor_tau):
+def test_simple_plant_has_little_overshoot(motor_tau):
     model = LinearDragQuadrotor.of(size_of("4 kg", motor_tau), 0.02)
     for axis in range(3):
         assert np.asarray(fly_once(model, axis)).max() < 1.4
@@ -91,7 +91,7 @@ def poles(gains, tau, lead=0.0):
 
 
 @pytest.mark.parametrize("motor_tau", [0.01, 0.05, 0.1, 0.3])
-def test_gains_of_its_own_have_the_damping_that_they_are_said_to_have(motor_tau):
+def test_derived_gains_have_stated_damping(motor_tau):
     plain = Gains(jnp.full(3, 20.0), jnp.full(3, 300.0), jnp.full(3, 0.2))
     own = tune(plain, jnp.array(motor_tau))
     without_integral = Gains(own.a, jnp.zeros(3), own.b)
@@ -102,7 +102,7 @@ def test_gains_of_its_own_have_the_damping_that_they_are_said_to_have(motor_tau)
     assert np.all(is_damped(own, jnp.zeros(3), jnp.array(motor_tau)))
 
 
-def test_a_loop_that_is_not_stable_is_never_damped():
+def test_unstable_loop_has_no_damping():
     rng = np.random.default_rng(3)
     stable = []
     for _ in range(300):
@@ -114,7 +114,7 @@ def test_a_loop_that_is_not_stable_is_never_damped():
     assert 50 < sum(stable) < 280
 
 
-def test_a_step_shows_what_the_thrust_cannot_do():
-    """With a hundredth of the lever, the same gains saturate."""
+def test_step_response_includes_thrust_saturation():
+    """With 0.01 of the arm, the same gains saturate."""
     weak = dataclasses.replace(size_of("4 kg", 0.1), inertia=200.0 * jnp.array([0.08, 0.08, 0.14]))
     assert step_responses(weak)[0].rise > 2.0 * step_responses(size_of("4 kg", 0.1))[0].rise

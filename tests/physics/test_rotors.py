@@ -1,4 +1,4 @@
-"""Physics that a rotor-level model must obey, for both vehicles."""
+"""Physical laws of a rotor-level model, for both vehicles."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ VEHICLES = {"small": small, "large": large}
 
 @pytest.fixture(params=list(VEHICLES))
 def exact(request):
-    """No thrust error, no drag."""
+    """Return the model without a thrust error and without drag."""
     model = LinearDragQuadrotor.of(VEHICLES[request.param](), 0.02, thrust_error=0.0)
     return replace_fields(model, drag=jnp.zeros(3))
 
@@ -36,13 +36,13 @@ def test_hover_balance(exact):
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
 
-def test_thrust_error_is_the_stated_acceleration():
+def test_thrust_error_gives_stated_acceleration():
     model = replace_fields(LinearDragQuadrotor.of(small(), 0.02, thrust_error=0.035), drag=jnp.zeros(3))
     s = fly_once(model, model.init(State.at(jnp.zeros(3))), Command.hover(), 1.0)
     assert s.x.v[2] == pytest.approx(0.035 * 9.81 * 1.0, rel=1e-6)
 
 
-def test_mixer_and_wrench_are_inverse(exact, key):
+def test_mixer_inverts_wrench(exact, key):
     force, torque = jnp.array(5.0), 1e-3 * random.normal(key, (3,))
     thrusts = exact.mix(force, torque)
     found_force, found_torque = exact.wrench(exact.init(State.at(jnp.zeros(3))), jnp.zeros(4), thrusts, jnp.zeros(3))
@@ -50,7 +50,7 @@ def test_mixer_and_wrench_are_inverse(exact, key):
     np.testing.assert_allclose(found_torque, torque, atol=1e-14)
 
 
-def test_each_rotor_turns_the_body_as_its_place_says(exact):
+def test_torque_of_each_rotor_follows_from_position(exact):
     """Front-right, back-left, back-right, front-left; torque = r x f in a forward-left-up frame."""
     ax, ay = (float(a) for a in exact.vehicle.arm)
     places = [(ax, -ay), (-ax, ay), (-ax, -ay), (ax, ay)]
@@ -62,7 +62,7 @@ def test_each_rotor_turns_the_body_as_its_place_says(exact):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_rate_step_response(exact, axis):
-    """Reaches 63 % within 150 ms (yaw 300 ms), overshoots by less than 25 %, settles on the command."""
+    """Rates reach 63 % within 150 ms (yaw 300 ms), overshoot by less than 25 %, and settle on the command."""
     u = Command(jnp.array(9.81), 1.0 * jnp.eye(3)[axis])
     s, rates = exact.init(State.at(jnp.zeros(3))), []
     step = jax.jit(lambda s: exact.substep(s, u, ExternalEffects.calm(jnp.dtype(float))))
@@ -75,7 +75,7 @@ def test_rate_step_response(exact, axis):
 
 
 def test_mirror_symmetry(exact, key):
-    """Left and right are the same: mirror the start and the command in y, and the flight is mirrored."""
+    """If start and command are mirrored in y, the flight is mirrored."""
     M = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
     x, u = random_state(key, 0.3), random_command(key)
     mirror = State(M @ x.p, M @ x.R @ M, M @ x.v)
@@ -85,7 +85,7 @@ def test_mirror_symmetry(exact, key):
     np.testing.assert_allclose(t.x.R, M @ s.x.R @ M, atol=1e-10)
 
 
-def test_drag_takes_energy_and_thrustless_flight_creates_none():
+def test_drag_dissipates_energy_and_ballistic_flight_conserves_it():
     model = LinearDragQuadrotor.of(small(), 0.02)
     v = jnp.array([3.0, -2.0, 1.0])
     x, zero = State(jnp.zeros(3), so3.exp(jnp.array([0.3, 0.2, 0.1])), v), jnp.zeros(3)
@@ -135,8 +135,8 @@ def test_vehicles(make):
     )
 
 
-def test_vehicles_can_be_made_under_a_transformation():
-    """A mass may be traced: mapped over, or differentiated."""
+def test_vehicles_can_be_traced():
+    """A mass may be mapped over, or differentiated."""
     hover = lambda mass: replace_fields(small(), mass=mass).hover_speed  # noqa: E731
     np.testing.assert_allclose(jax.vmap(hover)(jnp.array([0.19, 0.76]))[1], 2 * hover(jnp.array(0.19)))
     assert jax.grad(hover)(jnp.array(0.19)) > 0
@@ -150,6 +150,6 @@ def test_vehicles_can_be_made_under_a_transformation():
         ("thrust_max", 1.0, r"cannot lift its weight, 1\.86 N"),
     ],
 )
-def test_impossible_vehicles(field, value, message):
+def test_invalid_vehicles_are_refused(field, value, message):
     with pytest.raises(ValueError, match=message):
         replace_fields(small(), **{field: jnp.array(value)})

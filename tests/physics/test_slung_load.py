@@ -38,7 +38,7 @@ def at(*p):
 
 
 def motion(load, s, x, u, times):
-    """Paths of vehicle and load from a state on, under a constant command, and the tension, as NumPy arrays."""
+    """Return paths of vehicle and load under a constant command, and the tension, as NumPy arrays."""
     return jax.tree.map(np.asarray, paths(load, s, x, u, times))
 
 
@@ -58,8 +58,8 @@ def times(seconds, begin=0.0):
     return begin + H * np.arange(round(seconds / H))
 
 
-def displaced(load, angle, x=None, heading=0.0):
-    """The load at rest relative to the vehicle, on a cable with its static stretch, at an angle to the vertical."""
+def displaced_load(load, angle, x=None, heading=0.0):
+    """Return a load at rest relative to the vehicle, on a cable with its static stretch, at an angle."""
     x = at(0.0, 0.0, 2.0) if x is None else x
     length = load.length + G * (1.0 + load.share) / STIFFNESS**2
     q = jnp.array([math.sin(angle) * math.cos(heading), math.sin(angle) * math.sin(heading), -math.cos(angle)])
@@ -71,7 +71,7 @@ def thrust(c):
 
 
 def energy(load, x, s):
-    """Of vehicle and load, per mass of the vehicle, with the elastic energy of the cable."""
+    """Return the energy of vehicle and load, per mass of the vehicle, including the elastic energy of the cable."""
     share = float(load.share)
     stretch = np.maximum(np.linalg.norm(s.p - x.p, axis=-1) - float(load.length), 0.0)
     elastic = 0.5 * share / (1.0 + share) * (STIFFNESS * stretch) ** 2
@@ -80,7 +80,7 @@ def energy(load, x, s):
 
 
 def period(signal, seconds):
-    """Mean distance between zero crossings of the same sign [s]."""
+    """Return the mean distance between zero crossings of the same sign [s]."""
     t = H * np.arange(len(signal))
     at = np.flatnonzero((signal[:-1] < 0.0) & (signal[1:] >= 0.0))
     crossings = t[at] - signal[at] / (signal[at + 1] - signal[at]) * H
@@ -92,11 +92,11 @@ def period(signal, seconds):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.4, 1.0])
-def test_momentum_and_energy_without_thrust_and_gravity_work(share):
-    """In free fall, the pair spins about its centre of mass, which falls on a parabola; the energy is constant."""
+def test_free_fall_conserves_momentum_and_energy(share):
+    """The pair spins about its centre of mass, which follows a parabola."""
     load = SlungLoad.of(share)
     x = dataclasses.replace(at(0.0, 0.0, 50.0), v=jnp.array([0.3, -0.2, 0.5]))
-    s = displaced(load, 0.7, x)
+    s = displaced_load(load, 0.7, x)
     s = dataclasses.replace(s, v=x.v + jnp.array([1.5, 2.0, 0.9]))
     t = times(2.0)
     xs, ss, _ = motion(load, s, x, thrust(0.0), t)
@@ -106,7 +106,7 @@ def test_momentum_and_energy_without_thrust_and_gravity_work(share):
     np.testing.assert_allclose((xs.v + share * ss.v) / (1.0 + share), v0 + fall * elapsed, rtol=0, atol=1e-11)
     centre = p0 + v0 * elapsed + 0.5 * fall * elapsed**2
     np.testing.assert_allclose((xs.p + share * ss.p) / (1.0 + share), centre, rtol=0, atol=1e-10)
-    # The radial oscillation that the first stretch excites is damped; then the energy stays.
+    # The radial oscillation from the first stretch is damped; afterwards the energy is constant.
     energies = energy(load, xs, ss)[300:]
     np.testing.assert_allclose(energies, energies[0], rtol=0, atol=1e-4)
     r = ss.p - xs.p
@@ -115,14 +115,14 @@ def test_momentum_and_energy_without_thrust_and_gravity_work(share):
     np.testing.assert_allclose(spin, np.tile(first, (len(t), 1)), rtol=2e-3)
 
 
-def test_energy_of_a_swinging_load_changes_by_the_work_of_the_thrust_alone():
+def test_energy_of_swinging_load_changes_by_work_of_thrust():
     load, c = SlungLoad.of(0.3), G * 1.3
     x = at(0.0, 0.0, 2.0)
-    xs, ss, tension = motion(load, displaced(load, 0.5, x), x, thrust(c), times(5.0))
+    xs, ss, tension = motion(load, displaced_load(load, 0.5, x), x, thrust(c), times(5.0))
     assert float(tension.min()) > 0.0
     energies = energy(load, xs, ss) - c * xs.p[:, 2]
     np.testing.assert_allclose(energies, energies[0], rtol=0, atol=2e-3)
-    assert float(np.ptp(0.5 * np.sum(ss.v**2, axis=1))) > 0.4  # while kinetic energy comes and goes
+    assert float(np.ptp(0.5 * np.sum(ss.v**2, axis=1))) > 0.4  # while kinetic energy oscillates
 
 
 # ---- the pendulum
@@ -130,10 +130,10 @@ def test_energy_of_a_swinging_load_changes_by_the_work_of_the_thrust_alone():
 
 @pytest.mark.parametrize("length", [0.3, 0.5, 1.0])
 @pytest.mark.parametrize("share", [0.2, 0.4])
-def test_period_of_a_small_swing(share, length):
-    """A free vehicle in hover swings against its load: omega^2 = (1 + share) g / length; a fixed one: g / length."""
+def test_period_of_small_swing(share, length):
+    """For a free vehicle in hover, omega^2 = (1 + share) g / length; for a fixed vehicle, g / length."""
     load, x = SlungLoad.of(share, length=length), at(0.0, 0.0, 2.0)
-    s = displaced(load, 0.02, x)
+    s = displaced_load(load, 0.02, x)
     xs, ss, _ = motion(load, s, x, thrust(G * (1.0 + share)), times(8.0))
     expected = 2.0 * math.pi * math.sqrt(length / (G * (1.0 + share)))
     assert period(np.asarray(ss.p - xs.p)[:, 0], 8.0) == pytest.approx(expected, rel=1e-3)
@@ -146,7 +146,7 @@ def test_period_of_a_small_swing(share, length):
     assert period(held, 8.0) == pytest.approx(2.0 * math.pi * math.sqrt(length / G), rel=1e-3)
 
 
-def test_equilibrium_tension_is_the_weight():
+def test_equilibrium_tension_is_weight():
     load, x = SlungLoad.of(0.3), at(0.0, 0.0, 1.0)
     xs, ss, tension = motion(load, load.init(x), x, thrust(G * 1.3), times(2.0))
     np.testing.assert_allclose(tension, G, rtol=1e-6)
@@ -157,7 +157,7 @@ def test_equilibrium_tension_is_the_weight():
 
 
 @pytest.mark.parametrize("angle", [0.1, 0.8])
-def test_a_taut_cable_obeys_the_lagrange_equations(angle, key):
+def test_taut_cable_satisfies_lagrange_equations(angle, key):
     """Compare accelerations with those of two points at a fixed distance, by finite differences of velocities.
 
     With q the direction of the cable and a_u the acceleration of the vehicle without it, the tension per mass of the
@@ -167,7 +167,7 @@ def test_a_taut_cable_obeys_the_lagrange_equations(angle, key):
     load = SlungLoad.of(share, length=length)
     x = dataclasses.replace(random_tilt(key), p=jnp.array([0.0, 0.0, 2.0]))
     u = thrust(14.0)
-    xs, ss, _ = motion(load, displaced(load, angle, x), x, u, times(0.6))
+    xs, ss, _ = motion(load, displaced_load(load, angle, x), x, u, times(0.6))
     g = np.array([0.0, 0.0, -G])
     for k in (300, 450, 560):  # after the radial oscillation
         q = np.asarray(ss.p - xs.p)[k]
@@ -185,10 +185,10 @@ def random_tilt(key):
     return State(jnp.zeros(3), so3.exp(0.2 * random.normal(key, (3,))), jnp.array([0.4, -0.3, 0.2]))
 
 
-def test_turning_the_world_about_the_vertical_turns_the_motion(key):
+def test_motion_is_equivariant_to_heading(key):
     turn = so3.exp(jnp.array([0.0, 0.0, 1.1]))
     load, x = SlungLoad.of(0.3), dataclasses.replace(random_tilt(key), p=jnp.array([0.1, 0.2, 2.0]))
-    s = displaced(load, 0.4, x, heading=0.5)
+    s = displaced_load(load, 0.4, x, heading=0.5)
     x_turned = State(turn @ x.p, turn @ x.R, turn @ x.v)
     s_turned = LoadState(turn @ s.p, turn @ s.v)
     one, other = (motion(load, s, x, thrust(13.0), times(1.0)) for s, x in ((s, x), (s_turned, x_turned)))
@@ -199,15 +199,15 @@ def test_turning_the_world_about_the_vertical_turns_the_motion(key):
 # ---- slack
 
 
-def test_a_slack_cable_has_no_tension():
-    """Vehicle and load fall side by side until the load, thrown away from the vehicle, tightens the cable."""
+def test_slack_cable_has_no_tension():
+    """Vehicle and load fall together until the load, thrown away from the vehicle, tightens the cable."""
     load, x = SlungLoad.of(0.3), at(0.0, 0.0, 20.0)
     s = LoadState(x.p + jnp.array([0.1, 0.0, -0.2]), jnp.array([0.0, 0.0, -1.0]))
     xs, ss, tension = motion(load, s, x, thrust(0.0), times(0.6))
     distance = np.linalg.norm(ss.p - xs.p, axis=1)
     slack = distance < float(load.length)
     begin = int(np.argmin(slack))
-    assert 200 < begin < 400  # taut for the first time after some 0.28 s
+    assert 200 < begin < 400  # taut for the first time after about 0.28 s
     np.testing.assert_array_equal(tension[slack], 0.0)
     np.testing.assert_allclose(ss.v[: begin - 1, 2], -1.0 - G * (times(0.6)[: begin - 1] + H), rtol=1e-12)
     np.testing.assert_allclose(xs.p[: begin - 1, 2], 20.0 - 0.5 * G * (times(0.6)[: begin - 1] + H) ** 2, rtol=1e-12)
@@ -219,7 +219,7 @@ def test_a_slack_cable_has_no_tension():
 # ---- pick-up and release
 
 
-def test_a_load_is_held_until_it_is_picked_up_and_falls_when_it_is_dropped():
+def test_load_is_fixed_before_pick_up_and_falls_after_release():
     load, x = SlungLoad.of(0.3, picked=1.0, dropped=2.0), at(0.0, 0.0, 3.0)
     t = times(3.0)
     xs, ss, _ = motion(load, load.init(x), x, thrust(G), t)
@@ -234,7 +234,7 @@ def test_a_load_is_held_until_it_is_picked_up_and_falls_when_it_is_dropped():
     np.testing.assert_allclose(push, [0.0, -0.3 * G, 0.0], atol=1e-12)
 
 
-def test_impossible_loads():
+def test_invalid_loads_are_refused():
     for values in ({"share": 0.0}, {"share": 0.3, "length": 0.0}, {"share": 0.3, "picked": 2.0, "dropped": 2.0}):
         with pytest.raises(ValueError, match="SlungLoad: share = "):
             SlungLoad.of(**values)
@@ -243,7 +243,7 @@ def test_impossible_loads():
 # ---- disturbances with a state
 
 
-def test_sums_carry_the_states_of_their_parts():
+def test_sum_contains_states_of_parts():
     load, x = SlungLoad.of(0.3), at(0.0, 0.0, 1.0)
     assert isinstance(load, Disturbance)
     assert isinstance(load, StatefulDisturbance)
@@ -261,8 +261,8 @@ def test_sums_carry_the_states_of_their_parts():
 
 
 @pytest.mark.parametrize("kind", [LinearDragQuadrotor, BemQuadrotor])
-def test_a_plant_carries_the_load_and_its_parts_change_in_flight(kind):
-    """The plant's load is the load of a flight of its parts; a push that is added in flight leaves it as it is."""
+def test_parts_of_disturbance_change_in_flight(kind):
+    """The load of the plant equals that of a flight of its parts, and a push added in flight does not change it."""
     model, x = kind.of(small(), 0.02), at(0.0, 0.0, 1.0)
     plant = SimPlant(model, disturbance("slung-load=0.3"))
     plant.reset(x)
@@ -276,7 +276,7 @@ def test_a_plant_carries_the_load_and_its_parts_change_in_flight(kind):
         plant.step(u)
     (after,) = plant._state.disturbance
     true = plant.simulation.true(plant._state)
-    assert float(swing_angle(after, true)) > 0.03  # it lags behind the vehicle
+    assert float(swing_angle(after, true)) > 0.03  # the load lags behind the vehicle
     assert float(after.p[0]) < float(true.p[0])
     plant.disturb(Constant(jnp.zeros(3)))
     plant.step(u)
@@ -286,7 +286,7 @@ def test_a_plant_carries_the_load_and_its_parts_change_in_flight(kind):
     assert len(plant._state.disturbance) == 1
 
 
-def test_loads_are_mapped_and_keep_their_precision():
+def test_loads_support_vmap_and_keep_precision():
     with jax.enable_x64(False):
         loads = jax.vmap(SlungLoad)(jnp.array([0.2, 0.4]), jnp.array([0.5, 0.3]), jnp.zeros(2), jnp.full(2, jnp.inf))
         x = at(0.0, 0.0, 1.0)

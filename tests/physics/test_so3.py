@@ -1,4 +1,4 @@
-"""Axioms of SO(3), also next to the identity, and gradients where they usually break."""
+"""Axioms of SO(3), including near the identity, and gradients at singular points."""
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ def test_adjoint_and_products(w, v, y):
     np.testing.assert_allclose(so3.act(R, y), R @ y, atol=1e-14)
 
 
-def test_exp_agrees_with_the_matrix_exponential():
+def test_exp_equals_matrix_exponential():
     w = jnp.array([0.4, -1.1, 0.7])
     np.testing.assert_allclose(so3.exp(w), jax.scipy.linalg.expm(so3.hat(w)), atol=1e-14)
 

@@ -1,4 +1,4 @@
-"""What the models with rotors tell a plant beside the state: which commands they take, how body and rotors turn."""
+"""Rotor-level models provide command limits, body rates and rotor speeds to a plant."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ MODELS = {"linear drag": LinearDragQuadrotor, "bem": BemQuadrotor}
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
 @pytest.mark.parametrize("vehicle", [small, large])
-def test_command_limits_are_those_of_the_vehicle(make, vehicle):
+def test_command_limits_are_those_of_vehicle(make, vehicle):
     low, high = make.of(vehicle(), 0.02).command_limits
     np.testing.assert_array_equal(low.vector(), vehicle().command_min.vector())
     np.testing.assert_array_equal(high.vector(), vehicle().command_max.vector())
@@ -22,8 +22,8 @@ def test_command_limits_are_those_of_the_vehicle(make, vehicle):
     assert (high.vector() > Command.hover().vector()).all()
 
 
-def test_the_linear_model_obeys_no_command_beyond_its_limits():
-    """A command beyond them moves the vehicle as the limit itself does."""
+def test_linear_model_clips_commands():
+    """A command beyond the limits has the effect of the limit."""
     model = LinearDragQuadrotor.of(small(), 0.02)
     _, high = model.command_limits
     wild = Command(10.0 * high.c, 10.0 * high.omega)
@@ -32,8 +32,11 @@ def test_the_linear_model_obeys_no_command_beyond_its_limits():
 
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
-def test_rotor_state_is_what_the_model_turns_with(make, key):
-    """Before the first tick: no body rate, four equal rotors. After a roll command: a roll rate, and unequal rotors."""
+def test_rotor_state_follows_command(make, key):
+    """Before the first tick, body rates are zero and the rotors equal.
+
+    A roll command gives a roll rate and unequal rotors.
+    """
     model = make.of(small(), 0.02, thrust_error=0.0)
     x = random_state(key)
     s = model.init(x)
@@ -51,8 +54,8 @@ def test_rotor_state_is_what_the_model_turns_with(make, key):
     assert float(left.min()) > float(right.max())
 
 
-def test_a_model_need_have_neither(key):
-    """One of rigid translation: at hover thrust, level and undisturbed it moves on a straight line."""
+def test_model_without_rates_and_rotors(key):
+    """The model translates without rotation: at hover thrust, level and undisturbed, it moves along a straight line."""
     x = replace_fields(random_state(key), R=jnp.eye(3))
     assert CheapModel().command_limits is None
     assert CheapModel().rotor_state(x) is None

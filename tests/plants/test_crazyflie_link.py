@@ -1,4 +1,4 @@
-"""One end of CRTP: what it believes, whom it believes, and what it says."""
+"""The CRTP link of a Crazyflie: accepted messages, accepted senders, and sent packets."""
 
 import struct
 import time
@@ -42,7 +42,7 @@ def state(p=(0.0, 0.0, 1.0), v=(0.0, 0.0, 0.0), omega=(0.0, 0.0, 0.0)):
     return crtp.state_values(np.array(p), UPRIGHT, np.array(v), np.array(omega))
 
 
-def test_a_state_is_read_in_our_frames(wire, link):
+def test_state_is_converted_to_retrim_frames(wire, link):
     says(wire, link, STATES, 1000, state((1.0, -2.0, 0.5), (0.1, 0.2, 0.3), (0.4, 0.5, 0.6)))
     x = link.reading
     np.testing.assert_allclose(x.p, [1.0, -2.0, 0.5], atol=1e-3)
@@ -51,27 +51,27 @@ def test_a_state_is_read_in_our_frames(wire, link):
     assert 0.0 <= time.monotonic() - x.stamp < 0.5
 
 
-def test_a_state_that_was_late_is_as_old_as_it_says(wire, link):
+def test_late_state_has_its_stated_age(wire, link):
     says(wire, link, STATES, 1000, state())
     time.sleep(0.05)
     says(wire, link, STATES, 1010, state())
     assert time.monotonic() - link.reading.stamp == pytest.approx(0.04, abs=0.02)
 
 
-def test_its_time_may_begin_anew_after_four_hours(wire, link):
+def test_time_may_wrap_after_four_hours(wire, link):
     says(wire, link, STATES, (1 << 24) - 5, state())
     says(wire, link, STATES, (1 << 24) + 5, state((0.1, 0.0, 1.0)))
     assert link.reading.p[0] == pytest.approx(0.1)
     assert link.ignored == 0
 
 
-def test_what_was_overtaken_is_not_taken_back(wire, link):
+def test_overtaken_state_is_ignored(wire, link):
     says(wire, link, STATES, 1010, state((0.1, 0.0, 1.0)))
     says(wire, link, STATES, 1000, state((0.0, 0.0, 1.0)))
     assert link.reading.p[0] == pytest.approx(0.1)
 
 
-def test_a_leap_is_not_believed_while_there_are_states_and_is_afterwards(wire, link):
+def test_time_jump_is_accepted_only_after_silence(wire, link):
     says(wire, link, STATES, 1000, state())
     says(wire, link, STATES, 1010, state((5.0, 0.0, 1.0)))
     assert (link.reading.p[0], link.ignored) == (0.0, 1)
@@ -80,14 +80,14 @@ def test_a_leap_is_not_believed_while_there_are_states_and_is_afterwards(wire, l
     assert link.reading.p[0] == pytest.approx(5.0)
 
 
-def test_a_status_is_read(wire, link):
+def test_status_is_read(wire, link):
     says(wire, link, STATUSES, 1000, crtp.status_values(crtp.Status(30_000.0, crtp.ARMED | crtp.CAN_FLY, 3.9)))
     assert link.status.info & crtp.ARMED
     assert list(link.thrusts) == [30_000.0]
 
 
-def test_of_2000_damaged_packets_none_is_believed(wire, link):
-    """Random ones, cut ones, ones of strangers, and logs of right length with random content."""
+def test_2000_damaged_packets_are_refused(wire, link):
+    """The packets are random, truncated, from other senders, or logs of the right length with random content."""
     rng = np.random.default_rng(0)
     says(wire, link, STATES, 5_000_000, state())
     says(wire, link, STATUSES, 5_000_000, crtp.status_values(crtp.Status(1.0, 0, 3.9)))
@@ -109,19 +109,19 @@ def test_of_2000_damaged_packets_none_is_believed(wire, link):
     assert link.reading is before
     assert link.status.thrust == 1.0
     assert link.last_message >= reply
-    assert link.ignored > 1400  # the others were of ports that nobody listens to
+    assert link.ignored > 1400  # the others were for ports without a receiver
     says(wire, link, STATES, 5_000_020, state((0.1, 0.0, 1.0)))
     assert link.reading.p[0] == pytest.approx(0.1)
 
 
-def firmware(names, *, version=12, refuses=0):
-    """What answers like one, to the questions of a start."""
+def firmware_responder(names, *, version=12, refuses=0):
+    """Return a function that answers the requests of a start like the firmware."""
 
     def answer(data):
-        packet = answered(crtp.unpack(data))
+        packet = exchange(crtp.unpack(data))
         return None if packet is None else packet.pack()
 
-    def answered(packet):
+    def exchange(packet):
         port, channel, body = packet
         if (port, channel) == (crtp.PLATFORM, 1):
             return packet._replace(body=bytes([0, version]))
@@ -137,9 +137,9 @@ def firmware(names, *, version=12, refuses=0):
     return answer
 
 
-def test_logs_are_asked_for_by_the_numbers_of_their_names(wire, link):
+def test_logs_are_requested_by_number(wire, link):
     names = ["other.one", *reversed(crtp.STATE_LOG), "other.two", *crtp.STATUS_LOG, "other.three"]
-    wire.answer = firmware(names)
+    wire.answer = firmware_responder(names)
     link.start_logs(1.0, lambda: True)
     setup = [packet.body for packet in send(wire) if (packet.port, packet.channel) == (crtp.LOG, crtp.CONTROL)]
     listed_rows = [
@@ -149,29 +149,32 @@ def test_logs_are_asked_for_by_the_numbers_of_their_names(wire, link):
     assert [body for body in setup if body[0] == crtp.START] == [bytes([3, 1, 1]), bytes([3, 2, 5])]
     assert link.version == 12
     calls = [packet.body for packet in send(wire) if packet[:2] == (crtp.LOG, crtp.TOC) and packet.body[0] == crtp.ITEM]
-    assert len(calls) == len(names) - 1  # no further than they are
+    assert len(calls) == len(names) - 1  # the table of contents is read only as far as necessary
 
 
 @pytest.mark.parametrize(
     ("answer", "why"),
     [
         (lambda data: None, "does not answer on port 13 in 0.3 s"),
-        (firmware([*crtp.STATE_LOG, "pm.vbat"]), "logs no stabilizer.thrust, supervisor.info; its firmware is too old"),
-        (firmware([*crtp.STATE_LOG, *crtp.STATUS_LOG], refuses=12), "refuses a block of its log: error 12"),
+        (
+            firmware_responder([*crtp.STATE_LOG, "pm.vbat"]),
+            "logs no stabilizer.thrust, supervisor.info; its firmware is too old",
+        ),
+        (firmware_responder([*crtp.STATE_LOG, *crtp.STATUS_LOG], refuses=12), "refuses a block of its log: error 12"),
     ],
 )
-def test_what_cannot_be_logged_is_named(wire, link, answer, why):
+def test_missing_log_variable_is_refused(wire, link, answer, why):
     wire.answer = answer
     with pytest.raises(PlantError, match=why):
         link.start_logs(0.3, lambda: True)
 
 
-def test_giving_up_is_noticed_while_nobody_answers(link):
+def test_cancellation_is_noticed_without_answer(link):
     with pytest.raises(PlantError, match="given up"):
         link.start_logs(5.0, lambda: False)
 
 
-def test_its_words_are_kept(wire, link):
+def test_console_messages_are_stored(wire, link):
     wire.inbox.append((Packet(crtp.CONSOLE, 0, b"SYS: low \nbattery\n").pack(), HERE))
     link.pump(0.0)
     assert link.console_text() == "; it said: SYS: low battery"

@@ -1,4 +1,4 @@
-"""The wire of a Crazyflie: golden vectors of its own client, inverses, and what is refused."""
+"""The wire format of a Crazyflie: golden vectors from its client, inverses, and refused values."""
 
 import struct
 
@@ -14,32 +14,32 @@ from retrim.plants.bridges.crtp import Packet
 @pytest.mark.parametrize(
     ("quaternion", "packed"), [([0.1, -0.2, 0.3, 0.9273618], 3297395929), ([-0.8, 0.2, 0.5, -0.2645751], 689808575)]
 )
-def test_attitudes_are_packed_as_its_client_packs_them(quaternion, packed):
-    """Numbers of cflib 0.1.34; elements are x, y, z, w."""
+def test_packed_attitudes_equal_client(quaternion, packed):
+    """Values from cflib 0.1.34; elements are x, y, z, w."""
     R = Rotation.from_quat(quaternion).as_matrix()
     assert crtp.quaternion_of(R) == packed
     np.testing.assert_allclose(crtp.attitude_of(packed), R, atol=4e-3)
 
 
-def test_attitudes_come_back():
+def test_attitudes_survive_round_trip():
     for q in np.random.default_rng(0).normal(size=(200, 4)):
         R = Rotation.from_quat(q)
         back = Rotation.from_matrix(crtp.attitude_of(crtp.quaternion_of(R.as_matrix())))
         assert (R.inv() * back).magnitude() < 5e-3
 
 
-def test_states_come_back_to_a_millimetre():
+def test_states_survive_round_trip_to_a_millimetre():
     rng = np.random.default_rng(1)
     p, v, omega = rng.uniform(-9.0, 9.0, (3, 3))
     R = Rotation.from_rotvec([0.3, -0.2, 2.0]).as_matrix()
     values = crtp.state_values(p, R, v, omega)
-    assert len(values) == 22  # of the 26 that a log packet has room for
+    assert len(values) == 22  # of the 26 bytes of a log packet
     for result, true in zip(crtp.state_of(values), (p, R, v, omega), strict=True):
         np.testing.assert_allclose(result, true, atol=5e-3)
 
 
-def test_a_setpoint_of_rates_has_the_pitch_up():
-    """20 deg/s about our y, left, is nose down; on the wire pitch is nose up."""
+def test_rate_setpoint_has_pitch_up_sign():
+    """20 deg/s about our y axis (left) is nose down; on the wire, pitch is nose up."""
     data = crtp.rates_setpoint(30_000, np.radians([10.0, 20.0, 30.0])).pack()
     assert data[0] == 7 << 4 | 3 << 2
     assert struct.unpack("<BfffHB", data[1:]) == (
@@ -66,12 +66,12 @@ def test_a_setpoint_of_rates_has_the_pitch_up():
         (crtp.start_block(2, 0.05), "5d 03 02 05"),
     ],
 )
-def test_orders_are_those_of_its_protocol(packet, data):
+def test_commands_equal_protocol(packet, data):
     assert packet.pack() == bytes.fromhex(data)
     assert crtp.unpack(packet.pack()) == packet
 
 
-def test_a_block_that_does_not_fit_into_a_packet_is_appended_to():
+def test_large_block_is_appended_to():
     orders = crtp.new_block(1, [("h", n) for n in range(10)])
     assert [order.body[0] for order in orders] == [crtp.CREATE, crtp.APPEND]
     assert all(len(order.pack()) <= crtp.LONGEST for order in orders)
@@ -89,12 +89,12 @@ def test_a_block_that_does_not_fit_into_a_packet_is_appended_to():
         (lambda: crtp.attitude_of(0x3FFFFFFF), "largest element is not"),
     ],
 )
-def test_what_is_none_is_refused(what, why):
+def test_invalid_values_are_refused(what, why):
     with pytest.raises(MessageError, match=why):
         what()
 
 
-def test_packets_say_their_port_and_channel():
+def test_packets_contain_port_and_channel():
     for port in range(16):
         for channel in range(4):
             packet = Packet(port, channel, b"ab")

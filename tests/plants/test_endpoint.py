@@ -1,4 +1,4 @@
-"""Addresses of vehicles, and the two kinds of ends."""
+"""Addresses of vehicles, and the two kinds of endpoints."""
 
 import os
 import pty
@@ -34,12 +34,12 @@ def test_addresses(text, parts):
         "udp:127.0.0.1:" + "9" * 5000, "udp:127.0.0.1:١٤٥", "127.0.0.1:14540",
     ],
 )  # fmt: skip
-def test_what_is_no_address_is_named(text):
+def test_invalid_address_is_refused(text):
     with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
         address_of(text)
 
 
-def test_a_port_is_listened_on_and_given_back():
+def test_port_is_opened_and_released():
     first = open_endpoint("udp:127.0.0.1:24540")
     assert isinstance(first, Endpoint)
     with pytest.raises(PlantError, match="24540 cannot be listened on"):
@@ -49,12 +49,12 @@ def test_a_port_is_listened_on_and_given_back():
 
 
 @pytest.mark.parametrize("address", ["udp:no.such.host.invalid:14540", "udp:203.0.113.9:14540"])
-def test_an_address_of_another_machine_is_refused(address):
+def test_remote_listening_address_is_refused(address):
     with pytest.raises(PlantError, match="cannot be listened on"):
         open_endpoint(address)
 
 
-def test_only_the_address_towards_a_vehicle_is_listened_on():
+def test_endpoint_listens_only_on_route_to_vehicle():
     assert address_towards("127.0.0.1", 19850) == "127.0.0.1"
     beyond = address_towards_or_none("192.0.2.1")
     assert beyond != "0.0.0.0"
@@ -67,14 +67,14 @@ def test_only_the_address_towards_a_vehicle_is_listened_on():
 
 
 def address_towards_or_none(host):
-    """Return the address, or None where a machine has no network."""
+    """Return the address, or None on a machine without a network."""
     try:
         return address_towards(host, 19850)
     except PlantError:
         return None
 
 
-def test_a_serial_line_carries_both_ways():
+def test_serial_line_is_bidirectional():
     ours, theirs = pty.openpty()
     line = open_endpoint(f"serial:{os.ttyname(theirs)}:57600")
     try:
@@ -92,6 +92,6 @@ def test_a_serial_line_carries_both_ways():
         os.close(theirs)
 
 
-def test_a_missing_line_is_named():
+def test_missing_serial_line_is_refused():
     with pytest.raises(PlantError, match="serial:/dev/nothing:57600 cannot be opened"):
         open_endpoint("serial:/dev/nothing:57600")

@@ -1,4 +1,4 @@
-"""Frames of autopilots: laws of rotations, and places where everybody agrees."""
+"""Frames of autopilots: laws of rotations, and known values."""
 
 import numpy as np
 import pytest
@@ -13,12 +13,12 @@ quaternions = arrays(float, 4, elements=st.floats(-1.0, 1.0)).filter(lambda q: q
 
 
 def about(axis, angle):
-    """Quaternion of a turn about an axis of the body."""
+    """Return the quaternion of a rotation about a body axis."""
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * np.eye(3)[axis]])
 
 
 @given(vectors)
-def test_each_change_of_frame_is_its_own_inverse(v):
+def test_frame_conversion_is_involution(v):
     np.testing.assert_allclose(frames.turned_world(frames.turned_world(v)), v)
     np.testing.assert_allclose(frames.turned_body(frames.turned_body(v)), v)
     assert frames.turned_heading(frames.turned_heading(v[0])) == pytest.approx(v[0])
@@ -31,7 +31,7 @@ def test_frames_are_right_handed(a, b):
 
 
 @given(quaternions)
-def test_attitudes_survive_the_way_there_and_back(q):
+def test_attitudes_survive_round_trip(q):
     R = frames.attitude_of(q)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(R) == pytest.approx(1.0)
@@ -41,21 +41,21 @@ def test_attitudes_survive_the_way_there_and_back(q):
 
 
 @given(quaternions, vectors)
-def test_a_body_vector_means_the_same_in_both_worlds(q, v):
+def test_body_vector_is_equal_in_both_worlds(q, v):
     w, xyz = q[0], q[1:]
     in_ned = (2 * np.outer(xyz, xyz) + (w * w - xyz @ xyz) * np.eye(3)) @ v + 2 * w * np.cross(xyz, v)
     in_enu = frames.attitude_of(q) @ frames.turned_body(v)
     np.testing.assert_allclose(in_enu, frames.turned_world(in_ned / (q @ q)), atol=1e-6)
 
 
-def test_level_and_to_the_north_as_everybody_knows_it():
+def test_level_attitude_to_the_north():
     R = frames.attitude_of(np.array([1.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(R, [[0, -1, 0], [1, 0, 0], [0, 0, 1]])  # forward is north, left is west
     assert frames.heading_of(R) == pytest.approx(np.pi / 2)
 
 
 @pytest.mark.parametrize(("axis", "in_our_body"), [(0, [1, 0, 0]), (1, [0, -1, 0]), (2, [0, 0, -1])])
-def test_turns_have_their_signs(axis, in_our_body):
+def test_rotations_have_expected_signs(axis, in_our_body):
     level, rotation = frames.attitude_of(about(0, 0.0)), frames.attitude_of(about(axis, 1e-4))
     rate = (level.T @ rotation - np.eye(3)) / 1e-4
     result = np.array([rate[2, 1], rate[0, 2], rate[1, 0]])

@@ -1,4 +1,4 @@
-"""One end of MAVLink: what it believes, whom it believes, and what it says."""
+"""The MAVLink link: accepted messages, accepted senders, and sent messages."""
 
 import math
 import time
@@ -23,8 +23,8 @@ def wire():
     setup.close()
 
 
-class Speaker:
-    """Somebody who speaks."""
+class Sender:
+    """A MAVLink sender."""
 
     def __init__(self, wire, link, *, system=1, component=1, peer=HERE):
         self.out = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
@@ -51,13 +51,13 @@ def link(wire):
 
 @pytest.fixture
 def px4(wire, link):
-    speaker = Speaker(wire, link)
+    speaker = Sender(wire, link)
     speaker.alive()
     return speaker
 
 
 def parse_replies(wire):
-    """What was said, read by a parser of its own."""
+    """Return the sent messages, read by an independent parser."""
     parser = mavlink.MAVLink(None)
     return [m for data, _ in wire.packets for m in parser.parse_buffer(data) or []]
 
@@ -66,17 +66,17 @@ def read_messages(wire, kind):
     return [m for m in parse_replies(wire) if m.get_type() == kind]
 
 
-def test_the_first_autopilot_is_the_one(wire, link):
-    Speaker(wire, link, system=255).alive(INVALID)  # a ground station
+def test_first_autopilot_is_selected(wire, link):
+    Sender(wire, link, system=255).alive(INVALID)  # a ground station
     assert link.system is None
-    Speaker(wire, link, system=3).alive()
+    Sender(wire, link, system=3).alive()
     assert (link.system, link.autopilot, link.mode, link.armed) == ((3, 1), PX4, (6, 0), True)
-    Speaker(wire, link, system=4).alive(mode=(4, 6))
-    Speaker(wire, link, system=3, peer=("127.0.0.1", 9)).alive(mode=(4, 6))
+    Sender(wire, link, system=4).alive(mode=(4, 6))
+    Sender(wire, link, system=3, peer=("127.0.0.1", 9)).alive(mode=(4, 6))
     assert (link.system, link.mode, link.ignored) == ((3, 1), (6, 0), 3)
 
 
-def test_a_state_is_told_in_our_frames(px4, link):
+def test_state_is_converted_to_retrim_frames(px4, link):
     px4.odometry()
     np.testing.assert_allclose(link.reading.p, [2.0, 1.0, 3.0], atol=1e-6)
     np.testing.assert_allclose(link.reading.v, [0.2, 0.1, -0.3], atol=1e-6)
@@ -84,25 +84,25 @@ def test_a_state_is_told_in_our_frames(px4, link):
     np.testing.assert_allclose(link.reading.R, frames.attitude_of(TURNED), atol=1e-6)
 
 
-def test_a_velocity_in_body_axes_is_the_same_velocity(px4, link):
+def test_body_velocity_is_converted(px4, link):
     px4.odometry()
     world, R = link.reading.v, link.reading.R
     px4.odometry(v=frames.turned_body(R.T @ world), child=12)
     np.testing.assert_allclose(link.reading.v, world, atol=1e-6)
 
 
-def test_position_and_attitude_of_one_instant_do_for_a_state(px4, link):
+def test_simultaneous_position_and_attitude_give_state(px4, link):
     place = px4.out.local_position_ned_encode(1000, 1.0, 2.0, -3.0, 0.1, 0.2, 0.3)
     px4.says(place)
     assert link.reading is None
     px4.says(px4.out.attitude_quaternion_encode(900, *TURNED, 0.4, 0.5, 0.6), place)
-    assert link.reading is None  # a tenth of a second apart
+    assert link.reading is None  # 0.1 s apart
     px4.says(px4.out.attitude_quaternion_encode(1010, *TURNED, 0.4, 0.5, 0.6), place)
     np.testing.assert_allclose(link.reading.p, [2.0, 1.0, 3.0], atol=1e-6)
     np.testing.assert_allclose(link.reading.omega, [0.4, -0.5, -0.6], atol=1e-6)
 
 
-def test_messages_in_frames_that_are_not_known_are_counted_and_named_once(px4, link):
+def test_messages_in_unknown_frames_are_counted_and_reported_once(px4, link):
     px4.odometry()
     before = link.reading
     for frame in range(256):
@@ -121,13 +121,13 @@ def test_messages_in_frames_that_are_not_known_are_counted_and_named_once(px4, l
 
 
 def frame_packet(kind, payload):
-    """A whole packet of any kind of message, with any content."""
+    """Return a complete packet of any message type with any content."""
     head = bytes([len(payload), 0, 0, 0, 1, 1]) + kind.id.to_bytes(3, "little")
     crc = mavlink.x25crc(head + payload + bytes([kind.crc_extra])).crc
     return b"\xfd" + head + payload + crc.to_bytes(2, "little")
 
 
-def test_no_message_of_the_dialect_ends_a_flight(px4, wire, link):
+def test_no_message_of_dialect_ends_flight(px4, wire, link):
     rng = np.random.default_rng(0)
     for kind in mavlink.mavlink_map.values():
         length = kind.unpacker.size
@@ -144,7 +144,7 @@ def test_no_message_of_the_dialect_ends_a_flight(px4, wire, link):
     "wrong",
     [{"p": (math.nan, 0.0, 0.0)}, {"v": (0.0, math.inf, 0.0)}, {"q": (0.0, 0.0, 0.0, 0.0)}, {"q": (9, 0, 0, 0)}],
 )
-def test_a_state_that_makes_no_sense_is_ignored(px4, link, wrong):
+def test_implausible_state_is_ignored(px4, link, wrong):
     px4.odometry()
     before = link.reading
     px4.odometry(**wrong)
@@ -152,7 +152,7 @@ def test_a_state_that_makes_no_sense_is_ignored(px4, link, wrong):
     assert link.ignored == 1
 
 
-def test_stamps_are_of_our_clock(px4, wire, link):
+def test_stamps_are_converted_to_local_clock(px4, wire, link):
     began = time.monotonic()
     for _ in range(12):
         link.pump(time.monotonic() + 0.03)
@@ -166,14 +166,14 @@ def test_stamps_are_of_our_clock(px4, wire, link):
     assert link.reading.stamp == pytest.approx(sending - 0.2, abs=0.01)
 
 
-def test_it_says_that_it_is_there(px4, wire, link):
+def test_heartbeat_is_sent(px4, wire, link):
     link.pump(time.monotonic() + 1.2)
     assert 2 <= len(read_messages(wire, "HEARTBEAT")) <= 4
     assert len(read_messages(wire, "TIMESYNC")) >= 8
     assert {to for _, to in wire.packets} == {HERE}
 
 
-def test_nothing_is_said_to_nobody(wire, link):
+def test_nothing_is_sent_without_receiver(wire, link):
     link.pump(time.monotonic() + 0.1)
     link.fly_rates(0.5, np.zeros(3))
     link.fly_to(np.zeros(3), 0.0)
@@ -181,7 +181,7 @@ def test_nothing_is_said_to_nobody(wire, link):
     assert wire.packets == []
 
 
-def test_commands_are_told_in_its_frames(px4, wire, link):
+def test_commands_are_converted_to_px4_frames(px4, wire, link):
     link.fly_rates(0.4, np.array([0.1, 0.2, 0.3]))
     (rates,) = read_messages(wire, "SET_ATTITUDE_TARGET")
     assert rates.type_mask == 128
@@ -193,7 +193,7 @@ def test_commands_are_told_in_its_frames(px4, wire, link):
 
 
 def damage(rng, whole, *, kinds=5):
-    """A packet that is not whole."""
+    """Return a damaged packet."""
     kind = rng.integers(kinds)
     packet = bytearray(whole[rng.integers(len(whole))])
     if kind == 0:
@@ -205,13 +205,14 @@ def damage(rng, whole, *, kinds=5):
     if kind == 3:
         packet[rng.integers(len(packet))] ^= 1 << rng.integers(8)
         return bytes(packet)
-    return bytes(packet[rng.integers(1, len(packet)) :])  # on a line, the end of one that was cut before
+    # on a serial line, the end of a packet that was truncated earlier
+    return bytes(packet[rng.integers(1, len(packet)) :])
 
 
 @pytest.mark.parametrize("datagrams", [True, False])
-def test_of_2000_damaged_packets_none_is_believed(wire, datagrams):
+def test_2000_damaged_packets_are_refused(wire, datagrams):
     link, rng = MavlinkLink(wire, datagrams=datagrams), np.random.default_rng(0)
-    px4 = Speaker(wire, link)
+    px4 = Sender(wire, link)
     px4.alive()
     px4.odometry()
     out = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -232,6 +233,6 @@ def test_of_2000_damaged_packets_none_is_believed(wire, datagrams):
     assert link.reading is before
     assert (link.mode, link.armed, list(link.thrusts), list(link.texts)) == ((6, 0), True, [], [])
     assert link.ignored > 500
-    for _ in range(20 if not datagrams else 1):  # on a line, damage may swallow what follows it
+    for _ in range(20 if not datagrams else 1):  # on a serial line, damage may consume the following bytes
         px4.odometry(p=(4.0, 5.0, -6.0))
     np.testing.assert_allclose(link.reading.p, [5.0, 4.0, 6.0], atol=1e-6)

@@ -1,4 +1,4 @@
-"""Faults of measurements: each one does what its name says, and no fault of size zero changes anything."""
+"""Faults of measurements: each has its stated effect, and a fault of size zero has no effect."""
 
 import jax
 import jax.numpy as jnp
@@ -17,48 +17,48 @@ TICKS = 260
 
 
 def report(fault, tick, rows=30):
-    """What is reported at a tick of a sequence of random states, and the sequence, newest last."""
+    """Return the reported state at a tick of a sequence of random states, and the sequence, newest last."""
     xs = [random_state(random.key(k)) for k in range(rows)]
     past = jax.tree.map(lambda *leaves: jnp.stack(leaves), *xs[-(fault.memory + 1) :])
     return fault(past, jnp.array(tick), random.key(tick)), xs
 
 
-def same(a, b):
+def assert_equal(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 @pytest.mark.parametrize("name", ["velocity-spikes", "rare-spikes"])
-def test_a_spike_adds_its_size_to_one_velocity_in_so_many(name):
+def test_spikes_have_stated_size_and_interval(name):
     fault = measurement_fault(f"{name}=1.5")
     every = int(fault.every)
     for tick in range(0, 3 * every, 7):
         x, xs = report(fault, tick)
         wrong = tick % every == every - 1
         np.testing.assert_allclose(x.v - xs[-1].v, [1.5 * wrong, 0.0, 0.0], atol=1e-12)
-        same((x.p, x.R), (xs[-1].p, xs[-1].R))
+        assert_equal((x.p, x.R), (xs[-1].p, xs[-1].R))
 
 
-def test_swapped_markers_turn_the_pose_and_leave_a_rotation():
+def test_swapped_markers_rotate_pose_and_keep_it_valid():
     x, xs = report(measurement_fault("swapped-markers=1.5"), 49)
     np.testing.assert_allclose(x.R.T @ x.R, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(so3.log(xs[-1].R.T @ x.R), [0.0, 0.0, 1.5], atol=1e-9)
-    same(report(measurement_fault("swapped-markers"), 10)[0], xs[-1])
+    assert_equal(report(measurement_fault("swapped-markers"), 10)[0], xs[-1])
 
 
 @pytest.mark.parametrize("ticks", [1, 3, 7])
-def test_late_measurements_are_so_many_ticks_old(ticks):
+def test_late_measurements_have_stated_age(ticks):
     x, xs = report(measurement_fault(f"late={ticks}"), 40)
-    same(x, xs[-1 - ticks])
+    assert_equal(x, xs[-1 - ticks])
 
 
-def test_a_frozen_system_repeats_the_state_before_its_stop():
+def test_frozen_measurement_repeats_last_state():
     fault = measurement_fault("frozen=15")
     for tick, back in ((199, 0), (200, 1), (207, 8), (214, 15), (215, 0), (3, 0)):
         x, xs = report(fault, tick)
-        same(x, xs[-1 - back])
+        assert_equal(x, xs[-1 - back])
 
 
-def test_repeated_measurements_have_their_probability():
+def test_repeated_measurements_have_stated_probability():
     fault = measurement_fault("repeated=0.3")
     stale = [np.array_equal(x.p, xs[-2].p) for x, xs in (report(fault, k, rows=2) for k in range(400))]
     assert 0.23 < np.mean(stale) < 0.37
@@ -78,7 +78,7 @@ def test_scale_biases_and_drift():
     )
 
 
-def test_gaps_and_clock_jumps_show_in_the_times_of_a_plant():
+def test_gaps_and_clock_jumps_change_times_of_plant():
     def times(name):
         plant = SimPlant(CheapModel(0.02), Constant(jnp.zeros(3)), fault=measurement_fault(name))
         plant.reset(START)
@@ -90,8 +90,8 @@ def test_gaps_and_clock_jumps_show_in_the_times_of_a_plant():
     assert sorted({round(v, 9) for v in late.tolist()}) == [0.0, 0.1]
 
 
-def test_a_faulty_plant_moves_like_one_without_a_fault():
-    """Faults change what is measured, not what happens."""
+def test_fault_does_not_change_motion():
+    """Faults change the measurement, and not the true state."""
     u = Command(jnp.array(10.0), jnp.array([0.5, -0.2, 0.1]))
 
     def truth(fault):
@@ -104,7 +104,7 @@ def test_a_faulty_plant_moves_like_one_without_a_fault():
     plain = truth(None)
     for name in ("late", "velocity-spikes=2", "scaled-velocity", "repeated"):
         faulty = truth(measurement_fault(name))
-        same(faulty.true_state, plain.true_state)
+        assert_equal(faulty.true_state, plain.true_state)
         assert faulty.t == plain.t
     assert not np.array_equal(truth(measurement_fault("late")).x.p, plain.x.p)
 
@@ -124,7 +124,7 @@ def test_every_registered_fault_has_a_default_size():
         ("latte", "latte"),
     ],
 )
-def test_impossible_faults_are_refused_in_one_line(name, words):
+def test_invalid_faults_are_refused_in_one_line(name, words):
     with pytest.raises(ConfigError, match=words) as refusal:
         measurement_fault(name)
     assert "\n" not in str(refusal.value)

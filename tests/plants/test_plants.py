@@ -1,4 +1,4 @@
-"""Conformance: what every plant must do. A new plant is one more row in PLANTS."""
+"""Conformance of every plant. A new plant needs one row in PLANTS."""
 
 import importlib.util
 import os
@@ -31,7 +31,7 @@ EXTRAS = ("rotorpy", "mujoco", "crazyflow")
 
 
 def maker(plant):
-    """From a disturbance by name to the plant."""
+    """Return the function from a disturbance by name to the plant."""
     return lambda disturbance: Scenario(disturbance, plant).make()
 
 
@@ -41,7 +41,7 @@ START = State.at(jnp.array([0.3, -0.2, 1.5]))
 
 @pytest.fixture(params=list(PLANTS))
 def make(request):
-    """Plant in disturbances by name; skips, saying so, where its extra is not installed."""
+    """Return the plant under disturbances by name; skip the test if its extra is not installed."""
     if request.param in EXTRAS and importlib.util.find_spec(request.param) is None:
         pytest.skip(f"the extra {request.param} is not installed")
     return PLANTS[request.param]
@@ -53,7 +53,7 @@ def plant(make):
 
 
 def after(plant, ticks, c=9.81, omega=(0.0, 0.0, 0.0)):
-    """State after that many ticks of one command."""
+    """Return the state after that many ticks of one command."""
     plant.reset(START)
     for _ in range(ticks):
         measurement, _ = plant.step(Command(jnp.array(c), jnp.array(omega)))
@@ -64,7 +64,7 @@ def test_is_a_plant(plant):
     assert isinstance(plant, Plant)
 
 
-def test_reset_puts_it_where_it_is_told(plant, key):
+def test_reset_sets_state(plant, key):
     for x0 in (START, random_state(key, 0.3)):
         measurement = plant.reset(x0)
         assert measurement.t == 0.0
@@ -72,18 +72,18 @@ def test_reset_puts_it_where_it_is_told(plant, key):
         jax.tree.map(np.testing.assert_array_equal, measurement.truth, x0)
 
 
-def test_reset_without_a_state_is_a_metre_above_the_ground(plant):
+def test_default_reset_is_a_metre_above_ground(plant):
     measurement = plant.reset(None)
     np.testing.assert_array_equal(measurement.x.vector(), State.at(jnp.array([0.0, 0.0, 1.0])).vector())
 
 
-def test_ticks(plant):
+def test_time_advances_by_ticks(plant):
     plant.reset(START)
     times = [plant.step(Command.hover())[0].t for _ in range(5)]
     np.testing.assert_allclose(times, plant.dt * np.arange(1, 6), atol=1e-12)
 
 
-def test_reset_forgets(plant):
+def test_reset_clears_history(plant):
     def flight():
         plant.reset(START)
         return [plant.step(Command(jnp.array(11.0), jnp.array([1.0, 0.5, 0.2])))[0].x.vector() for _ in range(10)]
@@ -91,12 +91,12 @@ def test_reset_forgets(plant):
     np.testing.assert_array_equal(flight(), flight())
 
 
-def test_hover_hovers(plant):
+def test_hover_command_hovers(plant):
     assert float(jnp.linalg.norm(after(plant, 10).p - START.p)) < 0.05
 
 
-def test_command_acts_after_the_delay_and_is_accepted(plant):
-    """The command of tick k moves the vehicle from tick k + delay on, not before."""
+def test_command_acts_after_delay_and_is_accepted(plant):
+    """The command of tick k moves the vehicle from tick k + delay on, and not before."""
     rolling, plain = [], []
     for rates, into in ((jnp.array([3.0, 0.0, 0.0]), rolling), (jnp.zeros(3), plain)):
         plant.reset(START)
@@ -110,15 +110,15 @@ def test_command_acts_after_the_delay_and_is_accepted(plant):
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_rates_turn_it_about_its_own_axes(plant, axis):
-    """1 rad/s for 0.4 s, less the delay and the rate loop's lag."""
+def test_rates_rotate_about_body_axes(plant, axis):
+    """1 rad/s for 0.4 s, minus the delay and the lag of the rate loop."""
     angles = so3.log(after(plant, 20, omega=jnp.zeros(3).at[axis].set(1.0)).R)
     assert 0.25 < float(angles[axis]) < 0.4
     assert float(jnp.linalg.norm(angles)) == pytest.approx(float(angles[axis]), rel=0.05)
 
 
-def test_it_measures_how_fast_it_turns_and_how_it_is_accelerated(plant):
-    """Rates at the end of a tick, the mean acceleration over it: its attitudes and velocities say so, too."""
+def test_measured_rates_and_acceleration_match_motion(plant):
+    """Rates at the end of a tick and the mean acceleration over it agree with attitudes and velocities."""
     elapsed_time = [plant.reset(START)]
     for k in range(16):
         rates = jnp.array([1.5, -1.0, 0.5]) * (1.0 if k < 8 else -1.0)
@@ -126,7 +126,7 @@ def test_it_measures_how_fast_it_turns_and_how_it_is_accelerated(plant):
     for before, now in pairwise(elapsed_time):
         rates = so3.log(before.R.T @ now.R) / plant.dt
         ends = np.stack([before.omega, now.omega])
-        slack = 0.15 + 0.25 * np.ptp(ends, axis=0)  # it may have turned faster within the tick
+        slack = 0.15 + 0.25 * np.ptp(ends, axis=0)  # rates may have been higher within the tick
         assert np.all(rates > ends.min(axis=0) - slack)
         assert np.all(rates < ends.max(axis=0) + slack)
         np.testing.assert_allclose(now.a, (now.v - before.v) / plant.dt, atol=0.02)
@@ -134,7 +134,7 @@ def test_it_measures_how_fast_it_turns_and_how_it_is_accelerated(plant):
     assert float(elapsed_time[-1].omega @ elapsed_time[8].omega) < 0.0
 
 
-def test_what_is_beyond_its_limits_does_what_is_accepted(plant):
+def test_command_beyond_limits_has_effect_of_accepted_command(plant):
     low, high = small().command_min, small().command_max
     for calls in (Command(jnp.array(500.0), 1e3 * high.omega), Command(jnp.array(-5.0), 1e3 * low.omega)):
         plant.reset(START)
@@ -150,7 +150,7 @@ def test_what_is_beyond_its_limits_does_what_is_accepted(plant):
 
 
 def test_thrust_is_per_mass(plant):
-    """2 m/s^2 more than hover, for 0.1 s after the motors have settled."""
+    """2 m/s^2 above hover, for 0.1 s after the motors have settled."""
     rise = [float(after(plant, ticks, c=11.81).v[2] - after(plant, ticks).v[2]) for ticks in (10, 15)]
     assert 0.15 < rise[1] - rise[0] < 0.23
 
@@ -161,16 +161,16 @@ def test_push_accelerates(make):
     np.testing.assert_allclose(with_push.v - calm.v, 0.05, rtol=0.1)
 
 
-def test_wind_moves_it_downwind(make):
-    """It blows along (1, 1, 0)."""
+def test_wind_accelerates_downwind(make):
+    """The wind is along (1, 1, 0)."""
     blown, calm = after(make("wind"), 50), after(make("none"), 50)
     shift = blown.p - calm.p
     assert float(shift[0] + shift[1]) / 2**0.5 > 0.03
     assert abs(float(shift[0] - shift[1])) < 0.1 * float(shift[0] + shift[1])
 
 
-def test_wind_is_in_the_world_frame(make):
-    """Whatever the heading."""
+def test_wind_is_in_world_frame(make):
+    """The result is independent of the heading."""
     plant = make("wind")
     plant.reset(State(START.p, so3.exp(jnp.array([0.0, 0.0, 2.5])), START.v))
     for _ in range(50):
@@ -187,19 +187,19 @@ def support(make, disturbance):
         pytest.skip(str(error))
 
 
-def test_load_pulls_it_down(make):
-    """70 g more than the thrust carries."""
+def test_load_accelerates_downwards(make):
+    """A load of 70 g exceeds the thrust at hover."""
     assert float(support(make, "payload").v[2] - after(make("none"), 10).v[2]) < -0.3
 
 
-def test_weak_rotor_tilts_it_towards_itself(make):
-    """Front right."""
+def test_weak_rotor_tilts_towards_itself(make):
+    """The weak rotor is front right."""
     up = support(make, "weak-rotor").R[:, 2] - after(make("none"), 10).R[:, 2]
     assert float(up[0]) > 1e-3
     assert float(up[1]) < -1e-3
 
 
-def test_what_a_plant_cannot_do_is_refused_before_anything_moves():
+def test_unsupported_disturbance_is_refused_at_construction():
     pytest.importorskip("rotorpy")
     plant = RotorpyPlant(Payload.of(0.07, picked=0.2))
     plant.reset(START)
@@ -213,7 +213,7 @@ def test_what_a_plant_cannot_do_is_refused_before_anything_moves():
         after(PLANTS["rotorpy"]("weak-rotor"), 1)
 
 
-def test_flights_in_threads_are_the_same_flights(make):
+def test_flights_in_threads_equal_serial_flights(make):
     def flight(_):
         return after(make("wind"), 30, 10.0, (0.5, 0.2, 0.1)).vector()
 
@@ -222,7 +222,7 @@ def test_flights_in_threads_are_the_same_flights(make):
             np.testing.assert_array_equal(result, flight(None))
 
 
-def test_flights_are_in_the_dtype_of_their_start(make):
+def test_flight_has_dtype_of_start(make):
     plant = make("wind")
     with jax.enable_x64(False):
         plant32 = make("wind")
@@ -237,7 +237,7 @@ def test_flights_are_in_the_dtype_of_their_start(make):
     ("c", "omega", "name"),
     [(float("nan"), [0, 0, 0], "c = nan"), (9.81, [0, float("inf"), 0], r"omega\[1\] = inf")],
 )
-def test_a_command_that_is_not_finite_is_refused_by_name(plant, c, omega, name):
+def test_nonfinite_command_is_refused(plant, c, omega, name):
     plant.reset(START)
     with pytest.raises(PlantError, match=f"command refused, {name} is not finite"):
         plant.step(Command(jnp.array(c), jnp.array(omega, dtype=float)))
@@ -254,7 +254,7 @@ def test_stop_is_idempotent_and_final(plant):
     assert plant.reset(START).t == 0.0
 
 
-class Broken(AbstractController[None]):
+class FailingController(AbstractController[None]):
     def init(self, x):
         return None
 
@@ -262,14 +262,14 @@ class Broken(AbstractController[None]):
         return Command(jnp.where(t > 0.05, jnp.nan, 9.81), jnp.zeros(3)), None
 
 
-def test_flight_stops_the_plant_whatever_happens(plant):
+def test_flight_stops_plant_after_error(plant):
     with pytest.raises(PlantError, match="c = nan is not finite"):
-        fly(plant, ControllerPilot(Broken()), START, ticks=10)
+        fly(plant, ControllerPilot(FailingController()), START, ticks=10)
     with pytest.raises(PlantError, match="call reset first"):
         plant.step(Command.hover())
 
 
-def test_leaving_the_context_stops_the_plant(plant):
+def test_context_exit_stops_plant(plant):
     with plant as entries:
         assert entries is plant
         plant.reset(START)
@@ -290,8 +290,8 @@ def test_log_has_every_tick(plant):
 
 
 @pytest.mark.parametrize("name", ["bem", "simple"])
-def test_a_command_beyond_the_limits_is_clipped_and_reported(name):
-    """What is reported is what flies: the same motion as under the clipped command itself."""
+def test_command_beyond_limits_is_clipped_and_reported(name):
+    """The reported command is the one that acts: the motion equals that under the clipped command."""
     low, high = small().command_min, small().command_max
     plant = PLANTS[name]("none")
     for wild, within in (
@@ -314,9 +314,9 @@ IMPORTED = {"rotorpy": "rotorpy.vehicles.hummingbird_params", "mujoco": "mujoco"
 
 
 @pytest.mark.parametrize("name", EXTRAS)
-def test_missing_extra_names_the_command_that_installs_it(name, monkeypatch):
+def test_missing_extra_error_states_installation(name, monkeypatch):
     monkeypatch.setitem(sys.modules, IMPORTED[name], None)
-    monkeypatch.setattr(crazyflow, "_simulator", crazyflow._simulator.__wrapped__)  # which remembers what it imported
+    monkeypatch.setattr(crazyflow, "_simulator", crazyflow._simulator.__wrapped__)  # the module cached the import
     expected = rf"plant '{name}' needs the package '{name}' .*`uv pip install -e '\.\[{name}\]'`.*`pip install {name}`"
     with pytest.raises(PlantError, match=expected) as error:
         PLANTS[name]("none")
@@ -324,20 +324,20 @@ def test_missing_extra_names_the_command_that_installs_it(name, monkeypatch):
 
 
 @pytest.mark.parametrize("name", [*EXTRAS, "mavlink"])
-def test_missing_extra_is_named_before_anything_is_trained(name, monkeypatch):
+def test_missing_extra_is_reported_before_training(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "pymavlink" if name == "mavlink" else name, None)
     with pytest.raises(PlantError, match=rf"plant '{name}' needs the package .*`uv pip install -e '\.\[{name}\]'`"):
         FlightArguments(plant=name, disturbance="none").scenario(load("hover/retrim"))
 
 
-def test_missing_ros_is_named_before_anything_is_trained(monkeypatch):
+def test_missing_ros_is_reported_before_training(monkeypatch):
     monkeypatch.setitem(sys.modules, "rospy", None)
     with pytest.raises(ConfigError, match="ROS 1 needs rospy from the system: apt install python3-rospy"):
         FlightArguments(plant="ros").scenario(load("hover/retrim"))
 
 
 @pytest.mark.parametrize("installed", [set(), {"rosbags"}])
-def test_missing_packages_of_ros_2_are_named_before_anything_is_trained(installed, monkeypatch):
+def test_missing_ros_2_packages_are_reported_before_training(installed, monkeypatch):
     for module in (ros2, backends):
         monkeypatch.setattr(module, "is_installed", lambda name: name in installed)
     why = "ROS 2 needs rclpy" if installed else "plant 'ros2' needs the package 'rosbags'"
@@ -345,14 +345,14 @@ def test_missing_packages_of_ros_2_are_named_before_anything_is_trained(installe
         FlightArguments(plant="ros2").scenario(load("hover/retrim"))
 
 
-def test_missing_firmware_is_named_before_anything_is_trained(monkeypatch):
+def test_missing_firmware_is_reported_before_training(monkeypatch):
     monkeypatch.setenv("RETRIM_BETAFLIGHT", "/nowhere")
     with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere: no program"):
         FlightArguments(plant="betaflight").scenario(load("hover/retrim"))
 
 
 def python(code):
-    """Run ``code`` in a process that has not imported anything; what it printed."""
+    """Run ``code`` in a fresh process; return its output."""
     env = {key: value for key, value in os.environ.items() if key != "SCIPY_ARRAY_API"}
     done = subprocess.run(
         [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True, timeout=120
@@ -365,7 +365,7 @@ def test_extras_are_not_imported_with_retrim():
     assert python(f"import sys, retrim, retrim.config; print({heavy} & set(sys.modules))") == "set()\n"
 
 
-def test_scipy_without_its_array_api_is_refused_with_what_to_do():
+def test_scipy_without_array_api_is_refused_with_remedy():
     pytest.importorskip("crazyflow")
     code = """
 import scipy
@@ -379,7 +379,7 @@ except PlantError as error:
     assert "plant crazyflow: scipy has already been imported" in python(code)
 
 
-def test_crazyflow_leaves_jax_as_it_was():
+def test_crazyflow_does_not_change_jax_settings():
     pytest.importorskip("crazyflow")
     after(PLANTS["crazyflow"]("none"), 1)
     config = jax.config.values
@@ -390,8 +390,8 @@ def test_crazyflow_leaves_jax_as_it_was():
         jnp.zeros(3) + jnp.zeros((2, 3))
 
 
-def test_mujoco_drag_is_that_of_the_vehicle():
-    """Falling at 5 m/s along each axis: density / 2 c A v^2."""
+def test_mujoco_drag_is_that_of_vehicle():
+    """A fall at 5 m/s along each axis: density / 2 c A v^2."""
     pytest.importorskip("mujoco")
     vehicle = small()
     plant = MujocoPlant(vehicle, Constant(jnp.zeros(3)))

@@ -1,4 +1,4 @@
-"""Links to vehicles behind ROS 2: frames, signs, orders of quaternions, and comparisons before take-off."""
+"""Links to vehicles behind ROS 2: frames, signs, orders of quaternions, and checks before take-off."""
 
 import math
 import threading
@@ -75,7 +75,7 @@ def vehicle(talker, t=1.0, p=(1.0, 2.0, -3.0), q=NORTH, v=(0.4, 0.5, 0.6), rates
 # ---- states
 
 
-def test_px4_s_state_is_told_in_our_frames(talker, px4):
+def test_px4_state_is_converted_to_retrim_frames(talker, px4):
     vehicle(talker)
     x = px4.reading
     np.testing.assert_allclose(x.p, [2.0, 1.0, 3.0])  # east, north, up
@@ -84,15 +84,15 @@ def test_px4_s_state_is_told_in_our_frames(talker, px4):
     assert frames.heading_of(x.R) == pytest.approx(math.pi / 2)  # counter-clockwise from east
 
 
-def test_px4_s_quaternions_begin_with_w(talker, px4):
+def test_px4_quaternions_begin_with_w(talker, px4):
     vehicle(talker, q=(HALF, 0.0, 0.0, HALF))  # a quarter turn to the right, from north to east
     np.testing.assert_allclose(px4.reading.R, np.eye(3), atol=1e-6)
     vehicle(talker, t=2.0, q=(math.cos(0.1), math.sin(0.1), 0.0, 0.0))  # right side down, nose to the north
     up = px4.reading.R[:, 2]
-    np.testing.assert_allclose(up, [math.sin(0.2), 0.0, math.cos(0.2)], atol=1e-6)  # thrust pulls to the east
+    np.testing.assert_allclose(up, [math.sin(0.2), 0.0, math.cos(0.2)], atol=1e-6)  # the thrust points to the east
 
 
-def test_px4_s_velocity_may_be_in_the_body(talker, px4):
+def test_px4_velocity_may_be_in_body_frame(talker, px4):
     vehicle(talker, q=(HALF, 0.0, 0.0, HALF), v=(1.0, 2.0, 3.0), of_v=3)  # nose to the east: forward, right, down
     np.testing.assert_allclose(px4.reading.v, [1.0, -2.0, -3.0], atol=1e-6)
 
@@ -101,13 +101,13 @@ def test_px4_s_velocity_may_be_in_the_body(talker, px4):
     ({"frame": 0}, "in frame 0"), ({"of_v": 0}, "velocities in frame 0"), ({"p": (math.nan, 0, 0)}, "not finite"),
     ({"q": (0, 0, 0, 0)}, "without an attitude"), ({"rates": (0, math.inf, 0)}, "not finite"),
 ])  # fmt: skip
-def test_px4_s_states_that_make_no_sense_are_ignored(talker, px4, bad, why):
+def test_implausible_px4_states_are_ignored(talker, px4, bad, why):
     vehicle(talker, **bad)
     assert (px4.reading, px4.ignored) == (None, 1)
     assert why in px4.notes[0]
 
 
-def test_mavros_has_our_frames_and_quaternions_that_end_with_w(talker, mavros):
+def test_mavros_has_retrim_frames_and_quaternions_end_with_w(talker, mavros):
     odometry(talker)
     x = mavros.reading
     np.testing.assert_allclose(x.p, [1.0, 2.0, 3.0])
@@ -117,13 +117,13 @@ def test_mavros_has_our_frames_and_quaternions_that_end_with_w(talker, mavros):
 
 
 @pytest.mark.parametrize("child", ["map", ""])
-def test_a_twist_in_the_world_is_recognised(talker, mavros, child):
+def test_twist_in_world_frame_is_recognised(talker, mavros, child):
     odometry(talker, child=child)
     np.testing.assert_allclose(mavros.reading.v, [0.4, 0.0, 0.0])
     np.testing.assert_allclose(mavros.reading.omega, [0.2, -0.1, 0.3], atol=1e-9)
 
 
-def test_both_describe_the_same_vehicle(talker, network):
+def test_px4_and_mavros_give_same_state(talker, network):
     """One state, from PX4 and from mavros."""
     px4, mavros = Px4Link(network.node(), address_of("px4")), MavrosLink(network.node(), address_of("mavros"))
     rng = np.random.default_rng(3)
@@ -142,7 +142,7 @@ def test_both_describe_the_same_vehicle(talker, network):
         np.testing.assert_allclose(mine, other, atol=1e-5)
 
 
-def test_velocities_come_from_poses_where_there_is_no_odometry(talker, mavros):
+def test_velocities_follow_from_poses_without_odometry(talker, mavros):
     def pose(k):
         def fill(m):
             stamped(m, 100.0 + 0.01 * k)
@@ -154,14 +154,14 @@ def test_velocities_come_from_poses_where_there_is_no_odometry(talker, mavros):
     for k in range(40):
         talker.says(POSES, POSE, pose(k))
         time.sleep(0.01)
-    np.testing.assert_allclose(mavros.reading.v, [2.0, 0.0, 0.0], atol=0.4)  # the times are those of arrival at first
+    np.testing.assert_allclose(mavros.reading.v, [2.0, 0.0, 0.0], atol=0.4)  # the first times are those of arrival
     np.testing.assert_allclose(mavros.reading.omega, [0.0, 0.0, 1.0], atol=0.3)
     odometry(talker, t=200.0)
     talker.says(POSES, POSE, pose(60))
     np.testing.assert_allclose(mavros.reading.p, [1.0, 2.0, 3.0])  # odometry is recent
 
 
-def test_states_that_arrive_out_of_order_or_twice_are_left_out(talker, px4):
+def test_reordered_and_duplicate_states_are_ignored(talker, px4):
     for t, p in ((1.00, 0.0), (1.02, 2.0), (1.01, 1.0), (1.02, 9.0), (1.04, 4.0), (1.03, 3.0)):
         vehicle(talker, t=t, p=(0.0, p, 0.0))
         assert px4.reading.p[0] in (0.0, 2.0, 4.0)
@@ -170,7 +170,7 @@ def test_states_that_arrive_out_of_order_or_twice_are_left_out(talker, px4):
 
 
 @pytest.mark.parametrize("jump", [-3600.0, -0.2, 0.7, 3600.0])
-def test_a_clock_that_is_set_is_followed_within_three_states(talker, px4, jump):
+def test_adjusted_clock_is_followed_within_three_states(talker, px4, jump):
     for k in range(20):
         vehicle(talker, t=5000.0 + 0.01 * k)
         time.sleep(0.01)
@@ -184,7 +184,7 @@ def test_a_clock_that_is_set_is_followed_within_three_states(talker, px4, jump):
     assert now - px4.last_message < 0.1
 
 
-def test_a_state_without_a_stamp_has_the_time_of_its_arrival(talker, mavros):
+def test_state_without_stamp_has_arrival_time(talker, mavros):
     for _ in range(3):
         odometry(talker, t=0.0)
         assert 0.0 <= time.monotonic() - mavros.reading.stamp < 0.05
@@ -193,7 +193,7 @@ def test_a_state_without_a_stamp_has_the_time_of_its_arrival(talker, mavros):
 # ---- setpoints
 
 
-def test_setpoints_are_told_in_px4_s_frames(talker, px4):
+def test_setpoints_are_converted_to_px4_frames(talker, px4):
     rates, wish, place = (
         "/fmu/in/vehicle_rates_setpoint",
         "/fmu/in/offboard_control_mode",
@@ -215,7 +215,7 @@ def test_setpoints_are_told_in_px4_s_frames(talker, px4):
     assert (mode.position, mode.body_rate) == (True, False)
 
 
-def test_a_command_is_for_any_system(talker, px4):
+def test_vehicle_command_addresses_any_system(talker, px4):
     talker.hears("/fmu/in/vehicle_command", "px4_msgs/msg/VehicleCommand")
     px4.command(176, 1.0, 6.0)
     (m,) = talker.kept["/fmu/in/vehicle_command"]
@@ -223,7 +223,7 @@ def test_a_command_is_for_any_system(talker, px4):
     assert (m.target_system, m.target_component) == (0, 0)
 
 
-def test_a_target_of_mavros_has_rates_in_our_frame(talker, mavros):
+def test_mavros_target_has_rates_in_retrim_frame(talker, mavros):
     talker.hears(ATTITUDE, TARGET)
     mavros.fly_rates(0.3, np.array([0.1, 0.2, 0.4]))
     (m,) = talker.kept[ATTITUDE]
@@ -233,7 +233,7 @@ def test_a_target_of_mavros_has_rates_in_our_frame(talker, mavros):
     assert abs(m.header.stamp.sec - time.time()) < 5.0
 
 
-def test_the_mode_is_read(talker, px4):
+def test_mode_is_read(talker, px4):
     for armed, offboard in ((False, False), (True, False), (True, True)):
         talker.says(
             CONTROL, "px4_msgs/msg/VehicleControlMode", flag_armed=armed, flag_control_offboard_enabled=offboard
@@ -241,7 +241,7 @@ def test_the_mode_is_read(talker, px4):
         assert (px4.armed, px4.mode[0] == 6) == (armed, offboard)
 
 
-def test_quality_of_service_is_that_of_px4(px4, mavros):
+def test_quality_of_service_equals_px4(px4, mavros):
     assert {px4.node.qos[topic] for topic in px4.node.qos} == {SENSOR}  # best effort, volatile
     assert mavros.node.qos[ODOM] == SENSOR
     assert mavros.node.qos[ATTITUDE] == COMMAND  # reliable, which every subscriber accepts
@@ -250,8 +250,8 @@ def test_quality_of_service_is_that_of_px4(px4, mavros):
 # ---- versions
 
 
-def answering(talker, release="newest", known=True):
-    """PX4 answers questions about the formats of its inputs."""
+def answer_format_requests(talker, release="newest", known=True):
+    """Answer requests for the formats of PX4's inputs."""
 
     def answer(m):
         topic = bytes(m.topic_name).split(b"\0")[0].decode()
@@ -264,27 +264,27 @@ def answering(talker, release="newest", known=True):
     talker.hears("/fmu/in/message_format_request", "px4_msgs/msg/MessageFormatRequest", answer)
 
 
-def test_the_firmware_is_asked_for_its_formats(talker, px4):
-    answering(talker)
+def test_formats_of_firmware_are_requested(talker, px4):
+    answer_format_requests(talker)
     assert px4.format_fault() == ""
     assert len(talker.kept["/fmu/in/message_format_request"]) == len(TOPICS)
     assert px4.notes == []
 
 
-def test_another_release_of_the_firmware_is_named(talker, px4, network):
-    answering(talker, "1.14")
+def test_firmware_of_other_release_is_refused(talker, px4, network):
+    answer_format_requests(talker, "1.14")
     fault = px4.format_fault()
     assert "/fmu/in/vehicle_command: px4_msgs/msg/VehicleCommand is that of px4_msgs 1.14 (before 1.15)" in fault
     assert "in the firmware, and of px4_msgs 1.15 or later here" in fault
     assert Px4Link(network.node(), address_of("px4-1.14")).format_fault() == ""
 
 
-def test_an_input_that_the_firmware_lacks_is_named(talker, px4):
-    answering(talker, known=False)
+def test_missing_input_of_firmware_is_refused(talker, px4):
+    answer_format_requests(talker, known=False)
     assert px4.format_fault().startswith("PX4 has no input /fmu/in/vehicle_rates_setpoint")
 
 
-def test_a_firmware_that_does_not_answer_is_noted(px4, monkeypatch):
+def test_firmware_without_answer_is_noted(px4, monkeypatch):
     monkeypatch.setattr("retrim.plants.bridges.ros2_px4_link.ANSWER_S", 0.1)
     assert px4.format_fault() == ""
     assert "PX4 does not tell the formats of its inputs" in px4.notes[0]
@@ -292,7 +292,7 @@ def test_a_firmware_that_does_not_answer_is_noted(px4, monkeypatch):
 
 @pytest.fixture
 def connects(monkeypatch, network):
-    """Make the plant's node one of the network, and its patience short."""
+    """Let the plant use a node of the fake network, with short time-outs."""
     monkeypatch.setattr(ros2, "open_node", lambda *_: network.node())
     monkeypatch.setattr(ros2, "WAIT_S", 0.4)
     monkeypatch.setattr(ros2, "LISTENER_S", 0.4)
@@ -311,8 +311,8 @@ def connects(monkeypatch, network):
 
 
 @pytest.fixture
-def speaking(talker):
-    """Something that is done at 100 Hz, or less often."""
+def periodic(talker):
+    """Return a context that repeats a call at 100 Hz or less."""
     over = threading.Event()
 
     def begin(say, rate=100.0):
@@ -329,63 +329,63 @@ def speaking(talker):
     time.sleep(0.05)
 
 
-def listening(talker, release="newest"):
+def subscribe_to_setpoints(talker, release="newest"):
     for topic, name in TOPICS.items():
         talker.hears(f"/fmu/in/{topic}", f"px4_msgs/msg/{name}", release=release)
 
 
-def test_a_vehicle_that_is_there_is_connected(connects, speaking, talker):
-    listening(talker)
-    answering(talker)
-    speaking(vehicle)
+def test_available_vehicle_is_connected(connects, periodic, talker):
+    subscribe_to_setpoints(talker)
+    answer_format_requests(talker)
+    periodic(vehicle)
     assert connects("px4").notes == ()
 
 
-def test_nobody_there_is_named(connects):
+def test_missing_vehicle_is_reported(connects):
     with pytest.raises(PlantError, match=r"no state came on /mavros/local_position/odom or /mavros/.*pose in 0\.4 s"):
         connects("mavros")
 
 
-def test_states_of_another_release_are_named(connects, speaking):
+def test_states_of_other_release_are_refused(connects, periodic):
     def old(talker, t):
         talker.says(STATE, "px4_msgs/msg/VehicleOdometry", release="1.13")
 
-    speaking(old)
+    periodic(old)
     with pytest.raises(PlantError, match=r"px4_msgs 1\.13 \(before 1\.14\); this end has px4_msgs 1\.14 or"):
         connects("px4")
 
 
-def test_a_listener_of_another_release_is_named(connects, speaking, talker):
-    listening(talker, "1.14")
-    speaking(vehicle)
+def test_subscriber_of_other_release_is_refused(connects, periodic, talker):
+    subscribe_to_setpoints(talker, "1.14")
+    periodic(vehicle)
     with pytest.raises(PlantError, match=r"VehicleCommand is that of px4_msgs 1\.14 .* use the same px4_msgs"):
         connects("px4")
 
 
-def test_a_firmware_of_another_release_is_named(connects, speaking, talker):
-    listening(talker)
-    answering(talker, "1.14")
-    speaking(vehicle)
+def test_connection_to_firmware_of_other_release_is_refused(connects, periodic, talker):
+    subscribe_to_setpoints(talker)
+    answer_format_requests(talker, "1.14")
+    periodic(vehicle)
     with pytest.raises(PlantError, match=r"in the firmware, .* name the firmware's release, as in ros2:px4-1\.14"):
         connects("px4")
 
 
-def test_setpoints_without_a_listener_are_named(connects, speaking):
-    speaking(vehicle)
+def test_setpoints_without_subscriber_are_refused(connects, periodic):
+    periodic(vehicle)
     with pytest.raises(PlantError, match="no node listens to /fmu/in/vehicle_rates_setpoint, /fmu/in/offboard"):
         connects("px4")
 
 
-def test_states_that_are_rare_are_named(connects, speaking, talker):
-    listening(talker)
-    speaking(vehicle, rate=5.0)
+def test_rare_states_are_refused(connects, periodic, talker):
+    subscribe_to_setpoints(talker)
+    periodic(vehicle, rate=5.0)
     with pytest.raises(PlantError, match=r"states come at \d Hz; at least 15 Hz are needed on /fmu/out"):
         connects("px4")
 
 
-def test_two_nodes_that_tell_a_state_are_named(connects, speaking, talker, network):
-    listening(talker)
-    speaking(vehicle)
+def test_two_publishers_of_state_are_refused(connects, periodic, talker, network):
+    subscribe_to_setpoints(talker)
+    periodic(vehicle)
     network.node().advertise(STATE, message_type("px4_msgs/msg/VehicleOdometry"), SENSOR)
     with pytest.raises(PlantError, match="several nodes publish /fmu/out/vehicle_odometry"):
         connects("px4")
@@ -414,7 +414,7 @@ def test_addresses(text, address):
     "px5", "mavros-1.14", "px4-1.13", "px4-9", "rclpy@10.0.0.7:7447:px4", "mavros/", "px4,imu=/x", "px4,pose=x",
     "/a//b", "px4-1.14,odometry=/a b", "dds:px4", "ros2:px4",
 ])  # fmt: skip
-def test_a_wrong_address_is_named_before_it_flies(text):
+def test_wrong_address_is_refused_before_flight(text):
     with pytest.raises(ConfigError, match=r"address '.*': (expected ros2:|a release follows px4)|absolute name"):
         Scenario(plant=f"ros2:{text}")
 
@@ -423,7 +423,7 @@ def test_a_wrong_address_is_named_before_it_flies(text):
 
 
 @pytest.mark.parametrize("reports", [False, True])
-def test_thrust_is_scaled_by_the_autopilot_s_or_else_by_the_vehicle_file(network, talker, reports):
+def test_thrust_scale_is_from_autopilot_or_vehicle_file(network, talker, reports):
     vehicle = Scenario(plant="simple").make_vehicle("small")
     strongest = float(vehicle.thrust_max / vehicle.mass)
     plant = Scenario(plant="ros2:px4").make("small")

@@ -1,4 +1,4 @@
-"""The plant of second order: a vehicle whose command path is known as numbers."""
+"""The plant of second order: a vehicle with a known command path."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def plant(response=SLOW, disturbance=CALM, **options):
 
 
 def second_order(times, lag, zeta):
-    """The textbook's step response."""
+    """Return the step response of a second-order system."""
     omega_n, root = 2.0 * zeta / lag, np.sqrt(complex(1.0 - zeta**2))
     swing = np.cos(omega_n * root * times) + zeta / root * np.sin(omega_n * root * times)
     return np.where(times > 0.0, 1.0 - np.real(np.exp(-zeta * omega_n * times) * swing), 0.0)
@@ -50,8 +50,8 @@ def second_order(times, lag, zeta):
 
 @pytest.mark.parametrize("delay", [0.0, 0.0125, 0.02, 0.0374, 0.1])
 @pytest.mark.parametrize("zeta", [0.4, 0.7, 1.2])
-def test_measured_rates_are_the_analytical_step_response(delay, zeta):
-    """Exact where the command changes at a millisecond; within the mean of one elsewhere."""
+def test_measured_rates_equal_analytical_step_response(delay, zeta):
+    """Rates are exact if the command changes at a millisecond, and otherwise within the mean of one millisecond."""
     flying = plant(ActuatorResponse.of(0.03, 0.1, inverse_damping=1.0 / zeta), delay_s=delay)
     flying.reset(START)
     u = Command(jnp.array(9.81), jnp.array([1.0, -0.5, 0.3]))
@@ -61,8 +61,8 @@ def test_measured_rates_are_the_analytical_step_response(delay, zeta):
     np.testing.assert_allclose(rates, rise[:, None] * np.asarray(u.omega), atol=1e-10 if whole else 1e-4)
 
 
-def by_hand(response, us, delay, push, h=2e-4, gravity=9.81):
-    """The same vehicle in NumPy, in steps so short that their kind hardly matters."""
+def numpy_flight(response, us, delay, push, h=2e-4, gravity=9.81):
+    """Simulate the same vehicle in NumPy, with steps so short that the integration rule hardly matters."""
     p, R, v, c, w, dw = np.array(START.p), np.eye(3), np.zeros(3), gravity, np.zeros(3), np.zeros(3)
     tau, kappa = np.asarray(response.rate_lag), np.asarray(response.inverse_damping)
     sigma, states = (0.5 * tau * kappa) ** 2, []
@@ -85,13 +85,13 @@ def by_hand(response, us, delay, push, h=2e-4, gravity=9.81):
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.034])
-def test_a_flight_equals_one_by_hand(delay):
+def test_flight_equals_numpy_simulation(delay):
     draw, push = np.random.default_rng(1), np.array([0.5, -0.3, 0.2])
     us = np.array([9.81, 0.0, 0.0, 0.0]) + draw.normal(size=(40, 4)) * np.array([2.0, 1.5, 1.5, 1.0])
     flying = plant(disturbance=Constant(jnp.array(push)), delay_s=delay)
     flying.reset(START)
     result = [flying.step(Command(jnp.array(u[0]), jnp.array(u[1:])))[0].x.vector() for u in us]
-    np.testing.assert_allclose(result, by_hand(SLOW, us, delay, push), atol=2e-3)
+    np.testing.assert_allclose(result, numpy_flight(SLOW, us, delay, push), atol=2e-3)
 
 
 def test_acceleration_is_measured_and_rotors_are_not():
@@ -100,7 +100,7 @@ def test_acceleration_is_measured_and_rotors_are_not():
     rows = [flying.step(Command.hover())[0] for _ in range(300)]
     assert rows[0].motor_speeds is None
     rates = np.stack([m.omega for m in rows])
-    np.testing.assert_allclose(rates.std(axis=0), 0.05, rtol=0.15)  # it does not turn
+    np.testing.assert_allclose(rates.std(axis=0), 0.05, rtol=0.15)  # no rotation
     assert np.stack([m.a for m in rows])[:, :2].std() == pytest.approx(0.4, rel=0.15)
 
 
@@ -120,7 +120,7 @@ def test_loads_weak_rotors_and_wind_act():
 
 
 def fly(simulation, us):
-    """Rates and states of a flight, as a pure function."""
+    """Return rates and states of a flight, as a pure function."""
 
     def tick(s, row):
         k, u = row
@@ -143,7 +143,7 @@ def simulations():
         yield plant(response, delay_s=delay).simulation
 
 
-def test_a_batch_of_vehicles_equals_its_members():
+def test_batch_of_vehicles_equals_members():
     us = draw()
     together = eqx.filter_jit(lambda many: eqx.filter_vmap(lambda each: fly(each, us))(many))
     result = together(stack(list(simulations())))
@@ -153,8 +153,8 @@ def test_a_batch_of_vehicles_equals_its_members():
             np.testing.assert_allclose(a[i], b, rtol=1e-10, atol=1e-12)
 
 
-def test_another_vehicle_is_never_another_program():
-    """Through the plant itself, which compiles its launch and its tick once."""
+def test_new_vehicle_needs_no_compilation():
+    """The plant compiles its launch and its tick once."""
     traces = []
 
     def calm(t, x):
@@ -172,8 +172,8 @@ def test_another_vehicle_is_never_another_program():
     assert len(traces) == once > 0
 
 
-def test_gradients_against_finite_differences():
-    """Of the last state, in commands, start, delay and response."""
+def test_gradients_equal_finite_differences():
+    """The function is the last state; gradients are with respect to commands, start, delay and response."""
     us = draw(8)
     arguments, simulation = (jnp.array(0.033), SLOW, us), plant().simulation
 
@@ -199,11 +199,11 @@ def test_gradients_against_finite_differences():
 # ---- by name
 
 
-def test_it_conforms():
+def test_conformance():
     testing.check_plant(lambda: Scenario(plant="second-order").make())
 
 
-def test_a_vehicle_file_gives_lag_and_damping():
+def test_vehicle_file_sets_lag_and_damping():
     body = ("made_up", 1.0, (0.02, 0.02, 0.03), (0.2, 0.2), 20.0, (4.0, 4.0, 3.0), 0.05)
     spec = VehicleSpec(*body, rate_lag=(0.07, 0.08, 0.4), rate_damping=(0.5, 0.5, 1.0))
     simulation = Scenario(plant="second-order", delay=0.0374, thrust_error=0.1).make(spec).simulation

@@ -1,4 +1,4 @@
-"""What a vehicle sees of itself: noise as stated, late by the latency, held where samples are lost, and repeatable."""
+"""Sensors: stated noise and latency, repeated samples after losses, and reproducible noise."""
 
 import jax
 import jax.numpy as jnp
@@ -27,24 +27,24 @@ def stack(states):
     return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
 
 
-def same(a, b):
+def assert_equal(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-def test_ideal_sensing_is_the_truth():
-    """With and without sensors; and what the sensors do never moves the vehicle."""
+def test_ideal_sensors_return_true_state():
+    """The motion is equal with and without sensors."""
     plain, ideal, rough = (
         samples(plant(sensors))
         for sensors in (None, SensorModel.of(), SensorModel.of(position=0.1, dropout=0.5, latency=20))
     )
     for a, b, c in zip(plain[1:], ideal[1:], rough[1:], strict=True):
-        same(a.x, a.truth)
-        same(b.x, a.truth)
-        same(b.truth, a.truth)
-        same(c.truth, a.truth)
+        assert_equal(a.x, a.truth)
+        assert_equal(b.x, a.truth)
+        assert_equal(b.truth, a.truth)
+        assert_equal(c.truth, a.truth)
 
 
-def test_noise_has_the_stated_deviation(key):
+def test_noise_has_stated_deviation(key):
     sensors, x, n = SensorModel.of(position=0.01, velocity=0.2, attitude=0.03), random_state(key), 20_000
 
     @jax.jit
@@ -62,34 +62,34 @@ def test_noise_has_the_stated_deviation(key):
     np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-12)
 
 
-def test_samples_of_a_flight_are_noisy():
-    """Through the plant: fresh noise every tick."""
+def test_samples_of_flight_have_new_noise_every_tick():
+    """The samples pass through the plant."""
     flight = samples(plant(SensorModel.of(position=0.01)), ticks=400, u=Command.hover())[1:]
     error = np.stack([s.x.p - s.truth.p for s in flight])
     np.testing.assert_allclose(error.std(axis=0), 0.01, rtol=0.15)
     assert np.abs(np.corrcoef(error[1:, 0], error[:-1, 0])[0, 1]) < 0.2
-    same(flight[0].x.v, flight[0].truth.v)
+    assert_equal(flight[0].x.v, flight[0].truth.v)
 
 
-def test_latency():
-    """A sample shows the vehicle as it was 20 ms ago; before the first arrives, the start."""
+def test_sample_shows_state_before_latency():
+    """A sample shows the state 20 ms earlier, and the start before the first sample arrives."""
     flight = samples(plant(SensorModel.of(latency=20)))
-    same(flight[1].x, START)
+    assert_equal(flight[1].x, START)
     for late, then in zip(flight[2:], flight[1:-1], strict=True):
-        same(late.x, then.truth)
+        assert_equal(late.x, then.truth)
     assert not np.array_equal(flight[-1].x.p, flight[-1].truth.p)
 
 
 def test_latency_between_ticks():
-    """Samples are 10 ms apart: of those 5 ms late, the newest that has arrived is half a tick of 20 ms old."""
+    """With samples every 10 ms and a latency of 5 ms, the newest available sample is half of a 20 ms tick old."""
     fine, coarse = samples(plant(dt=0.01), ticks=20), samples(plant(SensorModel.of(latency=5)), ticks=10)
     for i in range(1, 11):
         np.testing.assert_allclose(coarse[i].x.vector(), fine[2 * i - 1].x.vector(), atol=1e-12)
 
 
 @pytest.mark.parametrize("latency", [0, 5, 10, 15, 20, 33])
-def test_a_sample_is_as_old_as_it_says(latency):
-    """Also where the latency is no whole number of periods: at the end of a tick the sample is older than it."""
+def test_sample_has_stated_age(latency):
+    """If the latency is not a multiple of the period, the sample at the end of a tick is older than the latency."""
     fine, late = samples(plant(dt=0.001), ticks=200), samples(plant(SensorModel.of(latency=latency)), ticks=10)
     for m in late[3:]:
         assert m.age >= 1e-3 * latency
@@ -97,33 +97,33 @@ def test_a_sample_is_as_old_as_it_says(latency):
         np.testing.assert_allclose(m.x.vector(), then.truth.vector(), atol=1e-12)
 
 
-def test_dropout_holds_the_last_sample():
+def test_dropout_holds_last_sample():
     flight = samples(plant(SensorModel.of(dropout=0.5), seed=3), ticks=400)
     observation = np.stack([s.x.vector() for s in flight[1:]])
     hold = np.mean((observation[1:] == observation[:-1]).all(axis=1))
-    assert hold == pytest.approx(0.25, abs=0.08)  # both samples of a tick lost
+    assert hold == pytest.approx(0.25, abs=0.08)  # both samples of a tick are lost
     fresh = np.mean((observation == np.stack([s.truth.vector() for s in flight[1:]])).all(axis=1))
     assert fresh == pytest.approx(0.5, abs=0.1)
 
 
-def test_held_sample_and_its_noise_do_not_change(key):
-    """Nothing is drawn anew while samples are lost."""
+def test_held_sample_keeps_its_noise(key):
+    """No new noise is drawn while samples are lost."""
     sensors = SensorModel.of(position=0.1, dropout=0.999999)
     first = sensors.noisy(START, key)
     queue = jax.tree.map(lambda leaf: leaf[None], first)
     moving = stack([START, random_state(key), random_state(key, 2.0)])
-    same(sensors.received(queue, jax.tree.map(jnp.asarray, moving), key), queue)
+    assert_equal(sensors.received(queue, jax.tree.map(jnp.asarray, moving), key), queue)
 
 
-def test_a_seed_repeats_bit_for_bit():
+def test_seed_repeats_bit_for_bit():
     rough = SensorModel.of(position=0.01, velocity=0.1, attitude=0.01, dropout=0.2, latency=20)
     one = plant(rough, seed=1)
     first, again = samples(one), samples(one)
     other, different = samples(plant(rough, seed=1)), samples(plant(rough, seed=2))
     for a, b, c, d in zip(first[1:], again[1:], other[1:], different[1:], strict=True):
-        same(a.x, b.x)
-        same(a.x, c.x)
-        same(a.truth, d.truth)
+        assert_equal(a.x, b.x)
+        assert_equal(a.x, c.x)
+        assert_equal(a.truth, d.truth)
     assert not np.array_equal(first[-1].x.p, different[-1].x.p)
 
 
@@ -131,12 +131,12 @@ def test_a_seed_repeats_bit_for_bit():
     ("field", "value"),
     [("position", -1e-3), ("velocity", -1.0), ("attitude", float("nan")), ("dropout", 1.0), ("dropout", -0.1)],
 )
-def test_impossible_sensors(field, value):
+def test_invalid_sensors_are_refused(field, value):
     with pytest.raises(ValueError, match=rf"SensorModel\.{field} = {value}"):
         SensorModel.of(**{field: value})
 
 
-def test_impossible_times():
+def test_invalid_times_are_refused():
     with pytest.raises(ValueError, match="latency = -1 ms"):
         SensorModel.of(latency=-1)
     zero = jnp.array(0.0)
@@ -146,7 +146,7 @@ def test_impossible_times():
         plant(SensorModel.of(), dt=0.025)
 
 
-def test_log_keeps_what_was_true_and_what_was_measured():
+def test_log_has_true_and_measured_states():
     observation = []
     rough = SensorModel.of(position=0.05, latency=20)
     pilot = FunctionPilot(lambda measurement: observation.append(measurement) or TURN)
@@ -155,5 +155,5 @@ def test_log_keeps_what_was_true_and_what_was_measured():
     np.testing.assert_array_equal(log.p, np.stack([s.x.p for s in truth]))
     np.testing.assert_array_equal(log.R, np.stack([s.x.R for s in truth]))
     np.testing.assert_array_equal(log.measured.p[:-1], np.stack([s.x.p for s in observation]))
-    assert not np.array_equal(observation[-1].x.p, log.p[-2])  # the pilot sees what the sensors show
-    same(observation[-1].true_state.p, log.p[-2])
+    assert not np.array_equal(observation[-1].x.p, log.p[-2])  # the pilot receives the output of the sensors
+    assert_equal(observation[-1].true_state.p, log.p[-2])

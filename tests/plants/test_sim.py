@@ -1,4 +1,4 @@
-"""The simulated plant: command delay, disturbances, and what it measures beside the state."""
+"""The simulated plant: command delay, disturbances, and measurements in addition to the state."""
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ def fly_once(delay_s, ticks=40):
     return [plant.step(Command(jnp.array(9.81), jnp.array([1.0, 0.0, 0.0])))[0].x.R for _ in range(ticks)]
 
 
-def test_delay_shifts_the_response():
+def test_delay_shifts_response():
     now, late, later = fly_once(0.0), fly_once(0.02), fly_once(0.04)
     np.testing.assert_allclose(late[1:], now[:-1], atol=1e-12)
     np.testing.assert_allclose(later[2:], now[:-2], atol=1e-12)
@@ -37,15 +37,15 @@ def test_delay_shifts_the_response():
 
 
 @pytest.mark.parametrize("delay_s", [-0.01, float("nan"), float("inf")])
-def test_impossible_delays(delay_s):
+def test_invalid_delays_are_refused(delay_s):
     with pytest.raises(ValueError, match="finite, non-negative number of seconds"):
         simulate(delay_s=delay_s)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.001, 0.02, 0.0213, 0.035, 0.0996, 0.2, 0.25])
 @pytest.mark.parametrize("dt", [0.002, 0.02])
-def test_a_delay_is_exact_in_each_millisecond(dt, delay_s):
-    """The commands that the model is given are those of a clock that counts in microseconds."""
+def test_delay_is_exact_in_each_millisecond(dt, delay_s):
+    """The commands in the model equal those of a clock that counts microseconds."""
     plant = SimPlant(CheapModel(dt), CALM, delay_s=delay_s)
     ticks, per_tick = round(0.3 / dt), round(1e3 * dt)
     commands = 9.81 + np.arange(1.0, ticks + 1)
@@ -59,7 +59,7 @@ def test_a_delay_is_exact_in_each_millisecond(dt, delay_s):
     np.testing.assert_allclose(np.concatenate(result), acting.reshape(-1, 1000).mean(axis=1), rtol=1e-9)
 
 
-def test_another_delay_is_never_another_program():
+def test_new_delay_needs_no_compilation():
     traces = []
 
     def calm(t, x):
@@ -85,7 +85,7 @@ def test_disturbance_accelerates():
     assert float(measurement.x.v[0]) == pytest.approx(0.05, rel=0.05)
 
 
-def test_any_function_of_time_and_state_is_a_disturbance():
+def test_function_of_time_and_state_is_a_disturbance():
     plant = SimPlant(
         LinearDragQuadrotor.of(small(), 0.02), Push(lambda t, x: -10.0 * x.v + jnp.where(t < 0.1, 1.0, 0.0))
     )
@@ -95,12 +95,12 @@ def test_any_function_of_time_and_state_is_a_disturbance():
     assert np.isfinite(measurement.x.vector()).all()
 
 
-# ---- what it measures
+# ---- measurements
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_rates_acceleration_and_rotor_speeds_are_the_models(name):
-    """Rates turn the attitude, the acceleration moves the velocity, and the rotors carry the weight at hover."""
+def test_rates_acceleration_and_rotor_speeds_are_consistent(name):
+    """Rates rotate the attitude, the acceleration changes the velocity, and the rotors balance the weight at hover."""
     plant = simulate(name)
     first = plant.reset(START)
     np.testing.assert_array_equal(first.omega, 0.0)
@@ -119,8 +119,8 @@ def test_rates_acceleration_and_rotor_speeds_are_the_models(name):
     assert bool(jnp.all(measurement.motor_speeds > first.motor_speeds))
 
 
-def test_rotor_speeds_give_the_thrust():
-    """Of the simple model: 4 c_T Omega^2 (1 + thrust error) = m c, once the motors have settled."""
+def test_rotor_speeds_give_thrust():
+    """For the simple model, 4 c_T Omega^2 (1 + thrust error) = m c after the motors have settled."""
     vehicle, plant = small(), simulate()
     plant.reset(START)
     for _ in range(25):
@@ -129,7 +129,7 @@ def test_rotor_speeds_give_the_thrust():
     assert thrust == pytest.approx(11.0 * float(vehicle.mass), rel=1e-3)
 
 
-def test_the_first_sample_is_as_noisy_as_the_others():
+def test_first_sample_has_same_noise_as_others():
     sensors = SensorModel.of(position=0.01, gyro=0.1, accelerometer=0.5)
     firsts = [simulate(sensors=sensors, seed=seed).reset(START) for seed in range(60)]
     errors = np.stack([m.x.p for m in firsts]) - np.asarray(START.p)
@@ -140,8 +140,8 @@ def test_the_first_sample_is_as_noisy_as_the_others():
     np.testing.assert_allclose(np.stack([m.a for m in firsts]).std(), 0.5, rtol=0.25)
 
 
-def test_inertial_noise_has_the_stated_deviation():
-    """Around the true rates and accelerations, fresh every tick, and never in the state or the motion."""
+def test_inertial_noise_has_stated_deviation():
+    """The noise is new at every tick, and does not affect the state or the motion."""
     sensors = SensorModel.of(gyro=0.05, accelerometer=0.4)
     noisy, exact = simulate(sensors=sensors), simulate()
     pairs = [(noisy.reset(START), exact.reset(START))]
@@ -156,14 +156,14 @@ def test_inertial_noise_has_the_stated_deviation():
 
 
 @pytest.mark.parametrize(("name", "age"), [("mocap", 0.0), ("rough", 0.01)])
-def test_a_measurement_tells_its_age(name, age):
+def test_measurement_has_its_age(name, age):
     plant = simulate(sensors=SENSORS.find(name)())
     assert plant.reset(START).age == age
     assert plant.step(WILD)[0].age == age
 
 
-def test_the_clock_of_a_long_flight_is_its_ticks_in_single_precision():
-    """Ticks, not a sum of them: that drifts by milliseconds in a minute, and a tracking error with it."""
+def test_clock_of_long_flight_is_exact_in_single_precision():
+    """A sum of ticks would drift by milliseconds in a minute, and so would the tracking error."""
     model = CheapModel(0.02)
     specific_force = Push(lambda t, x: t * jnp.ones(3, jnp.float32))
     simulation = SimPlant(model, specific_force, delay_s=0.0).simulation

@@ -19,7 +19,8 @@ from retrim.physics.command_path import CommandQueue
 from retrim.plants.bridges.vehicle_state import LONGEST_S, ExtraAcceleration, VehicleState
 
 ages = st.floats(0.0, LONGEST_S)
-LEANING, THRUST, SPIN = (0.3, -0.2, 1.0), 12.0, (0.0, 0.0, 1.5)  # about its thrust axis, so that the motion is known
+# about its thrust axis, so that the motion has a closed form
+LEANING, THRUST, SPIN = (0.3, -0.2, 1.0), 12.0, (0.0, 0.0, 1.5)
 
 
 def state(age, omega=(0.0, 0.0, 0.0), rotation=(0.3, -0.2, 1.0), v=(1.0, -2.0, 0.5)):
@@ -27,21 +28,21 @@ def state(age, omega=(0.0, 0.0, 0.0), rotation=(0.3, -0.2, 1.0), v=(1.0, -2.0, 0
     return VehicleState(np.array([0.1, 0.2, 1.5]), R, np.array(v), np.array(omega), age)
 
 
-def test_what_is_new_stays_as_it_is():
+def test_recent_state_is_unchanged():
     x = state(0.0, omega=(1.0, 2.0, 3.0))
     for result, message in zip(x.extrapolate(12.0)[:4], x[:4], strict=True):
         np.testing.assert_allclose(result, message, atol=1e-12)
 
 
 @given(ages, st.lists(st.floats(-8.0, 8.0), min_size=3, max_size=3))
-def test_it_turns_by_its_body_rates(age, omega):
+def test_attitude_follows_body_rates(age, omega):
     x = state(age, omega)
     R = x.extrapolate(9.81).R
     np.testing.assert_allclose(R, x.R @ Rotation.from_rotvec(age * np.array(omega)).as_matrix(), atol=1e-9)
 
 
 @given(ages)
-def test_it_falls_without_thrust_and_hovers_with_it(age):
+def test_vehicle_falls_without_thrust_and_hovers_with_it(age):
     x = state(age, rotation=(0.0, 0.0, 0.4))
     fall_state, hover_state = x.extrapolate(0.0), x.extrapolate(9.81)
     np.testing.assert_allclose(hover_state.p, x.p + age * x.v, atol=1e-9)
@@ -50,7 +51,7 @@ def test_it_falls_without_thrust_and_hovers_with_it(age):
     np.testing.assert_allclose(hover_state.v - fall_state.v, [0.0, 0.0, 9.81 * age], atol=1e-9)
 
 
-def test_what_a_steady_wind_adds_is_found_and_carried_on():
+def test_steady_wind_is_estimated_and_extrapolated():
     wind, estimate, rng = np.array([1.5, -1.0, 0.5]), ExtraAcceleration(), np.random.default_rng(0)
     c, x, now = 12.0, state(0.015, rotation=(0.1, 0.2, 0.0)), 50.0
     nominal = c * x.R[:, 2] - np.array([0.0, 0.0, 9.81])
@@ -60,13 +61,13 @@ def test_what_a_steady_wind_adds_is_found_and_carried_on():
         v = (now - age) * (nominal + wind) + rng.normal(0.0, 2e-3, 3)
         x = x._replace(v=v, age=age)
         estimate.record(x, c, now)
-        estimate.record(x, c, now + 1e-4)  # the same state once more
+        estimate.record(x, c, now + 1e-4)  # the same state again
     np.testing.assert_allclose(estimate.value, wind, atol=0.15)
     expected = x.v + x.age * (nominal + wind)
     np.testing.assert_allclose(x.extrapolate(c, estimate.value).v, expected, atol=0.15 * x.age + 1e-9)
 
 
-def test_a_gap_in_the_states_and_a_jump_of_velocity_do_little_harm():
+def test_gap_and_velocity_jump_have_little_effect():
     estimate, x = ExtraAcceleration(), state(0.0, rotation=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0))
     for now in (0.0, 0.02, 0.04, 5.0):  # 5 s without a state
         estimate.record(x._replace(v=np.full(3, float(now > 1.0))), 9.81, now)
@@ -75,7 +76,7 @@ def test_a_gap_in_the_states_and_a_jump_of_velocity_do_little_harm():
     assert np.abs(estimate.value).max() <= 10.0
 
 
-def test_no_age_is_left_the_news_keep_theirs_and_a_truth_is_carried_on_by_its_own():
+def test_extrapolated_state_has_age_zero_and_message_keeps_its_age():
     x = state(0.02)._replace(truth=state(0.01))
     result = x.extrapolate(9.81)
     assert (result.age, result.truth.age) == (0.0, 0.0)
@@ -83,7 +84,7 @@ def test_no_age_is_left_the_news_keep_theirs_and_a_truth_is_carried_on_by_its_ow
     assert np.linalg.norm(result.p - result.truth.p) == pytest.approx(0.01 * np.linalg.norm(x.v), rel=0.1)
 
 
-def test_what_is_old_is_not_carried_on_for_long():
+def test_extrapolation_is_limited():
     old, older = state(LONGEST_S).extrapolate(9.81), state(5.0).extrapolate(9.81)
     np.testing.assert_allclose(older.p, old.p)
     assert (old.age, older.age) == (0.0, 5.0 - LONGEST_S)
@@ -93,7 +94,7 @@ def test_what_is_old_is_not_carried_on_for_long():
 # ---- a controller behind a link
 
 
-class Spinning(PointVehicle):
+class SpinningVehicle(PointVehicle):
     """A vehicle that spins about its thrust axis at constant thrust; its messages are ``late`` seconds old."""
 
     def __init__(self, late):
@@ -113,7 +114,7 @@ class Spinning(PointVehicle):
 
 
 def at(t):
-    """The vehicle a while after ``state(0.0)``, in closed form."""
+    """Return the vehicle a while after ``state(0.0)``, in closed form."""
     x = state(0.0, SPIN, LEANING)
     a = THRUST * x.R[:, 2] - np.array([0.0, 0.0, 9.81])
     R = x.R @ Rotation.from_rotvec(t * np.array(SPIN)).as_matrix()
@@ -121,38 +122,38 @@ def at(t):
 
 
 def use(x, age):
-    """The state that a predicting controller uses as the present one."""
+    """Return the state that a predicting controller uses as the present state."""
     acting = Command(jnp.array(THRUST), jnp.array(SPIN))
     prediction = Prediction.of(CommandPath.of(), 0.02).with_age(age)
     queue = CommandQueue.of(acting, 0.02, longest=0.0)
     return prediction(Underway(ActuatorState.at(acting), queue), x, jnp.zeros(3))[0]
 
 
-def agrees(result, true):
+def assert_agrees(result, true):
     for one, other in zip((result.p, result.R, result.v), true[:3], strict=True):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.005, 0.02, LONGEST_S, 0.08, 0.3])
-def test_a_controller_that_looks_ahead_works_with_the_present_state(late):
-    """Link and controller together compensate the age of a message once."""
-    plant = Spinning(late)
+def test_predicting_controller_uses_present_state(late):
+    """Link and controller together compensate for the age of a message once."""
+    plant = SpinningVehicle(late)
     plant.reset(None)
     measurement, _ = plant.step(Command(jnp.array(THRUST), jnp.array(SPIN)))
-    agrees(use(measurement.x, measurement.age), at(0.0))
+    assert_agrees(use(measurement.x, measurement.age), at(0.0))
 
 
 @pytest.mark.parametrize("late", [0.0, 0.02, 0.08, 0.099])
-def test_so_does_one_in_a_live_flight(late):
-    plant = Spinning(late)
+def test_predicting_controller_in_live_flight_uses_present_state(late):
+    plant = SpinningVehicle(late)
     plant.send(np.array([THRUST, *SPIN]))
     sample = _sample(3, 0.02, plant.now(), np.zeros(4))
     p, R, v = np.split(jnp.asarray(sample.state), [3, 12])
-    agrees(use(State(p, R.reshape(3, 3), v), sample.age), at(0.0))
+    assert_agrees(use(State(p, R.reshape(3, 3), v), sample.age), at(0.0))
     assert sample.age <= Limits.state_age
 
 
 @pytest.mark.parametrize("late", [0.101, 0.12, 1.0])
-def test_the_guard_is_told_how_old_the_news_are(late):
-    """The age of the message decides, not the age that remains after the extrapolation."""
-    assert _sample(3, 0.02, Spinning(late).now(), np.zeros(4)).age == pytest.approx(late)
+def test_guard_receives_age_of_message(late):
+    """The age of the message is relevant, not the remaining age after the extrapolation."""
+    assert _sample(3, 0.02, SpinningVehicle(late).now(), np.zeros(4)).age == pytest.approx(late)

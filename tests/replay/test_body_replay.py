@@ -1,4 +1,4 @@
-"""Values from a board's own log: within a tenth of the truth, or the report gives the reason for their absence."""
+"""Values from a board's own log are within a tenth of the truth, or the report gives the reason for their absence."""
 
 import json
 import tomllib
@@ -35,13 +35,13 @@ def few_draws(monkeypatch):
     monkeypatch.setattr(body_identification, "DRAWS", 8)
 
 
-def thinned(flight, every):
+def thin(flight, every):
     return BodyFlight(*(getattr(flight, name)[::every] for name in ("t", "command", "rates", "motors", "force")))
 
 
 def log_of(flight, every=4, **changes):
-    """The log of a board, without a file."""
-    f = thinned(flight, every)
+    """Return the log of a board, without a file."""
+    f = thin(flight, every)
     columns = {
         "t": f.t, "motors": f.motors, "rates": f.rates, "command": f.command, "specific_force": f.force,
         "valid": np.ones(len(f.t), dtype=bool), "dt": DT * every, "curve": None, "filter_lag": 0.0, "notes": (),
@@ -49,8 +49,8 @@ def log_of(flight, every=4, **changes):
     return BodyLog(**columns)
 
 
-def agrees(result, truth, *, forces=True):
-    """Every value is within a tenth of the truth, or within 2 ms or 0.1 where a tenth is less."""
+def assert_agrees(result, truth, *, forces=True):
+    """Assert that every value is within a tenth of the truth, or within 2 ms or 0.1 if a tenth is less."""
     found = result.vehicle
     assert found.delay.value == pytest.approx(truth.delay, rel=TENTH, abs=2e-3)
     assert found.rate_lag.value == pytest.approx(truth.lag, rel=TENTH)
@@ -67,23 +67,23 @@ def agrees(result, truth, *, forces=True):
 
 
 @pytest.mark.parametrize("name", TRUTHS)
-def test_what_was_put_into_a_blackbox_is_found_in_it(name, tmp_path):
-    """By the whole way: bytes of a log, frames, units, regression."""
+def test_identification_recovers_blackbox_parameters(name, tmp_path):
+    """The test covers all steps: bytes of a log, frames, units and regression."""
     truth = TRUTHS[name]
-    (tmp_path / "flight.bbl").write_bytes(blackbox(thinned(fly_body(11.0, truth), 4)))
+    (tmp_path / "flight.bbl").write_bytes(blackbox(thin(fly_body(11.0, truth), 4)))
     result = identify_body(read_log(tmp_path / "flight.bbl"))
-    agrees(result, truth)
+    assert_agrees(result, truth)
     assert min(result.explained.values()) > 0.9
 
 
-def test_what_was_put_into_a_dataflash_log_is_found_in_it(tmp_path):
+def test_identification_recovers_dataflash_parameters(tmp_path):
     truth = Truth(curve=0.0)
-    data = dataflash(body_messages(thinned(fly_body(11.0, truth), 5)), without=("XKF1",))
+    data = dataflash(body_messages(thin(fly_body(11.0, truth), 5)), without=("XKF1",))
     (tmp_path / "flight.bin").write_bytes(data)
-    agrees(identify_body(read_log(tmp_path / "flight.bin")), truth)
+    assert_agrees(identify_body(read_log(tmp_path / "flight.bin")), truth)
 
 
-def test_the_filter_of_the_accelerometer_is_not_the_lag_of_the_thrust():
+def test_accelerometer_filter_is_separate_from_thrust_lag():
     truth, lag = Truth(), 0.02
     flight = fly_body(11.0, truth)
     filtered = respond(flight.force, DT, ResponsePath(0.0, lag, 1.0 / 3.0))
@@ -91,19 +91,19 @@ def test_the_filter_of_the_accelerometer_is_not_the_lag_of_the_thrust():
     longer = identify_body(log).vehicle
     through = identify_body(log_of(BodyFlight(flight.t, flight.command, flight.rates, flight.motors, filtered),
                                    filter_lag=lag))  # fmt: skip
-    agrees(through, truth)
+    assert_agrees(through, truth)
     assert longer.thrust_lag.value > truth.thrust_lag * 1.1
 
 
-def test_a_map_that_states_the_thrust_curve_is_believed():
+def test_stated_thrust_curve_is_used():
     truth = Truth(curve=0.6)
     result = identify_body(log_of(fly_body(11.0, truth), curve=0.6))
     assert result.curve is None or result.curve.value == 0.6
     assert result.hover.value == pytest.approx(truth.hover, rel=0.02)
 
 
-def test_what_does_not_move_is_not_known():
-    """At rest there is noise alone: the rate loop and the thrust map stay unknown."""
+def test_flight_at_rest_identifies_nothing():
+    """At rest there is only noise, and the rate loop and the thrust map remain unknown."""
     rng, flight = np.random.default_rng(0), fly_body(11.0)
     noise = 0.01 * rng.normal(size=flight.rates.shape)
     still = BodyFlight(
@@ -115,12 +115,12 @@ def test_what_does_not_move_is_not_known():
     assert not result.known
 
 
-def test_a_short_flight_is_refused():
+def test_short_flight_is_refused():
     with pytest.raises(LogError, match="identification needs 8 s at least"):
         identify_body(log_of(fly_body(5.0)))
 
 
-def test_a_response_is_that_of_the_estimator_in_flight():
+def test_response_equals_estimator_in_flight():
     age = np.linspace(-0.01, 0.5, 60)
     for ringing in (0.0, 0.2, 1.0 / 3.0, 0.5, 0.8):
         ours = mean_response(age, 0.004, ResponsePath(0.01, 0.03, ringing))
@@ -128,8 +128,8 @@ def test_a_response_is_that_of_the_estimator_in_flight():
         np.testing.assert_allclose(ours, theirs, atol=2e-3)
 
 
-def test_a_report_says_what_is_known_and_why_the_rest_is_not(tmp_path):
-    (tmp_path / "flight.bbl").write_bytes(blackbox(thinned(fly_body(11.0), 4)))
+def test_report_has_values_and_reasons_for_missing_ones(tmp_path):
+    (tmp_path / "flight.bbl").write_bytes(blackbox(thin(fly_body(11.0), 4)))
     run = Run("replay", tmp_path / "out")
     replay(tmp_path / "flight.bbl", Replay(identify=True), run, Silent())
     text = (tmp_path / "out" / "replay.md").read_text()
@@ -145,7 +145,7 @@ def test_a_report_says_what_is_known_and_why_the_rest_is_not(tmp_path):
     assert spec.command_delay == pytest.approx(Truth().delay, abs=2e-3)
 
 
-def test_a_log_without_an_accelerometer_and_one_without_commands_say_so():
+def test_missing_accelerometer_or_commands_are_reported():
     flight = fly_body(11.0)
     log = log_of(flight, specific_force=None)
     rows = dict(body_section(log, identify_body(log)).rows)
@@ -159,13 +159,13 @@ def test_a_log_without_an_accelerometer_and_one_without_commands_say_so():
     assert rows["motor command at hover"].startswith("0.3")
 
 
-def test_rates_that_are_not_those_commanded_are_named():
+def test_rates_unrelated_to_commands_are_reported():
     log = log_of(fly_body(11.0, Truth(gain=0.5)))
     about = body_section(log, identify_body(log)).about
     assert "**The roll and pitch rates are 0.50 times the commanded ones**" in about
 
 
-def test_no_policy_is_adapted_to_it_and_flights_are_numbered_from_one(tmp_path):
+def test_adaptation_is_refused_and_flights_are_numbered_from_one(tmp_path):
     log, setup = log_of(fly_body(2.0)), Setup.from_preset("hover/retrim")
     with pytest.raises(LogError, match="--adapt full: the log has no attitudes and velocities"):
         replay_body(log, tmp_path / "flight.bbl", setup, Run("replay", tmp_path), Silent(), identify=False, seed=0,

@@ -1,4 +1,4 @@
-"""A log that Betaflight's simulated board wrote: the values identified from it agree with its settings."""
+"""A log of Betaflight's simulated board: the identified values agree with its settings."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def log():
     return read_log(LOG)
 
 
-def test_a_board_s_log_is_read_to_its_end(log):
+def test_board_log_is_read_to_its_end(log):
     assert any("Betaflight 4.6.0" in note for note in log.notes)
     assert not any("damaged" in note or "end mark" in note for note in log.notes)
     assert log.warnings == ()
@@ -29,14 +29,14 @@ def test_a_board_s_log_is_read_to_its_end(log):
     assert np.median(log.specific_force[log.valid, 2]) == pytest.approx(9.8, abs=0.5)
 
 
-def test_values_are_within_a_tenth_of_the_settings(log, monkeypatch):
+def test_values_are_within_a_tenth_of_settings(log, monkeypatch):
     monkeypatch.setattr(body_identification, "DRAWS", 8)
     lag, _, hover = settings_say(LOG, Scenario(plant="betaflight").make("small")._model)
     result = identify_body(log)
     assert result.vehicle.rate_lag.value == pytest.approx(lag, rel=TENTH)
     assert result.vehicle.rate_gain.value == pytest.approx(1.0, rel=TENTH)
     assert result.hover.value == pytest.approx(hover, rel=TENTH)
-    assert result.vehicle.delay.value < 3e-3  # one pass of the loop and one step of the simulated world
+    assert result.vehicle.delay.value < 3e-3  # one pass of the loop and one step of the simulation
 
 
 def test_two_logs_in_one_file(tmp_path):

@@ -1,4 +1,4 @@
-"""The vehicle of a flight that retrim has flown, as a vehicle file."""
+"""The vehicle file that is identified from a flight of retrim."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ VEHICLE = VehicleSpec(
 
 @pytest.fixture(scope="module")
 def sample_flight(as_a_user):
-    """A flight of a vehicle of second order by a geometric controller, and a set-up that does not know the vehicle."""
+    """Return a flight of a second-order vehicle by a geometric controller, and a setup without this vehicle."""
     scenario = Scenario("kick", plant="second-order", vehicle=VEHICLE, delay=0.03)
     model = dataclasses.replace(load("hover/retrim"), vehicle=VEHICLE)
     policy = Setup.from_preset(model).new_policy(jax.random.key(0))
@@ -29,7 +29,7 @@ def sample_flight(as_a_user):
     return flight, Setup.from_preset("hover/retrim")
 
 
-def test_the_file_has_the_delay_the_lags_and_the_damping_of_the_vehicle(sample_flight, tmp_path):
+def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
     flight, setup = sample_flight
     path = tmp_path / "found.toml"
     assert save_flight_vehicle(flight, setup, path) == ([path], 0)
@@ -38,15 +38,15 @@ def test_the_file_has_the_delay_the_lags_and_the_damping_of_the_vehicle(sample_f
     assert result.rate_lag[0] == pytest.approx(0.08, rel=0.05)
     assert result.rate_damping[0] == pytest.approx(0.7, rel=0.1)
     assert result.motor_tau == pytest.approx(0.04, rel=0.15)
-    assert result.mass == pytest.approx(float(setup.vehicle.mass))  # a flight does not show it
+    assert result.mass == pytest.approx(float(setup.vehicle.mass))  # a flight does not reveal it
 
 
-def test_without_the_option_nothing_is_written(sample_flight):
+def test_no_file_is_written_without_option(sample_flight):
     assert save_flight_vehicle(*sample_flight, None) == ([], 0)
     check_vehicle_file(None)
 
 
-def test_a_flight_that_is_too_short_is_refused_in_one_line(sample_flight, tmp_path, capsys):
+def test_too_short_flight_is_refused_in_one_line(sample_flight, tmp_path, capsys):
     flight, setup = sample_flight
     log = flight.log
     cut = lambda states: type(states)(*(part[:20] for part in states))  # noqa: E731
@@ -62,6 +62,6 @@ def test_a_flight_that_is_too_short_is_refused_in_one_line(sample_flight, tmp_pa
 @pytest.mark.parametrize(
     ("name", "message"), [("found.txt", "must end in .toml"), ("nowhere/found.toml", "does not exist; make it first")]
 )
-def test_a_file_that_cannot_be_written_is_refused_before_the_flight(tmp_path, name, message):
+def test_unwritable_file_is_refused_before_flight(tmp_path, name, message):
     with pytest.raises(ConfigError, match=message):
         check_vehicle_file(tmp_path / name)

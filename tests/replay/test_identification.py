@@ -1,4 +1,4 @@
-"""What is put into a flight is found in it, within the interval that is stated; what is not in it is not made up."""
+"""Identification recovers the parameters of a flight within the stated interval, and reports no unobservable ones."""
 
 import dataclasses
 import tomllib
@@ -24,27 +24,27 @@ DT, SUB = 0.02, 20
 
 @pytest.fixture(autouse=True)
 def few_draws(monkeypatch):
-    """Intervals of a bootstrap of a quarter of the samples that users get."""
+    """Use a quarter of the usual bootstrap samples."""
     monkeypatch.setattr(identification, "DRAWS", 50)
 
 
 def wander(rng, n, size, tau):
-    """A random walk that returns."""
+    """Return a mean-reverting random walk."""
     x = np.zeros(n)
     for i in range(1, n):
         x[i] = x[i - 1] * np.exp(-DT / tau) + size * np.sqrt(1 - np.exp(-2 * DT / tau)) * rng.normal()
     return x
 
 
-def driven(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0):
-    """A vehicle that follows random commands, integrated in steps of a millisecond; mild noise on what is logged."""
+def excited_flight(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0):
+    """Return a vehicle under random commands, integrated in steps of 1 ms, with mild noise on the log."""
     rng, h = np.random.default_rng(seed), DT / SUB
     c = 9.81 / gain + size * wander(rng, n, 1.5, 0.3)
     w = size * np.stack([wander(rng, n, 0.8, 0.2), wander(rng, n, 0.8, 0.2), wander(rng, n, 0.5, 0.5)], axis=1)
     j = np.maximum(0, np.arange(n * SUB) - round(delay / h)) // SUB
     keep, start_time = np.exp(-h / np.array([lag, *rate_lag])), np.array([9.81 / gain, 0.0, 0.0, 0.0])
     acts = np.stack(
-        [_following(u, k, at) for u, k, at in zip(np.column_stack([c, w])[j].T, keep, start_time, strict=True)]
+        [_first_order(u, k, at) for u, k, at in zip(np.column_stack([c, w])[j].T, keep, start_time, strict=True)]
     )
     thrust, turns = acts[0], _turns(h * acts[1:].T)
     R = np.stack(list(accumulate(turns[:-1], np.matmul, initial=np.eye(3))))
@@ -60,8 +60,10 @@ def driven(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0
     return FlightLog(DT * np.arange(n), p, R, v, np.zeros_like(v), c, np.zeros((n, 3)), w, valid, DT, None, ())
 
 
-def _following(expected, keep, y):
-    """What follows ``setpoint`` and keeps that share of its distance to it in a step; ``y`` is where it begins."""
+def _first_order(expected, keep, y):
+    """Return a first-order response to ``setpoint`` that keeps the share ``keep`` of its distance per step and begins
+    at ``y``.
+    """
     return lfilter([1 - keep], [1, -keep], expected, zi=[keep * y])[0]
 
 
@@ -78,8 +80,8 @@ def _turns(phi):
         (1, {"delay": 0.0, "lag": 0.03, "rate_lag": (0.03, 0.03, 0.03), "gain": 1.1, "drag": (0.1, 0.4, 0.0)}),
     ],
 )
-def test_what_was_put_in_is_found(seed, truth):
-    result = identify(driven(seed, **truth))
+def test_identification_recovers_parameters(seed, truth):
+    result = identify(excited_flight(seed, **truth))
     assert result.delay.value == pytest.approx(truth["delay"], abs=0.003)
     assert result.thrust_lag.value == pytest.approx(truth["lag"], abs=0.004)
     assert result.thrust_gain.value == pytest.approx(truth["gain"], abs=0.01)
@@ -93,8 +95,8 @@ def test_what_was_put_in_is_found(seed, truth):
     assert gain.low - 0.005 <= truth["gain"] <= gain.high + 0.005
 
 
-def test_a_controller_that_answers_noise_is_no_vehicle_that_follows():
-    """At rest all that moves is noise, and the command answers it: the next difference seems to follow at once."""
+def test_response_of_controller_to_noise_is_not_a_rate_loop():
+    """At rest only noise moves, and the command responds to it, so that the next difference seems to follow at once."""
     rng, n = np.random.default_rng(0), 900
     tilt = 2e-3 * rng.normal(size=(n, 3))
     v = 6e-3 * rng.normal(size=(n, 3))
@@ -106,23 +108,23 @@ def test_a_controller_that_answers_noise_is_no_vehicle_that_follows():
     assert result.drag == (None, None, None)
 
 
-def test_without_commanded_rates_the_thrust_is_still_known():
+def test_thrust_is_identified_without_commanded_rates():
     truth = {"delay": 0.03, "lag": 0.06, "rate_lag": (0.05, 0.05, 0.2), "gain": 0.9, "drag": (0.3, 0.3, 0.1)}
-    result = identify(dataclasses.replace(driven(2, **truth), command=None))
+    result = identify(dataclasses.replace(excited_flight(2, **truth), command=None))
     assert result.rate_lag is None
     assert result.thrust_gain.value == pytest.approx(0.9, abs=0.01)
     assert result.delay.value + result.thrust_lag.value == pytest.approx(0.09, abs=0.01)
 
 
-def test_a_short_flight_is_refused():
-    log = driven(0, delay=0.0, lag=0.03, rate_lag=(0.03,) * 3, gain=1.0, drag=(0.0,) * 3, n=300)
+def test_short_flight_is_refused():
+    log = excited_flight(0, delay=0.0, lag=0.03, rate_lag=(0.03,) * 3, gain=1.0, drag=(0.0,) * 3, n=300)
     with pytest.raises(LogError, match="needs 8 s at least"):
         identify(log)
 
 
-def test_what_is_found_is_a_vehicle_file():
+def test_identified_values_form_vehicle_file():
     truth = {"delay": 0.02, "lag": 0.05, "rate_lag": (0.08, 0.08, 0.3), "gain": 1.0, "drag": (0.3, 0.3, 0.1)}
-    log = dataclasses.replace(driven(0, **truth), full_thrust=25.0)
+    log = dataclasses.replace(excited_flight(0, **truth), full_thrust=25.0)
     text = vehicle_toml(identify(log), Setup.from_preset("hover/retrim"), "a flight.csv")
     spec = validated(VehicleSpec, tomllib.loads(text), source="vehicle")
     assert spec.motor_tau == pytest.approx(0.05, abs=0.01)
@@ -133,7 +135,7 @@ def test_what_is_found_is_a_vehicle_file():
 
 
 @pytest.mark.parametrize(("delay", "lag"), [(0.0, 0.0), (0.02, 0.0), (0.013, 0.04), (0.05, 0.3)])
-def test_an_acting_command_is_what_a_fine_integration_gives(delay, lag):
+def test_acting_command_equals_fine_integration(delay, lag):
     rng, fine = np.random.default_rng(3), 400
     command = rng.normal(size=60)
     h, y, means = DT / fine, command[0], np.zeros(60)

@@ -1,4 +1,4 @@
-"""Replaying a log: what is foretold, by whom, and what a policy learns from it."""
+"""Replay of a log: prediction errors of the models, and adaptation of a policy to the log."""
 
 import dataclasses
 import importlib
@@ -31,7 +31,7 @@ from retrim.runkit.run import Run
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 PUSH = (1.0, -0.5, 0.3)
-replays = importlib.import_module("retrim.replay.replay")  # the module, not its function of the same name
+replays = importlib.import_module("retrim.replay.replay")  # the module, not the function of the same name
 SHORT = Protocol(buffer=2.0, horizon=1.0, every=1.0)
 
 
@@ -43,7 +43,7 @@ def files(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory):
-    """A log that is long enough to be foretold, and too short to be identified."""
+    """Return a log that suffices for prediction, and not for identification."""
     return write_csv(tmp_path_factory.mktemp("brief") / "log.csv", columns(fly_once(7.0, wind=PUSH)))
 
 
@@ -52,14 +52,14 @@ def log(files, brief):
     return read_flight_log(brief, read_map(files[1]))
 
 
-def test_the_residual_of_a_push_is_the_push(log):
+def test_residual_of_push_is_push(log):
     rows = rows_of(log)
     assert rows.a_res[np.asarray(rows.valid)] == pytest.approx(
         np.broadcast_to(PUSH, (int(rows.valid.sum()), 3)), abs=2e-3
     )
 
 
-def test_a_push_is_foretold_and_zero_misses_all_of_it(log):
+def test_push_is_predicted_and_zero_prediction_misses_it(log):
     result = {each.name: each for each in predict_log(rows_of(log), log.dt, yardsticks(log.dt), SHORT)}
     assert result["zero"].rmse == pytest.approx(np.linalg.norm(PUSH), rel=1e-2)
     for name in ("last second", "mean of the buffer", "ridge"):
@@ -69,7 +69,7 @@ def test_a_push_is_foretold_and_zero_misses_all_of_it(log):
 
 
 @pytest.mark.parametrize("name", ["regression", "linear", "ensemble"])
-def test_residual_models_foretell_a_push(log, name):
+def test_residual_models_predict_push(log, name):
     preset = load("hover/retrim")
     begin = model_factory(name, preset, make_vehicle("small"), 0, window=100, fit_every=1.0, fit_steps=100)
     (result,) = predict_log(rows_of(log), log.dt, {name: begin}, SHORT)
@@ -87,7 +87,7 @@ def test_only_valid_rows_count(log):
         assert a.rmse < 0.02
 
 
-def test_a_log_that_is_too_short_says_what_to_choose(log):
+def test_too_short_log_is_refused_with_remedy(log):
     with pytest.raises(LogError, match="choose a shorter --buffer or --horizon"):
         list(predict_log(rows_of(log), log.dt, yardsticks(log.dt), Protocol(10.0, 10.0)))
 
@@ -102,12 +102,12 @@ def test_a_log_that_is_too_short_says_what_to_choose(log):
         ({"updates": 0}, "--updates 0"),
     ],
 )
-def test_what_cannot_be_asked_is_named(wrong, text):
+def test_invalid_options_are_refused(wrong, text):
     with pytest.raises(ConfigError, match=text):
         Replay(**wrong)
 
 
-def test_a_report_is_a_table_a_picture_and_json(files, tmp_path, monkeypatch):
+def test_report_is_table_plot_and_json(files, tmp_path, monkeypatch):
     monkeypatch.setattr(identification, "DRAWS", 20)
     path, choice = files
     run = Run("replay", tmp_path)
@@ -122,7 +122,7 @@ def test_a_report_is_a_table_a_picture_and_json(files, tmp_path, monkeypatch):
     assert "# Identified from log.csv" in (tmp_path / "vehicle.toml").read_text()
 
 
-def test_a_slower_log_has_its_own_tick_and_no_policy_adapts_to_it(tmp_path):
+def test_slow_log_keeps_its_tick_and_refuses_adaptation(tmp_path):
     path = write_csv(tmp_path / "log.csv", columns(fly_once(6.0, dt=1 / 30, wind=PUSH)))
     calls = Replay(map=str(write_map(tmp_path / "map.toml")), buffer=100 / 30, horizon=50 / 30)
     document = replay(path, calls, Run("replay", tmp_path), Silent())
@@ -135,8 +135,8 @@ def test_a_slower_log_has_its_own_tick_and_no_policy_adapts_to_it(tmp_path):
         replay(path, calls, Run("replay", tmp_path), Silent())
 
 
-def test_a_buffer_that_holds_too_few_samples_is_named(files, tmp_path, monkeypatch):
-    """0.2 s are ten samples at 50 Hz; what is enough is said, and is enough."""
+def test_too_short_buffer_is_refused(files, tmp_path, monkeypatch):
+    """0.2 s are ten samples at 50 Hz; the message states a sufficient length, which is accepted."""
     path, choice = files
     with pytest.raises(ConfigError, match=r"--buffer 0\.2: must be 0\.26 to .* every 20 ms") as error:
         replay(path, Replay(map=str(choice), buffer=0.2, horizon=1.0), Run("replay", tmp_path), Silent())
@@ -162,7 +162,7 @@ drag_area = [0.01, 0.02, 0.03]
 """
 
 
-def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, monkeypatch):
+def test_missing_values_come_from_vehicle_file(files, tmp_path, monkeypatch):
     path, choice = files
     (tmp_path / "heavy.toml").write_text(HEAVY)
     drag = Estimate(0.3, 0.2, 0.4)  # in a comment of the file
@@ -177,7 +177,7 @@ def test_what_a_log_does_not_tell_is_that_of_the_vehicle_file(files, tmp_path, m
     assert identified_one == dataclasses.replace(heavy, name="heavy-identified")
 
 
-def test_no_vehicle_file_is_written_of_a_log_that_says_nothing(brief, files, tmp_path, monkeypatch):
+def test_uninformative_log_writes_no_vehicle_file(brief, files, tmp_path, monkeypatch):
     monkeypatch.setattr(replays, "identify", lambda log, seed: IdentifiedVehicle(*[None] * 9, (None, None, None), 0.1))
     monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
     calls = Replay(map=str(files[1]), buffer=2.0, horizon=1.0, identify=True)
@@ -186,8 +186,8 @@ def test_no_vehicle_file_is_written_of_a_log_that_says_nothing(brief, files, tmp
     assert not (tmp_path / "vehicle.toml").exists()
 
 
-def test_a_report_begins_with_what_is_doubtful_and_shows_every_figure(tmp_path, monkeypatch):
-    """A column that is not the thrust, as a battery's voltage; then the thrust."""
+def test_report_begins_with_warnings_and_shows_every_value(tmp_path, monkeypatch):
+    """One column is not the thrust, for example a battery voltage; then the column is the thrust."""
     monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
     flight = fly_once(7.0, size=3.0)
     choice = write_map(tmp_path / "map.toml", thrust__unit='"share"')
@@ -206,8 +206,8 @@ def test_a_report_begins_with_what_is_doubtful_and_shows_every_figure(tmp_path, 
     assert "Warning" not in text[1]
 
 
-def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
-    """The gate lets through what is better in the model that the log corrected."""
+def test_policy_adapts_to_push_of_log(files, tmp_path):
+    """The gate admits policies that are better in the model corrected by the log."""
     preset = tiny_preset(adapt={"residual": "linear", "window": 100, "fit_every": 1.0, "learning_rate": 1e-3})
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(jax.random.key(0))
@@ -219,9 +219,7 @@ def test_a_policy_learns_the_push_of_a_log(files, tmp_path):
     np.testing.assert_allclose(model.predict(result.state.residual, x, u), PUSH, atol=0.1)
 
 
-def test_a_policy_is_adapted_with_its_own_residual_and_a_model_that_it_cannot_hold_is_named(
-    files, brief, tmp_path, monkeypatch
-):
+def test_policy_is_adapted_with_its_residual_and_unsuitable_model_is_refused(files, brief, tmp_path, monkeypatch):
     preset = tiny_preset(adapt={"residual": "regression", "window": 100, "fit_every": 1.0, "fit_steps": 100})
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     save_policy(tmp_path / "p.safetensors", policy, preset)

@@ -33,17 +33,17 @@ KINDS = [(name, release) for name, forms in DEFINITIONS.items() for release in f
 
 
 @pytest.mark.parametrize("name", RCLPY)
-def test_hashes_are_those_of_rclpy(name):
+def test_hashes_equal_rclpy(name):
     assert message_type(name).hash == RCLPY[name]
 
 
 @pytest.mark.parametrize("name", FIRMWARE)
-def test_hashes_are_those_of_the_firmware(name):
+def test_hashes_equal_firmware(name):
     assert px4_hash(f"px4_msgs/msg/{name}") == FIRMWARE[name]
 
 
 @pytest.mark.parametrize(("name", "release"), KINDS)
-def test_a_message_survives_the_way_there_and_back(name, release):
+def test_message_survives_round_trip(name, release):
     kind, rng = message_type(name, release), np.random.default_rng(0)
     message = kind.new()
     for field, value in vars(message).items() if hasattr(message, "__dict__") else []:
@@ -61,14 +61,14 @@ def test_a_message_survives_the_way_there_and_back(name, release):
 
 
 @pytest.mark.parametrize(("name", "release"), KINDS)
-def test_no_two_releases_have_the_same_hash(name, release):
+def test_releases_have_distinct_hashes(name, release):
     for other in DEFINITIONS[name]:
         same = other == release
         assert (message_type(name, other).hash == message_type(name, release).hash) == same
         assert (px4_hash(name, other) == px4_hash(name, release)) == same
 
 
-def test_a_release_is_found_by_what_the_other_end_tells():
+def test_release_is_recognised_from_other_end():
     assert [release_of(COMMAND, each) for each in ("1.13", "1.14", "1.15", "1.16", "2.0", "newest")] == [
         "1.14", "1.14", "1.15", "1.15", "1.15", "1.15",
     ]  # fmt: skip
@@ -80,7 +80,7 @@ def test_a_release_is_found_by_what_the_other_end_tells():
     assert release_by_px4_hash(COMMAND, 5) is None
 
 
-def test_a_message_of_another_release_is_refused_with_both_named():
+def test_message_of_other_release_is_refused_with_both_names():
     old, new = (message_type("px4_msgs/msg/VehicleOdometry", release) for release in ("1.13", "1.14"))
     why = (
         r"VehicleOdometry of 265 bytes, which is the length in px4_msgs 1\.13 \(before 1\.14\); "
@@ -96,7 +96,7 @@ def test_a_message_of_another_release_is_refused_with_both_named():
 @pytest.mark.parametrize(
     "name", ["nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "mavros_msgs/msg/AttitudeTarget"]
 )
-def test_bytes_from_strangers_are_refused_in_one_way(name, data):
+def test_invalid_bytes_are_refused(name, data):
     with pytest.raises(MessageError, match=rf"{name}: \d+ bytes that cannot be read"):
         message_type(name).decode(data)
 
@@ -126,13 +126,13 @@ def test_names_of_dds_and_ros():
 
 
 @pytest.mark.parametrize(("text", "domain"), [("", 0), ("7", 7), ("232", 232)])
-def test_the_domain_is_that_of_the_variable(monkeypatch, text, domain):
+def test_domain_is_that_of_environment_variable(monkeypatch, text, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", text)
     assert domain_id() == domain
 
 
 @pytest.mark.parametrize("text", ["-1", "233", "one", "٣"])
-def test_a_wrong_domain_is_named(monkeypatch, text):
+def test_wrong_domain_is_refused(monkeypatch, text):
     monkeypatch.setenv("ROS_DOMAIN_ID", text)
     with pytest.raises(ConfigError, match="expected a number from 0 to 232"):
         domain_id()

@@ -1,4 +1,4 @@
-"""Nodes of ROS 2: two of each back end exchange messages on this machine. `make test-ros2` does so with rclpy, too."""
+"""Nodes of ROS 2: two nodes of each back end exchange messages on this machine. `make test-ros2` also uses rclpy."""
 
 import struct
 import time
@@ -37,7 +37,7 @@ def nodes(request):
     yield pair
     for node in pair:
         node.close()
-        node.close()  # once more does nothing
+        node.close()  # a second call has no effect
 
 
 def until(condition, again=lambda: None, patience=15.0):
@@ -52,7 +52,7 @@ def until(condition, again=lambda: None, patience=15.0):
     "name", [ODOMETRY, POSE, TARGET, "px4_msgs/msg/VehicleOdometry", "std_msgs/msg/UInt8MultiArray"]
 )
 @pytest.mark.parametrize("qos", [SENSOR, COMMAND], ids=["sensor", "command"])
-def test_messages_arrive_as_they_were_sent(nodes, name, qos):
+def test_messages_arrive_unchanged(nodes, name, qos):
     here, there = nodes
     kind, kept = message_type(name), []
     message = kind.new()
@@ -77,7 +77,7 @@ def test_other_ends_are_found_with_type_and_hash(nodes):
     assert there.endpoints("/elsewhere") == []
 
 
-def test_keys_and_attachments_are_those_of_rmw_zenoh():
+def test_keys_and_attachments_equal_rmw_zenoh():
     zenoh = pytest.importorskip("zenoh")
     address = f"127.0.0.1:{free_port()}"
     node, other = ZenohNode(address, listen=True), ZenohNode(address)
@@ -99,16 +99,16 @@ def test_keys_and_attachments_are_those_of_rmw_zenoh():
     assert numbers[1] == numbers[0] + 1
     assert times[0] < times[1] < time.time_ns()
     assert [len(each) for each in attachment] == [33, 33]
-    assert attachment[0][16] == 16  # bytes of the publisher's number, which stays the same
+    assert attachment[0][16] == 16  # bytes of the publisher's identifier, which is constant
     assert attachment[0][17:] == attachment[1][17:]
     assert token.split("/")[6:12] == ["%", "%", "retrim", "%pose", kind.dds_name, kind.hash]
 
 
-def test_the_user_s_ros_comes_first(monkeypatch):
+def test_installed_ros_has_priority(monkeypatch):
     installed = {"rclpy", "px4_msgs", "cyclonedds", "zenoh"}
     monkeypatch.setattr(backends, "is_installed", lambda name: name in installed)
     assert choose_backend(("px4_msgs",)) == "rclpy"
-    assert choose_backend(("mavros_msgs",)) == "cyclonedds"  # which needs no package of messages
+    assert choose_backend(("mavros_msgs",)) == "cyclonedds"  # this does not need a package of messages
     installed.remove("cyclonedds")
     assert choose_backend(("mavros_msgs",)) == "zenoh"
     installed.clear()
@@ -116,7 +116,7 @@ def test_the_user_s_ros_comes_first(monkeypatch):
         choose_backend(())
 
 
-def test_the_variables_of_ros_configure_cyclone(monkeypatch):
+def test_ros_variables_configure_cyclone(monkeypatch):
     assert 'address="127.0.0.1"' in configuration()
     assert 'name="lo"' in configuration()
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
