@@ -1,4 +1,4 @@
-"""Two ends of a bus of each kind, for the suites that every bus passes."""
+"""Two ends of a bus of each kind, for the tests that every bus must pass."""
 
 import atexit
 import functools
@@ -20,7 +20,7 @@ LOCAL, NETWORK = ("in process", "shared memory"), ("zenoh", "zenoh, signed", "ro
 
 
 class Ends(NamedTuple):
-    """Two who share a bus."""
+    """Two ends of one bus."""
 
     writer: Bus
     reader: Bus
@@ -28,7 +28,7 @@ class Ends(NamedTuple):
 
 @functools.cache
 def master():
-    """Start a real rosmaster, one for each process, since rospy knows no other; skip the test if there is none."""
+    """Start a real rosmaster, one per process, since rospy supports one only; skip the test if there is none."""
     stack = ExitStack()
     atexit.register(stack.close)
     address = stack.enter_context(rosmaster())
@@ -38,7 +38,7 @@ def master():
 
 
 def two_ends(backend, topics):
-    """Yield two ends of one new bus."""
+    """Yield two ends of a new bus."""
     if backend == "in process":
         bus = InProcessBus(topics)
         yield Ends(bus, bus)
@@ -55,7 +55,7 @@ def two_ends(backend, topics):
 
 
 def network(backend):
-    """Where a new bus of a network is."""
+    """Return the address of a new bus on a network."""
     if backend == "ros":
         return master()
     shared = SharedKey(bytes(32)) if backend.endswith("signed") else None
@@ -68,7 +68,7 @@ def network(backend):
 
 
 def await_message(bus, topic, after=0, data=None, patience=10.0):
-    """Return the message of a topic once it is there."""
+    """Return the message of a topic as soon as it arrives."""
     until = time.monotonic() + patience
     while time.monotonic() < until:
         result = bus.latest(topic, after)

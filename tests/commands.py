@@ -1,4 +1,4 @@
-"""Commands as a user runs them: in this process where that is enough, in one of their own for Ctrl-C and kills."""
+"""Commands as a user runs them: in this process if that suffices, and in a separate one for Ctrl-C and kills."""
 
 import contextlib
 import io
@@ -12,7 +12,7 @@ import time
 from retrim.cli.console import console
 from retrim.cli.main import main
 
-# A policy that hovers, and updates that take no time, both within seconds.
+# The policy hovers and updates take no time, both within seconds.
 SMALL = """
 [pretrain]
 hidden_sizes = [64, 64]
@@ -26,7 +26,7 @@ update_every = 1.5
 fit_latency = 0.1
 update_latency = 0.3
 """
-# Of a sweep whose policies need not fly: one size, so that sweeps share their programs.
+# Preset of a sweep whose policies need not fly: one size, so that sweeps share their programs.
 OVERLAY = """
 [overlay.pretrain]
 hidden_sizes = [16, 16]
@@ -47,7 +47,7 @@ ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
 
 
 def retrim(*words, cwd, code=0):
-    """Run a command here; return what it printed."""
+    """Run a command in this process; return its output."""
     out = io.StringIO()
     before, console.width = sys.argv, 160
     end_note = None
@@ -67,7 +67,7 @@ def results(folder, name="results.json"):
 
 
 def start_process(words, cwd, setup=""):
-    """Start a command in a process of its own, whose Ctrl-C works whoever runs the tests."""
+    """Start a command in a separate process that handles Ctrl-C regardless of the test runner."""
     listening = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     listening += "; signal.signal(signal.SIGHUP, signal.SIG_DFL)"
     code = f"{listening}\nfrom retrim.cli.main import main\n{setup}\nmain({[str(word) for word in words]!r})"
@@ -81,7 +81,7 @@ def start_process(words, cwd, setup=""):
 
 
 def run_interrupted(words, cwd, *, after, setup="", by=signal.SIGINT):
-    """Run, send a signal once the output shows ``after`` or that file is there; return exit code and output."""
+    """Run; send a signal once the output shows ``after`` or that file exists; return exit code and output."""
     process, observation = start_process(words, cwd, setup), b""
     deadline = time.monotonic() + 180
     while time.monotonic() < deadline and process.poll() is None:

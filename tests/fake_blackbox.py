@@ -1,4 +1,4 @@
-"""Writes Blackbox logs from the description of the format: I, P and S frames with every code, and two events."""
+"""Write Blackbox logs from the description of the format: I, P and S frames with every encoding, and two events."""
 
 import struct
 
@@ -15,7 +15,7 @@ DISARM = b"E\x0f\x04"
 
 
 def vb(value):
-    """A variable-length unsigned integer."""
+    """Encode a variable-length unsigned integer."""
     value &= 0xFFFFFFFF
     out = bytearray()
     while value > 127:
@@ -25,12 +25,12 @@ def vb(value):
 
 
 def svb(value):
-    """A variable-length signed integer."""
+    """Encode a variable-length signed integer."""
     return vb(value << 1 ^ value >> 31)
 
 
 def eight(values):
-    """Up to eight numbers behind a byte that marks those that are not zero."""
+    """Encode up to eight numbers after a byte that marks the non-zero ones."""
     if len(values) == 1:
         return svb(values[0])
     return bytes([sum((v != 0) << k for k, v in enumerate(values))]) + b"".join(svb(v) for v in values if v)
@@ -49,7 +49,7 @@ def whole_bytes(values):
 
 
 def three(values):
-    """Three numbers of 2, 4 or 6 bits, or of whole bytes."""
+    """Encode three numbers of 2, 4 or 6 bits, or of whole bytes."""
     a, b, c = values
     if fits(values, (2, 2, 2)):
         return bytes([(a & 3) << 4 | (b & 3) << 2 | c & 3])
@@ -61,7 +61,7 @@ def three(values):
 
 
 def four(values):
-    """Four numbers of 0, 4, 8 or 16 bits, packed by half bytes."""
+    """Encode four numbers of 0, 4, 8 or 16 bits, packed by half bytes."""
     sizes = [0 if v == 0 else 1 if fits([v], [4]) else 2 if fits([v], [8]) else 4 for v in values]
     tag = sum((0, 1, 2, 0, 3)[size] << 2 * k for k, size in enumerate(sizes))
     text = "".join(f"{v & (1 << 4 * size) - 1:0{size}x}" for v, size in zip(values, sizes, strict=True) if size)
@@ -73,7 +73,7 @@ CODES = {0: (svb, 1), 1: (vb, 1), 3: (lambda v: vb(-v & 0x3FFF), 1), 6: (eight, 
 
 
 def encode(codes, values):
-    """The numbers of a frame."""
+    """Encode the numbers of a frame."""
     out, k = b"", 0
     while k < len(codes):
         write, most = CODES[codes[k]]
@@ -85,7 +85,7 @@ def encode(codes, values):
     return out
 
 
-# field, signed, predictor and code of I, predictor and code of P
+# field, signed, predictor and encoding of I, predictor and encoding of P
 LAYOUT = [
     ("loopIteration", 0, 0, 1, 6, 9), ("time", 0, 0, 1, 2, 0),
     *((f"axisI[{k}]", 1, 0, 0, 1, 7) for k in range(3)),
@@ -100,13 +100,13 @@ UNFILTERED = [(f"gyroUnfilt[{k}]", 1, 0, 0, 3, 0) for k in range(3)]
 
 
 def layout_of(version, without=()):
-    """The fields of a firmware version."""
+    """Return the fields of a firmware version."""
     fields = LAYOUT + (UNFILTERED if version >= (4, 5) else [])
     return [each for each in fields if not each[0].startswith(tuple(without) or ("-",))]
 
 
 def numbers(flight, version, fine=False):
-    """The numbers of a board: deg/s (tenths if ``fine``), 2048 for one g, motor commands of DSHOT."""
+    """Return the numbers of a board: deg/s (tenths if ``fine``), 2048 per g, and DSHOT motor commands."""
     k = 10.0 if fine else 1.0
     n = len(flight.t[::1])
     stick = (flight.motors.mean(axis=1) - IDLE) / (1.0 - IDLE)
@@ -125,7 +125,7 @@ def numbers(flight, version, fine=False):
 
 
 def header(layout, version, fine=False, **more):
-    """The lines of a header."""
+    """Return the lines of a header."""
 
     def row(index):
         return ",".join(str(each[index]) for each in layout)
@@ -145,7 +145,7 @@ def header(layout, version, fine=False, **more):
 
 
 def blackbox(flight, version=(4, 5), *, without=(), fine=False, end=DISARM + END, **more):
-    """A log of one flight, as bytes."""
+    """Return a log of one flight, as bytes."""
     layout = layout_of(version, without)
     columns = numbers(flight, version, fine)
     rows = np.stack([columns[each[0]] for each in layout], axis=1).tolist()
@@ -169,7 +169,7 @@ def blackbox(flight, version=(4, 5), *, without=(), fine=False, end=DISARM + END
 
 
 def decoded_csv(flight, version=(4, 5), settings=()):
-    """The table of blackbox_decode; Blackbox Explorer writes settings above the table."""
+    """Return the table of blackbox_decode; Blackbox Explorer adds settings above the table."""
     layout, columns = layout_of(version), numbers(flight, version)
     names = [each[0] for each in layout]
     title = ", ".join("time" if settings and n == "time" else "time (us)" if n == "time" else n for n in names)
@@ -178,4 +178,4 @@ def decoded_csv(flight, version=(4, 5), settings=()):
     return "\n".join([*lines, title, *(", ".join(map(str, row)) for row in rows)]) + "\n"
 
 
-assert struct.pack("<f", 1.0)[::-1].hex() == "3f800000"  # the gyroscope's scale in the header
+assert struct.pack("<f", 1.0)[::-1].hex() == "3f800000"  # the scale of the gyroscope in the header

@@ -1,4 +1,4 @@
-"""A flight of a rate loop of known delay, lags and thrust map, as a board measures it: no attitude, no position."""
+"""A flight of a rate loop with known delay, lags and thrust map, as measured on board: no attitude, no position."""
 
 from dataclasses import dataclass
 
@@ -40,7 +40,7 @@ class Truth:
 
 
 def second_order(u, lag, damping, delay):
-    """The response to ``u`` with omega = 2 zeta / lag, after a delay in milliseconds; exact for a held command."""
+    """Return the second-order response to ``u`` with omega = 2 zeta / lag, delayed [ms]; exact for a held command."""
     w = 2.0 * damping / lag
     num, den, _ = cont2discrete(([w * w], [1.0, lag * w * w, w * w]), DT, method="zoh")
     late = np.concatenate([np.full(round(delay / DT), u[0]), u])[: len(u)]
@@ -48,20 +48,20 @@ def second_order(u, lag, damping, delay):
 
 
 def first_order(u, lag):
-    """The response to ``u`` with one pole."""
+    """Return the first-order response to ``u``."""
     keep = np.exp(-DT / lag)
     return lfilter([0.0, 1.0 - keep], [1.0, -keep], u - u[0]) + u[0]
 
 
 def wander(rng, n, size, tau, every=10):
-    """A random walk that returns, held over ``every`` rows."""
+    """Return a mean-reverting random walk, held over ``every`` rows."""
     k, h = n // every + 1, DT * every
     keep = np.exp(-h / tau)
     return np.repeat(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], size * rng.normal(size=k)), every)[:n]
 
 
 def fly_body(seconds=16.0, truth=Truth(), seed=0, noise=0.01):
-    """Fly random rates and thrusts; mild noise on the measurements."""
+    """Fly random rates and thrusts, with mild measurement noise."""
     rng, n = np.random.default_rng(seed), round(seconds / DT)
     command = np.stack([wander(rng, n, size, 0.15) for size in (2.0, 2.0, 1.2)], axis=1)
     shapes = ((truth.lag, truth.damping), (truth.lag, truth.damping), (truth.yaw_lag, truth.damping))

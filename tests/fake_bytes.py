@@ -1,4 +1,4 @@
-"""Files of logs with made-up messages: ULogs byte by byte, and bags of ROS."""
+"""Log files with made-up messages: ULogs byte by byte, and bags of ROS."""
 
 import struct
 from pathlib import Path
@@ -40,7 +40,7 @@ def ulog(topics, stamps) -> bytes:
 
 
 def px4_topics(flight):
-    """The topics of PX4 1.10 and later, and stamps [us]: NED, forward-right-down, hover at half of the thrust."""
+    """Return the topics of PX4 1.10 and later, and stamps [us]: NED, forward-right-down, hover at half thrust."""
     ned = turned_frames(flight)
     q = np.roll(Rotation.from_matrix(ned.R).as_quat(), 1, axis=1)
     up = np.zeros_like(flight.c)
@@ -99,7 +99,7 @@ def bag2(path: Path, definitions, messages, typestore=None) -> Path:
 
 
 def px4_messages(flight, *, old=False, clock=None, jitter=0.0, folder="/fmu/{}/"):
-    """Messages that PX4 sends over DDS, stamped by its own clock, and received late by up to some jitter [s]."""
+    """Return messages of PX4 over DDS with stamps of its clock, received late by up to ``jitter`` [s]."""
     ned = turned_frames(flight)
     q = np.roll(Rotation.from_matrix(ned.R).as_quat(), 1, axis=1).astype(np.float32)
     rng, last = np.random.default_rng(0), 0

@@ -1,4 +1,4 @@
-"""Writes dataflash logs: messages that describe the others, and the others."""
+"""Write dataflash logs: messages that describe other messages, and the messages themselves."""
 
 import struct
 
@@ -22,30 +22,30 @@ DEG = 180.0 / np.pi
 
 
 def describe(name, code, codes, labels):
-    """The message that describes another one."""
+    """Return the message that describes a different one."""
     length = 3 + struct.calcsize("<" + "".join(TYPES[c] for c in codes))
     return HEAD + struct.pack("<BBB4s16s64s", 128, code, length, name.encode(), codes.encode(), labels.encode())
 
 
 def message(name, *values):
-    """One message."""
+    """Return one message."""
     code, codes, _ = KINDS[name]
     return HEAD + struct.pack("<B" + "".join(TYPES[c] for c in codes), code, *values)
 
 
 def formats(without=()):
-    """All descriptions, that of descriptions first."""
+    """Return all descriptions, starting with that of descriptions."""
     first = HEAD + struct.pack("<BBB4s16s64s", 128, 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
     return first + b"".join(describe(name, *kind) for name, kind in KINDS.items() if name not in without)
 
 
 def sorted_messages(rows):
-    """Messages in order of time."""
+    """Return messages in order of time."""
     return b"".join(data for _, data in sorted(rows, key=lambda row: row[0]))
 
 
 def flight_messages(flight, start=3.0, *, without=(), events=True, every=2):
-    """Messages of ArduCopter for a flight with attitudes: NED, forward-right-down; two of its estimators and IMUs."""
+    """Return ArduCopter messages of a flight with attitudes: NED, forward-right-down, two estimators and two IMUs."""
     ned, stamp = turned_frames(flight), [round(1e6 * (t + start)) for t in flight.t]
     angles = Rotation.from_matrix(ned.R).as_euler("ZYX", degrees=True)
     force = np.einsum("nji,nj->ni", flight.R, flight.a + G) @ FRD_OF_FLU.T
@@ -67,13 +67,13 @@ def flight_messages(flight, start=3.0, *, without=(), events=True, every=2):
 
 
 def dataflash(*parts, without=()):
-    """A log of the messages of one flight or more."""
+    """Return a log of the messages of one or more flights."""
     parameter = message("PARM", 1000, b"MOT_THST_HOVER", 0.35)
     return formats(without) + parameter + b"".join(sorted_messages(each) for each in parts)
 
 
 def body_messages(flight, start=3.0):
-    """Messages of ArduCopter for a flight of rates alone."""
+    """Return ArduCopter messages of a flight with rates only."""
     rows = []
     c, w, f = flight.command @ FRD_OF_FLU.T * DEG, flight.rates @ FRD_OF_FLU.T * DEG, flight.force @ FRD_OF_FLU.T
     share = flight.motors.mean(axis=1)

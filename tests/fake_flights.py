@@ -1,4 +1,4 @@
-"""Flights that were never flown, for what is computed from flights, and a reporter that remembers."""
+"""Made-up flights for functions that evaluate flights, and a reporter that records progress."""
 
 import contextlib
 
@@ -22,7 +22,7 @@ def log(seconds=10.0, *, terminated=False, events=(), t=None):
 
 
 def flight(error, *, spec=None, flight=None, steady_seconds=2.0, cross=None, **of_log):
-    """A flight with this error: a number, or one for each row of the log."""
+    """Return a flight with this error: a number, or one for each row of the log."""
     flight = log(**of_log) if flight is None else flight
     error = np.broadcast_to(np.asarray(error, dtype=float), flight.t.shape)
     spec = FlightSpec(Scenario("large"), "base", 0) if spec is None else spec
@@ -30,7 +30,7 @@ def flight(error, *, spec=None, flight=None, steady_seconds=2.0, cross=None, **o
 
 
 class Watching(Silent):
-    """Keeps what progress was told, as titles, shares and texts, and hands each share on."""
+    """A reporter that records titles, shares and texts of progress, and forwards each share."""
 
     def __init__(self, then=lambda share: None):
         self.messages, self._then = [], then
@@ -48,7 +48,7 @@ class Watching(Silent):
 
 
 class Imaginary:
-    """In the place of training and flying: what was asked, and flights of made-up errors."""
+    """Made-up training and flights; it records the requests."""
 
     def __init__(self, error):
         """``error`` of a specification [m]: a number, one for each row of the log, or None for a crash."""

@@ -1,4 +1,4 @@
-"""A flight that is known exactly, as arrays and as files of logs."""
+"""A flight with exactly known states, as arrays and as log files."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Flight:
 
 
 def fly_once(seconds=30.0, dt=0.02, wind=(0.0, 0.0, 0.0), gain=1.0, seed=0, size=1.0):
-    """A lively flight: sums of sines, thrust as flatness says, heading that turns; ``wind`` is a constant push."""
+    """Return an agile flight: sums of sines, thrust from flatness, a turning heading; ``wind`` is a constant push."""
     rng = np.random.default_rng(seed)
     t = dt * np.arange(round(seconds / dt) + 1)
     waves = 2 * np.pi * rng.uniform(0.1, 0.45, size=(3, 4))
@@ -55,7 +55,7 @@ def _attitudes(specific_force, yaw):
 
 
 def columns(flight: Flight) -> dict[str, np.ndarray]:
-    """The columns of a CSV file, by name."""
+    """Return the columns of a CSV file, by name."""
     q = Rotation.from_matrix(flight.R).as_quat()
     parts = {"p": flight.p, "v": flight.v, "q": q, "w": flight.omega}
     names = {f"{name}{'xyzw'[i]}": x[:, i].copy() for name, x in parts.items() for i in range(x.shape[1])}
@@ -104,7 +104,7 @@ def write_map(path: Path, text: str = MAP, **changes: str) -> Path:
 
 
 def turned_frames(flight: Flight) -> Flight:
-    """The same flight in NED and forward-right-down."""
+    """Return the same flight in NED and forward-right-down."""
     W, B = NED_OF_ENU, FRD_OF_FLU
     return dataclasses.replace(
         flight, p=flight.p @ W.T, v=flight.v @ W.T, a=flight.a @ W.T, R=W @ flight.R @ B, omega=flight.omega @ B

@@ -1,4 +1,4 @@
-"""A network of ROS 2 in one process: messages are delivered at once, in the thread that publishes."""
+"""A ROS 2 network in one process: messages are delivered immediately, in the publishing thread."""
 
 from collections import defaultdict
 
@@ -7,7 +7,7 @@ from retrim.ros2.node import SENSOR, Endpoint, Ros2Node
 
 
 class FakeNetwork:
-    """Topics, and the nodes that use them."""
+    """Topics and the nodes that use them."""
 
     def __init__(self):
         self.takers = defaultdict(list)
@@ -18,7 +18,7 @@ class FakeNetwork:
 
 
 class FakeNode(Ros2Node):
-    """A node of the network; its messages do not come back to it."""
+    """A node of the network; it does not receive its own messages."""
 
     backend = "fake"
 
@@ -51,7 +51,7 @@ class FakeNode(Ros2Node):
 
 
 class Talker:
-    """The other end: it publishes messages, and keeps those of others."""
+    """The other end: it publishes messages, and stores those of other nodes."""
 
     def __init__(self, network):
         self.node, self.publishers, self.kept = network.node(), {}, defaultdict(list)

@@ -1,4 +1,4 @@
-"""A vehicle whose time does not wait, in a few lines: a point mass that takes off at once and lands by itself."""
+"""A real-time vehicle in a few lines: a point mass that takes off immediately and lands by itself."""
 
 import time
 
@@ -14,7 +14,7 @@ HOVER = np.array([9.81, 0.0, 0.0, 0.0])
 
 
 class PointVehicle(VehiclePlant):
-    """It stands at the origin, is pushed, and does what ``faults`` say."""
+    """A point mass at the origin under a push, with the faults ``faults``."""
 
     def __init__(self, request, *, push=(0.3, -0.2, 0.1), never_arms=False, lost_after=None, lands_in=0.0):
         super().__init__(request.dt, np.array([0.0, -6.0, -6.0, -2.0]), np.array([30.0, 6.0, 6.0, 2.0]))

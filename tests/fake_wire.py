@@ -5,7 +5,7 @@ from collections import deque
 
 
 class Wire:
-    """What is sent is kept; what the other end says to it is put into the inbox, at once if ``answer`` returns some."""
+    """A wire that stores sent data; replies are put into the inbox, immediately if ``answer`` returns some."""
 
     def __init__(self):
         self.inbox, self.packets, self.answer = deque(), [], lambda data: None

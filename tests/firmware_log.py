@@ -1,4 +1,4 @@
-"""The response that Betaflight's settings determine, to compare with its log; and flights that excite a vehicle."""
+"""The response that follows from Betaflight settings, for comparison with a log; and flights that excite a vehicle."""
 
 import math
 import time
@@ -41,14 +41,14 @@ def settings_say(path, model):
 
 
 def fly_random_rates(plant, seconds, seed=0):
-    """Hold the place roughly, with random rates and thrusts on top."""
+    """Hold the position roughly, with random rates and thrusts in addition."""
     rng, home = np.random.default_rng(seed), np.array([0.0, 0.0, 50.0])
     plant.connect()
     plant.take_off(home, 0.0)
     plant.hold(time.monotonic() + 0.3)
     plant.send(np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0]))
     begin, turn, push = time.monotonic(), np.zeros(3), 0.0
-    fast, slow = math.exp(-0.1), math.exp(-0.025)  # a hundredth of a second of 0.1 s and of 0.4 s
+    fast, slow = math.exp(-0.1), math.exp(-0.025)  # 0.01 s, of 0.1 s and of 0.4 s
     while (t := time.monotonic() - begin) < seconds:
         s = plant.read()
         turn = fast * turn + math.sqrt(1.0 - fast**2) * rng.normal(size=3) * np.array([1.5, 1.5, 1.0])

@@ -1,4 +1,4 @@
-"""Small things that many tests need: random states, a small task, a small preset."""
+"""Small helpers for many tests: random states, a small task, a small preset."""
 
 import dataclasses
 import math
@@ -25,13 +25,13 @@ BRIEF = {
               "fit_steps": 5, "num_updates": 2, "num_envs": 2},
 }  # fmt: skip
 
-# One program each, instead of one for each operation.
+# Compiled programs: without jit, each operation would be compiled separately.
 residual_targets = eqx.filter_jit(learn.residual_targets)
 random_starts = eqx.filter_jit(training_starts)
 
 
 class CheapModel(AbstractSubstepDynamics[State]):
-    """Eq. (1) at 1 kHz: the cheapest model that a plant can fly, without rotors and limits."""
+    """Eq. (1) at 1 kHz, the cheapest model of a plant, without rotors and limits."""
 
     dt: float = eqx.field(static=True, default=0.02)
 
@@ -73,14 +73,14 @@ def hover_task(*, horizon=5, history=0, heading=math.pi, box=5.0, dt=0.02, make=
 
 
 def hover_env(dynamics=None, *, delay_ticks=0, **task):
-    """A hover task with a model of its rate, the point mass unless another is given."""
+    """Return a hover task with a model of its tick, by default the point mass."""
     small_task = hover_task(**task)
     delay = jnp.array(delay_ticks * small_task.dt)
     return Env(PointMass(small_task.dt) if dynamics is None else dynamics, small_task, delay)
 
 
 def first_order(tau):
-    """The response of first-order lags: one time constant for all, or those of a command's parts [s]."""
+    """Return the response of first-order lags [s]: one time constant for all, or one per part of a command."""
     return ActuatorResponse.of(tau.c, tau.omega) if isinstance(tau, Command) else ActuatorResponse.of(tau, tau)
 
 
@@ -108,7 +108,7 @@ def _field_flight(field, key, n, delay_ticks):
 
 
 def tiny_preset(**changes):
-    """The fast preset with a network and updates so small that a test can afford them."""
+    """Return the fast preset with a network and updates that are small enough for tests."""
     preset = changed(
         load("hover/fast"),
         pretrain={"hidden_sizes": (32, 32), "num_updates": 60, "num_envs": 8, "horizon": 60},
@@ -118,7 +118,7 @@ def tiny_preset(**changes):
 
 
 def brief_preset(name="hover/fast", **changes):
-    """A preset for flights of a second or two: it learns at once, and hardly; one size, so that programs are shared."""
+    """Return a preset for flights of a second or two with small updates; one size, so that programs are shared."""
     preset = changed(load(name), **BRIEF)
     return changed(preset, **changes) if changes else preset
 
@@ -127,7 +127,7 @@ _thousand = eqx.filter_jit(lambda reference, times: jax.vmap(reference)(times))
 
 
 def at(reference, times):
-    """The reference at many times, by one compiled program."""
+    """Return the reference at many times, with one compiled program."""
     times = np.asarray(times, dtype=float)
     padding = np.append(times, np.zeros(-len(times) % 1000)).reshape(-1, 1000)
     result = [_thousand(reference, jnp.asarray(part)) for part in padding]

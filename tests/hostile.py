@@ -1,6 +1,7 @@
-"""Files and messages that a stranger might write: every field with code, names, signs and numbers; checksums are valid.
+"""Malicious files and messages: every field with code, names, signs and numbers, and valid checksums.
 
-``cases(folder)`` yields them by kind. A case says how it is written, how it is read, and whether it may be read at all.
+``cases(folder)`` yields them by kind. A case contains functions that write and read it, and states whether it may be
+accepted.
 """
 
 import dataclasses
@@ -91,7 +92,7 @@ NUMBERS = {  # JSON and TOML
     "deep list": (5000 * "[" + 5000 * "]",) * 2,
     "deep table": (5000 * '{"a":' + "1" + 5000 * "}", 5000 * "{a=" + "1" + 5000 * "}"),
     "many": ("[" + ",".join(100_000 * "1") + "]",) * 2,
-    # These may be what a field is for: they are read, or refused with a line.
+    # These may be valid for a field: they are accepted, or refused with a line.
     "-0": ("-0.0", "-0.0"),
     "-1": ("-1", "-1"),
     "null": ("null", None),
@@ -114,7 +115,7 @@ class Case:
 
 
 def texts_and_numbers(*, toml: bool) -> Iterator[tuple[str, str]]:
-    """Names and texts of hostile values in one of the two notations."""
+    """Return names and texts of malicious values in one of the two notations."""
     for name, text in TEXTS.items():
         yield name, json.dumps(text, ensure_ascii=True)
     for name, pair in NUMBERS.items():
@@ -123,7 +124,7 @@ def texts_and_numbers(*, toml: bool) -> Iterator[tuple[str, str]]:
 
 
 def toml_of(tables: dict) -> str:
-    """TOML of plain tables; tables within are written in a line."""
+    """Return TOML of plain tables; nested tables are inline."""
     return "".join(f"{key} = {_inline(value)}\n" for key, value in tables.items())
 
 
@@ -136,7 +137,7 @@ def _inline(value) -> str:
 
 
 def places(tables: dict, before=()) -> Iterator[tuple[tuple, object]]:
-    """Paths and values of all leaves, tables, and members of lists."""
+    """Return paths and values of all leaves, tables, and members of lists."""
     for key, value in tables.items():
         yield (*before, key), value
         if isinstance(value, dict):
@@ -146,7 +147,7 @@ def places(tables: dict, before=()) -> Iterator[tuple[tuple, object]]:
 
 
 def with_mark(tables: dict, path: tuple) -> dict:
-    """The same tables with the mark at a path."""
+    """Return the same tables with the mark at a path."""
 
     def put(value, rest):
         if not rest:
@@ -159,12 +160,12 @@ def with_mark(tables: dict, path: tuple) -> dict:
 
 
 def without_none(tables: dict) -> dict:
-    """The tables as TOML can have them."""
+    """Return the tables without None, which TOML does not have."""
     return {k: without_none(v) if isinstance(v, dict) else v for k, v in tables.items() if v is not None}
 
 
 def variants(tables: dict, *, toml: bool, free=()) -> Iterator[tuple[str, Callable[[], str], bool]]:
-    """Name, what writes the text, whether it may be fine: each place with each value, and keys that nobody knows."""
+    """Yield name, writer and validity: each path with each value, and unknown keys."""
     paths = toml_of if toml else json.dumps
     for path, value in places(tables):
         whole = paths(with_mark(tables, path))
@@ -192,8 +193,8 @@ def write(about: dict) -> dict[str, str]:
     return {name: text if isinstance(text, str) else text() for name, text in about.items()}
 
 
-class Maker:
-    """Makes cases in a folder."""
+class CaseMaker:
+    """Creates cases in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.n, self.paths = folder, 0, list[Path]()
@@ -213,13 +214,13 @@ class Maker:
         return path
 
     def clear(self) -> None:
-        """Remove the files that were written."""
+        """Remove the written files."""
         for path in self.paths:
             path.unlink(missing_ok=True)
         self.paths.clear()
 
     def cases(self) -> Iterator[Case]:
-        """All kinds."""
+        """Return cases of all kinds."""
         files = self.policies, self.states, self.deltas, self.overlays, self.vehicles, self.sweeps, self.maps
         logs = self.csv_logs, self.npz_logs, self.trajectories
         for kind in (*files, *logs, self.missions, self.messages, self.rows):
@@ -227,14 +228,14 @@ class Maker:
                 yield dataclasses.replace(case, name=f"{kind.__name__}: {case.name}")
 
     def presets(self) -> Iterator[tuple[str, Callable[[], str], bool]]:
-        """JSON of presets."""
+        """Return JSON of presets."""
         tracking = changed(load("track/retrim"), pretrain={"hidden_sizes": (8, 8)})
         for preset in (self.preset, tracking):
             for name, text, fine in variants(json.loads(dump(preset)), toml=False, free=("options",)):
                 yield f"{preset.task} {name}", text, fine
 
     def policies(self) -> Iterator[Case]:
-        """Policies, whose header or tensors are hostile."""
+        """Return policies with a malicious header or malicious tensors."""
 
         def case(name, policy, about, fine=False):
             def read():
@@ -270,7 +271,7 @@ class Maker:
                 yield Case(f"tensor or kind {name}", read)
 
     def states(self) -> Iterator[Case]:
-        """What was learnt."""
+        """Return learner states."""
 
         def case(name, state, about, fine=False):
             def read():
@@ -297,7 +298,7 @@ class Maker:
                 yield case(f"{field} {name}", self.lora, {**about, field: text}, fine)
 
     def deltas(self) -> Iterator[Case]:
-        """Low-rank deltas."""
+        """Return low-rank deltas."""
         from retrim.io.checkpoint import fingerprint
 
         lora = self.lora.policy.policy
@@ -313,7 +314,7 @@ class Maker:
                 yield Case(f"{field} {name}", read, fine)
 
     def overlays(self) -> Iterator[Case]:
-        """Presets over presets."""
+        """Return overlays of presets."""
         for below in (self.preset, load("track/retrim")):
             tables = without_none(values(below))
             tables.pop("options")
@@ -325,7 +326,7 @@ class Maker:
                 yield Case(f"{below.task} {name}", read, fine)
 
     def vehicles(self) -> Iterator[Case]:
-        """Vehicle files, alone and in a preset."""
+        """Return vehicle files, alone and in a preset."""
         tables = {
             "name": "quad", "mass": 0.7, "inertia": [2e-3, 2e-3, 3e-3], "arm": [0.08, 0.08], "thrust_max": 30.0,
             "rates_max": [9.0, 9.0, 4.0], "motor_tau": 0.03, "rate_lag": [0.03, 0.03, 0.1], "command_delay": 0.02,
@@ -336,7 +337,7 @@ class Maker:
             yield Case(name, lambda text=text: read_vehicle(self.file(text(), ".toml")).build(), is_unbounded)
 
     def sweeps(self) -> Iterator[Case]:
-        """Sweep files. One whose names are looked up later is made into scenarios."""
+        """Return sweep files. A sweep with names that are resolved later is converted to scenarios."""
         tables = {
             "presets": ["hover/fast"], "seeds": [0], "methods": ["base"], "disturbances": ["none"], "plants": ["bem"],
             "vehicles": ["small"], "sensors": ["ideal"], "references": ["circle"], "starts": 1, "seconds": 5.0,
@@ -358,7 +359,7 @@ class Maker:
             yield Case(name, lambda text=text: read(text), fine or name.startswith(("references", "seconds: 2")))
 
     def maps(self) -> Iterator[Case]:
-        """Log maps."""
+        """Return log maps."""
         tables = {
             "time": {"field": "t", "unit": "s", "age": "age"}, "position": {"fields": ["px", "py", "pz"], "unit": "m"},
             "velocity": {"fields": ["vx", "vy", "vz"]}, "attitude": {"fields": ["q"], "form": "xyzw"},
@@ -372,7 +373,7 @@ class Maker:
             yield Case(name, lambda text=text: read_map(self.file(text(), ".toml")), fine or names)
 
     def csv_logs(self) -> Iterator[Case]:
-        """CSV logs: hostile cells, headers and times."""
+        """Return CSV logs with malicious cells, headers and times."""
         table, path = columns(fly_once(1.0)), self.folder / "plain.csv"
         lines = write_csv(path, table).read_text().splitlines()
         log_map = read_map(self.file(MAP, ".toml"))
@@ -388,7 +389,7 @@ class Maker:
                                lambda text=text: read_flight_log(self.file(text, ".csv"), log_map), True)  # fmt: skip
 
     def npz_logs(self) -> Iterator[Case]:
-        """NPZ logs: arrays of any type and shape, and names of members."""
+        """Return NPZ logs with arrays of any type and shape, and any names of members."""
         n = 60
         fine = {
             "t": 0.02 * np.arange(n), "age": np.zeros(n),
@@ -417,7 +418,7 @@ class Maker:
             yield Case(f"member {name}", lambda data=data: read_flight_log(self.file(data.getvalue(), ".npz")), True)
 
     def trajectories(self) -> Iterator[Case]:
-        """CSV files of trajectories: hostile cells and headers."""
+        """Return trajectory files with malicious cells and headers."""
         lines = ["t,x,y,z,yaw", *(f"{0.5 * i},{i % 3},{i % 2},1.0,0.0" for i in range(9))]
         cells = [*TEXTS.values(), *(pair[0] for pair in NUMBERS.values()), "1e308", "-1e308", "1e18", "0x10", "1_0"]
         for row in (0, 4):
@@ -430,7 +431,7 @@ class Maker:
                                lambda text=text: make_reference(str(self.file(text, ".csv"))), True)  # fmt: skip
 
     def missions(self) -> Iterator[Case]:
-        """Missions of learners on another machine."""
+        """Return missions of remote learners."""
         preset = dump(self.preset)
         start = wire.pack(
             self.state, kind="learnt", about={"preset": preset, "architecture": architecture(self.policy)}
@@ -453,7 +454,7 @@ class Maker:
 
         for name, text, _ in variants(fields, toml=False):
             yield case(name, text, fine=not (name.startswith("reference") and PYTHON.search(name)))
-        for name, text, _ in self.presets():  # what has no such name is refused by who builds it
+        for name, text, _ in self.presets():  # invalid names are refused by the builder
 
             def make_learner_state(text=text):
                 return wire.pack(self.state, kind="learnt", about={"preset": text()})
@@ -462,7 +463,7 @@ class Maker:
         yield case("no file", json.dumps(fields), b"")
 
     def messages(self) -> Iterator[Case]:
-        """Small messages: notes, knobs, parameters, updates."""
+        """Return small messages: notes, knobs, parameters, updates."""
         knobs = dict(vars(ManualDisturbance()))
         for name, text, fine in variants(json.loads(json.dumps(knobs)), toml=False):
             may = fine or "key" in name or any(word in name for word in ("true", "text", "kicks"))
@@ -503,7 +504,7 @@ class Maker:
                 yield Case(f"{kind} {name}", read, may)
 
     def rows(self) -> Iterator[Case]:
-        """Rows of a flight, samples, commands, and rows of a sweep."""
+        """Return rows of a flight, samples, commands, and rows of a sweep."""
         for value in (np.nan, np.inf, 3e38, -3e38, 1e308, -0.0, 2.0**63):
             for i in range(len(COLUMNS)):
                 row = np.zeros((2, len(COLUMNS)))
@@ -528,15 +529,15 @@ class Maker:
 
 
 def callers() -> Iterator[str]:
-    """Files of the functions that are called now."""
+    """Return the files of the functions on the stack."""
     frame = sys._getframe()
     while frame is not None:
         yield frame.f_code.co_filename
         frame = frame.f_back
 
 
-class Watch:
-    """Notes what Python does while hostile bytes are read: imports, code, processes, files written, sockets."""
+class AuditHook:
+    """Records what Python does while malicious bytes are read: imports, code, processes, written files, sockets."""
 
     EVENTS = (
         "import", "exec", "compile", "pickle.find_class", "subprocess.Popen", "socket.bind", "socket.connect",
@@ -557,8 +558,8 @@ class Watch:
         paths = event == "open" and isinstance(args[1], str) and set(args[1]) & set("wax+")
         inside = bool(args) and str(args[0]).startswith(self.folder)
         if event == "compile" and args[1] == "<unknown>":
-            return  # ast.literal_eval, which runs nothing: NumPy reads the heads of arrays with it
+            return  # ast.literal_eval executes nothing; NumPy reads the headers of arrays with it
         if event in ("compile", "exec") and any("/jaxtyping/" in name for name in callers()):
-            return  # our tests check shapes
+            return  # the tests check shapes
         if event in self.EVENTS or event.startswith(self.RUNS) or ((paths or event in self.CHANGES) and not inside):
             self.events.append(f"{event} {str(args)[:200]}")

@@ -1,4 +1,4 @@
-"""A controller, a plan and a plant of a few lines each, for tests of live flight."""
+"""A minimal controller, plan and plant for tests of live flight."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "en
 
 
 class Holds(AbstractController[Float[Array, ""]]):
-    """Holds a place by four gains; it counts its ticks."""
+    """Holds HOME with four gains, and counts its ticks."""
 
     gains: Float[Array, "2"] = eqx.field(default_factory=lambda: jnp.array([4.0, 3.5]))
     home: tuple[float, ...] = eqx.field(default=tuple(HOME.tolist()), static=True)
@@ -50,7 +50,7 @@ def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, secon
 
 
 def holding(gains=(4.0, 3.5), *, fit_result=False, home=HOME):
-    """The controller as programs; ``fit_result``: with a half that is fitted, which does nothing."""
+    """Return the controller as programs; ``fit_result`` adds a fitted part without effect."""
     if not fit_result:
         return plain_source(setup(), Holds(jnp.array(gains), tuple(map(float, home))))
     arrays, fixed = eqx.partition(Holds(jnp.array(gains), tuple(map(float, home))), eqx.is_array)

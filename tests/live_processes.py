@@ -1,4 +1,4 @@
-"""Processes for drills: a plant and learners of a few lines, writers, a network that is a bus of this machine.
+"""Processes for drills: a minimal plant and minimal learners, writers, and a bus of this machine in place of a network.
 
 None of them imports JAX, so that twenty flights cost little.
 """
@@ -35,7 +35,7 @@ def rotation(vector):
 
 
 def move(x, u, push=(0.0, 0.0, 0.0)):
-    """One tick of a point mass, in steps of a millisecond."""
+    """Return one tick of a point mass, in steps of a millisecond."""
     p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
     turn = rotation(1e-3 * np.asarray(u[1:]))
     for _ in range(20):
@@ -46,7 +46,7 @@ def move(x, u, push=(0.0, 0.0, 0.0)):
 
 @dataclass(frozen=True)
 class DrillPlan:
-    """What a process of a drill is started with."""
+    """Arguments of a process of a drill."""
 
     folder: Path
     parent: int
@@ -56,7 +56,7 @@ class DrillPlan:
 
 
 def plant(plan: DrillPlan) -> None:
-    """A point mass with a delay of a tick, against the clock."""
+    """Run a point mass with a delay of one tick, in real time."""
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     bus.publish("ready.plant", pack_note("ready", refused=be_punctual(20, {0})))
     if (epoch := wait_for_take_off(bus, parent)) is None:
@@ -80,7 +80,7 @@ def plant(plan: DrillPlan) -> None:
 
 
 def learner(plan: DrillPlan) -> None:
-    """Gains near those that are flown, now and then."""
+    """Publish gains near the current ones, at intervals."""
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     bus.publish(f"ready.{plan.role}", pack_note("ready", base=plan.base))
     topic, rng, heart = "parameters.policy", np.random.default_rng(), Heart(bus, plan.role)
@@ -94,12 +94,12 @@ def learner(plan: DrillPlan) -> None:
 
 
 def nothing(plan) -> None:
-    """A process that does nothing for long."""
+    """Run for a long time without doing anything."""
     time.sleep(60.0)
 
 
 def write_for_ever(folder: Path, topic: str, room: int) -> None:
-    """Messages of many lengths, each of one byte that is repeated."""
+    """Write messages of many lengths; each repeats one byte."""
     bus = SharedMemoryBus(folder)
     i = 0
     while True:
@@ -108,7 +108,7 @@ def write_for_ever(folder: Path, topic: str, room: int) -> None:
 
 
 def answer(address: Address, topics: dict[str, int], topic: str, data: bytes) -> None:
-    """One message, once somebody else's is there."""
+    """Publish one message after a message of the other end has arrived."""
     bus = address.join(topics, listen=False)
     until = time.monotonic() + 10.0
     while bus.latest(topic) is None and time.monotonic() < until:
@@ -119,7 +119,7 @@ def answer(address: Address, topics: dict[str, int], topic: str, data: bytes) ->
 
 
 class Left(SharedMemoryBus):
-    """A bus in place of a network, which notes that somebody left it."""
+    """A bus in place of a network, which records that a process left it."""
 
     def close(self):
         if self._maps:
@@ -129,7 +129,7 @@ class Left(SharedMemoryBus):
 
 @dataclass(frozen=True)
 class Beside(Address):
-    """Its network is a bus of this machine."""
+    """An address whose network is a bus of this machine."""
 
     folder: Path = Path()
 

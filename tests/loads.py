@@ -1,4 +1,4 @@
-"""Motion of a load below a vehicle on a given path, and what a filter of the load receives from it."""
+"""Motion of a load below a vehicle on a given path, and the inputs of a load filter."""
 
 from functools import partial
 
@@ -33,12 +33,12 @@ class Rows(eqx.Module):
 
 
 def seconds(n, step=DT):
-    """Times of ``n`` steps [s]."""
+    """Return the times of ``n`` steps [s]."""
     return jnp.asarray(step * np.arange(n), jnp.zeros(()).dtype)
 
 
 def path(t):
-    """A position of an irregular motion within a metre or so."""
+    """Return a position of an irregular motion within about a metre."""
     waves = ((1.3, 0.0, 0.5), (2.9, 1.0, 0.2), (4.1, 2.0, 0.06))
     side = lambda k: sum(a * jnp.sin(w * t + p + k) for w, p, a in waves)  # noqa: E731
     return jnp.stack([side(0.0), side(2.0), 1.0 + 0.3 * jnp.sin(1.7 * t)])
@@ -46,7 +46,7 @@ def path(t):
 
 @partial(jax.jit, static_argnums=1)
 def rows(load, ticks, push, drag, noise=0.0, key=None):
-    """The rows of a flight along the path, with a push [m/s^2] and a drag [1/s] that the model misses, too."""
+    """Return the rows of a flight along the path, with a push [m/s^2] and a drag [1/s] outside the model."""
     speed, level = jax.jacfwd(path), jnp.eye(3)
 
     def substep(s, t):
@@ -72,11 +72,11 @@ def rows(load, ticks, push, drag, noise=0.0, key=None):
 
 
 def flight(share, length=0.5, ticks=500, push=(0.3, -0.2, 0.4), drag=0.3, key=None, noise=0.0, **changes):
-    """The rows of a flight with a load."""
+    """Return the rows of a flight with a load."""
     load = SlungLoad.of(share, length=length, **changes)
     return rows(load, ticks, jnp.array(push), jnp.array(drag), jnp.array(noise), key)
 
 
 def angle_between(a, b):
-    """Angle between unit vectors [rad]."""
+    """Return the angle between unit vectors [rad]."""
     return np.arccos(np.clip(np.sum(np.asarray(a) * np.asarray(b), axis=-1), -1.0, 1.0))

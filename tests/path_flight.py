@@ -45,7 +45,7 @@ class Vehicles(NamedTuple):
 
 
 class Flights(NamedTuple):
-    """What was measured and commanded at each tick, (n, ticks, ...)."""
+    """Measurements and commands at each tick, (n, ticks, ...)."""
 
     p: np.ndarray
     R: np.ndarray
@@ -64,7 +64,7 @@ def random_vehicles(rng, n):
 
 
 def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.inf):
-    """Fly from a random point 1 m away; ``excitation`` maps the time to what is added to each command.
+    """Fly from a random point 1 m away; ``excitation`` maps the time to an addition to each command.
 
     From ``change`` [s] on, the vehicles are those of ``later``.
     """

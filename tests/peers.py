@@ -1,4 +1,4 @@
-"""Processes that stand in for an autopilot and its vehicle."""
+"""Processes that simulate an autopilot and its vehicle."""
 
 import contextlib
 import subprocess
@@ -7,7 +7,7 @@ import sys
 
 @contextlib.contextmanager
 def start_process(*command):
-    """A process, once it has said that it is there; ended by the signal that Ctrl-C is to it."""
+    """Start a process and wait for its first output; at the end, interrupt it."""
     process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True)
     try:
         assert "Ctrl-C ends it" in process.stdout.readline()
@@ -19,6 +19,6 @@ def start_process(*command):
 
 
 def peer(speaks, *words):
-    """A peer of ours that speaks the language of an autopilot."""
+    """Start a peer with the protocol of an autopilot."""
     module = "retrim.ros1.peer" if speaks == "ros" else f"retrim.testing.{speaks}_peer"
     return start_process(sys.executable, "-m", module, *words)

@@ -1,4 +1,4 @@
-"""The bench: times beside the machine's own unit, on one core and on all."""
+"""The benchmark: times relative to the machine's own unit, on one core and on all."""
 
 import json
 import subprocess
@@ -13,8 +13,8 @@ from retrim.runkit.reporter import Silent
 from retrim.runkit.run import Run
 
 
-def test_a_time_is_told_in_units_of_its_moment(monkeypatch):
-    """On a machine that becomes ten times as slow in the middle of a run, as many units are taken as before."""
+def test_time_is_in_units_of_its_moment(monkeypatch):
+    """If the machine becomes ten times slower during a run, the result in units is the same."""
     units, took = iter([0.1, 0.1, 1.0, 1.0, 1.0]), iter([0.3, 1.65, 3.0, 3.0])
     monkeypatch.setattr(timing, "unit", lambda: lambda: next(units))
     monkeypatch.setattr(timing, "seconds", lambda run: next(took))
@@ -30,8 +30,8 @@ def test_one_core_is_one():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "1\n"
 
 
-def test_a_row_has_both_and_the_share_of_the_limit(tmp_path, monkeypatch):
-    """An update that takes four units for the products of one is at 25 % of the limit; one core goes first."""
+def test_row_has_both_times_and_share_of_limit(tmp_path, monkeypatch):
+    """An update of four units for the products of one unit is at 25 % of the limit; one core runs first."""
     calls = []
 
     def process(name, cores, environment):

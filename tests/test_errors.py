@@ -1,4 +1,4 @@
-"""Messages of errors are one printable line of limited length, whatever they quote."""
+"""Messages of errors are one printable line of limited length for any quoted text."""
 
 import pickle
 
@@ -12,7 +12,7 @@ KINDS = [each for each in vars(errors).values() if isinstance(each, type) and is
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_message_is_a_line_whatever_it_quotes(kind):
+def test_message_is_one_line_for_any_quoted_text(kind):
     for text in ("plain", "a\nb\tc", "\x1b[2J\x00\u202e", "start " + 10**7 * "x" + " end", ""):
         error = kind(text)
         assert len(str(error)) <= LONGEST
@@ -21,7 +21,7 @@ def test_a_message_is_a_line_whatever_it_quotes(kind):
     assert str(kind("plain: 'a' must be b")) == "plain: 'a' must be b"
 
 
-def test_a_long_line_keeps_its_beginning_and_its_end():
+def test_long_line_keeps_its_beginning_and_end():
     line = one_line("start " + 10**7 * "x" + " end")
     assert line.startswith("start x")
     assert line.endswith("x end")
@@ -31,7 +31,7 @@ def test_a_long_line_keeps_its_beginning_and_its_end():
     assert excerpt("a'b\n") == '"a\'b\\n"'
 
 
-def test_nothing_that_is_shown_steers_a_terminal():
+def test_shown_text_has_no_control_characters():
     with console.capture() as display:
         refuse("a\x1b]0;owned\x07")
         RichReporter().say("b\x1b[2J\nc")

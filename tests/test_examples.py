@@ -15,7 +15,7 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)(?![\w])
 @pytest.mark.documentation
 @pytest.mark.usefixtures("optax_promotion")
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_runs(path, capsys, monkeypatch, tmp_path):
+def test_example_runs(path, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
     example = importlib.util.module_from_spec(spec)
@@ -28,7 +28,7 @@ def test_an_example_runs(path, capsys, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_every_file_of_the_folder_is_an_example_or_belongs_to_one_or_to_a_page():
+def test_every_file_belongs_to_an_example_or_page():
     assert [path.stem[:2] for path in EXAMPLES] == [f"0{i}" for i in range(1, 6)]
     docs = FOLDER.parent / "docs"
     pages = [*docs.glob("*.md"), *docs.glob("how-to/*.md")]

@@ -1,4 +1,4 @@
-"""Ten extensions of at most 20 lines, from the user's files in an empty folder: fly, sweep, live and replay."""
+"""Ten extensions of at most 20 lines, from files in an empty folder: flights, sweep, live flight and replay."""
 
 import json
 import shutil
@@ -49,7 +49,7 @@ hidden_sizes = [8, 8]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, as_a_user):
-    """Folder with the user's files and a policy of their reward, network and vehicle."""
+    """Return a folder with the user's files and a policy of their reward, network and vehicle."""
     folder = tmp_path_factory.mktemp("user")
     for path in FILES:
         shutil.copy(path, folder)
@@ -66,11 +66,11 @@ def folder(tmp_path_factory, as_a_user):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_an_extension_has_at_most_twenty_lines(path):
+def test_extension_has_at_most_twenty_lines(path):
     assert len([line for line in path.read_text().splitlines() if line.strip()]) <= 20
 
 
-def test_they_fly_and_learn_in_lockstep(folder):
+def test_extensions_fly_and_learn_in_lockstep(folder):
     where = "--disturbance", "disturbance:thermal=3", "--sensors", "sensor:mocap"
     retrim("fly", "--policy", "p", *TRUST, *where, "--seconds", "3", "--out", "f", cwd=folder)
     rows = {row["method"]: row for row in results(folder / "f")["rows"]}
@@ -81,7 +81,7 @@ def test_they_fly_and_learn_in_lockstep(folder):
     assert {row["method"] for row in results(folder / "g")["rows"]} == {"base", "controller:pd"}
 
 
-def test_they_fly_live_and_their_log_is_replayed(folder):
+def test_extensions_fly_live_and_log_is_replayed(folder):
     where = "--disturbance", "disturbance:thermal=3", "--sensors", "sensor:mocap"
     retrim("live", "--policy", "p", *TRUST, *where, "--seconds", "5", "--no-page", "--out", "l", cwd=folder)
     events = [json.loads(line)["event"] for line in (folder / "l" / "events.jsonl").read_text().splitlines()]
@@ -92,7 +92,7 @@ def test_they_fly_live_and_their_log_is_replayed(folder):
     assert "2 of 2 updates" in out or "1 of 2 updates" in out
 
 
-def test_they_are_axes_of_a_sweep(folder):
+def test_extensions_are_axes_of_sweep(folder):
     names = "task:task", "controller:pd", "disturbance:thermal", "sensor:mocap"
     trust = [word for name in names for word in ("--trust", name)]
     retrim("sweep", "sweep.toml", *trust, "--out", "s", cwd=folder)
@@ -102,7 +102,7 @@ def test_they_are_axes_of_a_sweep(folder):
     }
 
 
-def test_a_network_that_is_no_perceptron_is_refused_where_one_is_needed(folder):
+def test_other_network_is_refused_where_perceptron_is_needed(folder):
     out = retrim("fly", "--policy", "p", *TRUST, "--adapt", "lora", "--seconds", "1", cwd=folder, code=1)
     assert "low-rank adaptation needs a perceptron" in out
     out = retrim("export", "p", "--to", "npz", *TRUST, cwd=folder, code=1)
@@ -118,7 +118,7 @@ def gust(key, size):
 """
 
 
-def test_a_mistake_in_a_file_of_the_user_is_a_line_with_its_place_or_a_traceback(folder):
+def test_error_in_user_file_gives_line_with_location_or_traceback(folder):
     (folder / "broken.py").write_text(BROKEN)
     words = "fly", "--policy", "p", *TRUST, "--disturbance", "broken:gust", "--adapt", "none", "--seconds", "1"
     out = retrim(*words, cwd=folder, code=1)

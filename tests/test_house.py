@@ -1,4 +1,4 @@
-"""The house rules that a machine can check: layers, docstrings, sizes, imports, no addresses in the pins."""
+"""Automated house rules: layers, docstrings, sizes, imports, and no addresses in the pins."""
 
 import ast
 import importlib
@@ -30,7 +30,7 @@ def test_layers(monkeypatch):
     assert importlinter.lint_imports(config_filename="pyproject.toml") == 0
 
 
-def test_every_room_has_its_place_among_the_layers():
+def test_every_package_is_in_a_layer():
     text = (ROOT / "pyproject.toml").read_text()
     (layers,) = re.findall(r"^layers = (\[.*\])$", text, re.M)
     places = {name.strip() for layer in ast.literal_eval(layers) for name in layer.split("|")}
@@ -53,7 +53,7 @@ def test_public_names_have_docstrings(package):
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_files_are_small_and_have_no_junk_drawers(path):
+def test_files_are_small_and_not_named_utils(path):
     text = path.read_text()
     assert len(text.splitlines()) <= 300
     assert path.stem not in {"utils", "common", "helpers", "misc"}
@@ -65,7 +65,7 @@ CHANGING = {"Document", "Fallback", "FleetProcess", "GeometricHover", "RollbackM
 
 
 def test_values_are_frozen():
-    """Every dataclass but those that are no values; an ``equinox.Module`` is frozen by itself."""
+    """Dataclasses are frozen except for those with state; an ``equinox.Module`` is always frozen."""
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):
             for how in getattr(node, "decorator_list", ()):
@@ -74,14 +74,14 @@ def test_values_are_frozen():
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_no_room_outgrows_the_house(room):
+def test_packages_have_limited_size(room):
     mine = lines((HOUSE / room).rglob("*.py"))
     assert mine <= 0.2 * lines(SOURCES)
     assert room != "cli" or mine <= 1200
 
 
-def test_what_is_stated_once_stays_as_it_is():
-    """Data classes are frozen, but for those of something that goes on: documents, processes, guards."""
+def test_dataclasses_are_frozen():
+    """Exceptions are dataclasses with state: documents, processes, guards."""
 
     def melt(path):
         classes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)]
@@ -98,14 +98,14 @@ def test_only_viz_imports_matplotlib():
     assert {p.parent.name for p in importers} == {"viz"}
 
 
-def test_processes_of_ours_take_no_module_from_the_current_folder():
+def test_processes_do_not_import_from_current_folder():
     for path in SOURCES:
         assert path.stem == "launch" or '"-m"' not in path.read_text(), path
     assert PYTHON[1:] == ("-P", "-m")
 
 
 @pytest.mark.parametrize("name", ["constraints.txt", "tools/uv.txt"])
-def test_pins_hold_names_versions_and_hashes_only(name):
+def test_pins_have_only_names_versions_and_hashes(name):
     pins = (ROOT / name).read_text().replace(" \\\n    ", " ").splitlines()
     assert pins
     for line in pins:
@@ -113,7 +113,7 @@ def test_pins_hold_names_versions_and_hashes_only(name):
 
 
 def test_tools_of_hosted_checks_are_pinned():
-    """A moving tag, as v4, is another program tomorrow."""
+    """A moving tag such as v4 may refer to a different program tomorrow."""
     used = re.findall(r"uses: (\S+)@(\S+)", (ROOT / ".github" / "workflows" / "ci.yml").read_text())
     assert used
     assert not [each for each in used if not re.fullmatch(r"[0-9a-f]{40}|v\d+\.\d+\.\d+", each[1])]
@@ -154,8 +154,8 @@ assert not bridge._backends, "an array is made at import"
 """
 
 
-def test_importing_retrim_and_help_are_quick_and_no_import_starts_a_backend():
-    """In a fresh interpreter, since here one is running already."""
+def test_import_and_help_are_fast_and_start_no_backend():
+    """The test uses a fresh interpreter, since a backend is already running here."""
     code = QUICK_IMPORT.format(packages=PACKAGES)
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr

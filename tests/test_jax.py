@@ -14,8 +14,8 @@ from retrim.evaluation.jax_bug_check import EXCLUDED
 ROOT = Path(__file__).parent.parent
 
 
-def test_batched_products_are_right_as_users_compile_them():
-    """In a process of its own, without the flags of the tests."""
+def test_batched_products_are_correct_with_default_flags():
+    """The test uses a separate process without the flags of the test suite."""
     sizes = [("float32", 1_000), ("float32", 16_385), ("float32", 32_769), ("float64", 16_385)]
     code = (
         "import retrim, jax; jax.config.update('jax_enable_x64', True); import jax.numpy as jnp\n"
@@ -29,8 +29,8 @@ def test_batched_products_are_right_as_users_compile_them():
 
 @pytest.mark.parametrize("imports", ["import jax; from retrim import State", "from retrim import State; import jax"])
 @pytest.mark.parametrize(("calls", "extract"), [(None, "float32"), ("tensorfloat32", "tensorfloat32")])
-def test_products_are_of_whole_single_precision_unless_asked(calls, extract, imports):
-    """On a GPU, too, whose default is less; a user's choice stands, and the order of imports does not matter."""
+def test_products_have_full_single_precision_by_default(calls, extract, imports):
+    """This includes GPUs, whose default is lower; the user's choice has priority, in any order of imports."""
     environment = {name: value for name, value in os.environ.items() if name != "JAX_DEFAULT_MATMUL_PRECISION"}
     environment |= {} if calls is None else {"JAX_DEFAULT_MATMUL_PRECISION": calls}
     code = f"{imports}; print(jax.config.jax_default_matmul_precision)"
@@ -38,7 +38,7 @@ def test_products_are_of_whole_single_precision_unless_asked(calls, extract, imp
     assert done.stdout.strip() == extract, done.stderr
 
 
-def test_the_excluded_version_is_not_installed_and_cannot_be():
+def test_excluded_version_is_not_installed():
     assert jax.__version__ != EXCLUDED
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert f"jax>=0.8,!={EXCLUDED}" in project["dependencies"]

@@ -1,4 +1,4 @@
-"""Progress of calls from Python: a bar in a notebook or a terminal, and nothing elsewhere."""
+"""Progress of calls from Python: a bar in a notebook or a terminal, and no output elsewhere."""
 
 import os
 import pty
@@ -20,12 +20,12 @@ print("over")
 """
 
 
-def test_a_process_without_a_terminal_prints_nothing():
+def test_process_without_terminal_prints_nothing():
     result = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
     assert (result.stdout, result.stderr) == ("over\n", "")
 
 
-def test_a_terminal_shows_a_bar_on_the_standard_error():
+def test_terminal_shows_bar_on_standard_error():
     reader, writer = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT],
@@ -62,14 +62,14 @@ class Display:
 
 @pytest.fixture
 def cell(monkeypatch):
-    """The display of a process that looks like the kernel of a notebook."""
+    """Return the display of a process that imitates a notebook kernel."""
     display = Display()
     kernel = types.SimpleNamespace(display=display, get_ipython=lambda: types.SimpleNamespace(kernel=None))
     monkeypatch.setitem(sys.modules, "IPython", kernel)
     return display
 
 
-def test_a_notebook_shows_a_bar_and_removes_it_at_the_end(cell):
+def test_notebook_shows_bar_and_removes_it_at_end(cell):
     def run_interrupted():
         with show_progress("flying") as advance:
             advance(0.25, "<b>")
@@ -82,7 +82,7 @@ def test_a_notebook_shows_a_bar_and_removes_it_at_the_end(cell):
     assert cell.texts[-1] == ""
 
 
-def test_a_bar_shows_the_first_progress_and_the_last_one_and_few_in_between(cell):
+def test_bar_shows_first_last_and_few_other_steps(cell):
     with show_progress("flying") as advance:
         for tick in range(1001):
             advance(tick / 1000, f"{tick}")
@@ -104,7 +104,7 @@ def test_other_threads_and_no_progress_show_nothing(cell):
     assert cell.texts == []
 
 
-def test_a_lost_terminal_does_not_end_the_work(cell, monkeypatch):
+def test_lost_terminal_does_not_end_work(cell, monkeypatch):
     def lose(text):
         raise OSError(5, "Input/output error")
 

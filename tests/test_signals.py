@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and a terminal that was closed end a command in the same way, and what is done is kept."""
+"""Ctrl-C, SIGTERM and a closed terminal end a command in the same way, and finished work is saved."""
 
 import os
 import pty
@@ -49,19 +49,19 @@ def test_each_signal_stops_and_raises(number):
     assert stop.is_set()
 
 
-def test_what_a_closed_terminal_interrupts_is_kept(tmp_path):
+def test_closed_terminal_saves_finished_work(tmp_path):
     out, (ours, theirs) = tmp_path / "out", pty.openpty()
     words = [sys.executable, "-c", WORK, str(out)]
     process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
     os.close(theirs)
     begin(out)
-    os.close(ours)  # what is written there is an error from now on
+    os.close(ours)  # from now on, writing to it raises an error
     process.send_signal(signal.SIGHUP)
     assert process.wait(60.0) == 0
     assert out.read_text() == "kept, True"
 
 
-def test_a_hangup_that_nohup_ignores_stays_ignored():
+def test_hangup_ignored_by_nohup_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with handle_signals(lambda *_: pytest.fail("it was answered")):

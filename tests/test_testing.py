@@ -1,4 +1,4 @@
-"""The conformance suites accept what is right and name the law that a wrong thing breaks."""
+"""The conformance suites accept valid objects, and report the violated law of invalid ones."""
 
 import dataclasses
 
@@ -62,7 +62,7 @@ class FaultyPlant(Plant):
         ("stop", "a stopped plant refuses"),
     ],
 )
-def test_a_faulty_plant_breaks_a_law_by_name(fault, law):
+def test_violated_law_of_faulty_plant_is_reported(fault, law):
     with pytest.raises(AssertionError, match=law):
         testing.check_plant(lambda: FaultyPlant(fault))
 
@@ -72,22 +72,22 @@ def test_tasks_conform(preset):
     testing.check_task(Setup.from_preset(load(preset)).flight_task, starts=4)
 
 
-def test_a_faulty_task_breaks_a_law_by_name():
+def test_violated_law_of_faulty_task_is_reported():
     task = hover_task()
 
-    class Flat(type(task)):
+    class FlatReward(type(task)):
         def reward(self, t, x, u):
             return 0.0 * x.p[0]
 
-    class Endless(type(task)):
+    class NeverTerminated(type(task)):
         def terminated(self, t, x):
             return jnp.array(False)
 
     fields = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
     with pytest.raises(AssertionError, match="the reward has a gradient"):
-        testing.check_task(Flat(**fields), starts=2)
+        testing.check_task(FlatReward(**fields), starts=2)
     with pytest.raises(AssertionError, match="not finite is terminated"):
-        testing.check_task(Endless(**fields), starts=2)
+        testing.check_task(NeverTerminated(**fields), starts=2)
 
 
 def test_controllers_conform(key):
@@ -95,7 +95,7 @@ def test_controllers_conform(key):
     policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
     testing.check_controller(PolicyController(task.observation, policy))
 
-    class Growing(AbstractController[jax.Array]):
+    class GrowingMemory(AbstractController[jax.Array]):
         def init(self, x):
             return jnp.zeros(1)
 
@@ -103,14 +103,14 @@ def test_controllers_conform(key):
             return Command.hover(), jnp.concatenate([memory, memory])
 
     with pytest.raises(AssertionError, match="the memory keeps its shapes"):
-        testing.check_controller(Growing())
+        testing.check_controller(GrowingMemory())
 
 
 def test_residual_models_conform():
     ensemble = EnsembleModel(jnp.array([0.0, 0.0, 1.0]), small().omega_max, jnp.array(1e-2), jnp.array(1e-3), steps=50)
     testing.check_residual(ensemble)
 
-    class Deaf(eqx.Module):
+    class IgnoresRows(eqx.Module):
         def init(self, key):
             return jnp.zeros(3)
 
@@ -124,4 +124,4 @@ def test_residual_models_conform():
             return state
 
     with pytest.raises(AssertionError, match="a constant acceleration is learnt"):
-        testing.check_residual(Deaf())
+        testing.check_residual(IgnoresRows())

@@ -15,7 +15,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from hostile import TEXTS, Maker, Watch
+from hostile import TEXTS, AuditHook, CaseMaker
 from retrim import load_learner_state, load_policy
 from retrim.config import read_vehicle
 from retrim.errors import CheckpointError, ConfigError, LogError, RetrimError
@@ -34,7 +34,7 @@ FEW = 101
 
 @pytest.fixture(scope="module")
 def watch(tmp_path_factory):
-    return Watch(tmp_path_factory.getbasetemp())
+    return AuditHook(tmp_path_factory.getbasetemp())
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def outcome(case, watch):
 
 def read_all(folder, watch, every):
     """Read each ``every``-th case twice, since the first read imports modules for reasons other than the case."""
-    maker, result = Maker(folder), list[str]()
+    maker, result = CaseMaker(folder), list[str]()
 
     def choose(each):
         return (case for i, case in enumerate(maker.cases()) if i % each == 0)

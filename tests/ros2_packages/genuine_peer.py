@@ -23,7 +23,7 @@ class GenuineNode(RclpyNode):
         return lambda data: publisher.publish(_copied(kind.decode(data), cls()))
 
     def _check_installed(self, topic, kind):
-        """Do nothing, since a peer may have another version."""
+        """Do nothing, since a peer may have a different version."""
 
 
 def _copied(source, target):

@@ -68,7 +68,7 @@ def class_for(kind: MessageType, type_hash: str = "") -> type:
     hash_value = TypeHash(1, (ctypes.c_uint8 * 32)(*bytes.fromhex(digits)))
 
     def largest(bounds: ctypes.POINTER(ctypes.c_char)) -> int:
-        bounds[0] = b"\0"  # neither bounded nor plain: the length of each message counts
+        bounds[0] = b"\0"  # neither bounded nor plain: the length of each message is relevant
         return size
 
     callbacks = Callbacks(

@@ -1,4 +1,4 @@
-"""A flight as one program is the same flight, tick for tick, as that of the plant and its pilot."""
+"""A flight as one program equals the flight of the plant and its pilot, tick for tick."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ from retrim.runtime.together import fly_together
 
 
 @pytest.fixture(scope="module")
-def parts():
+def plant_and_pilot():
     task = hover_task(history=2)
     policy = Policy.of(task.observation.size, small(), key=random.key(3), hidden=(8,))
     policy = jax.tree.map(lambda leaf: leaf + 0.02, policy)
@@ -48,16 +48,16 @@ SENSORS = SensorModel.of(position=0.01, velocity=0.01, attitude=0.01, latency=20
 
 
 @pytest.mark.parametrize(("delay_s", "sensors"), [(0.0, None), (0.02, None), (0.025, SENSORS)])
-def test_same_as_flying_the_plant(parts, delay_s, sensors):
-    model, push, controller, x0 = parts
+def test_equals_flight_of_plant(plant_and_pilot, delay_s, sensors):
+    model, push, controller, x0 = plant_and_pilot
     plant = SimPlant(model, push, delay_s=delay_s, sensors=sensors, seed=4)
     log = fly(plant, ControllerPilot(controller), x0, ticks=15)
     assert_same(jax.jit(lambda x0: batch_flight(plant.simulation, controller, x0, ticks=15))(x0), log)
 
 
-def test_a_load_on_a_cable_swings_the_same(parts):
-    """As one program, and in a batch of different loads, whose launch shares a program."""
-    model, _, controller, x0 = parts
+def test_slung_load_equals_flight_of_plant(plant_and_pilot):
+    """The flight runs as one program, and in a batch of different loads whose launches share a program."""
+    model, _, controller, x0 = plant_and_pilot
     loads = [SlungLoad.of(share, length=0.3, picked=0.1, dropped=0.24) for share in (0.1, 0.4)]
     plants = [SimPlant(model, SumOfDisturbances((load, Constant(jnp.ones(3))))) for load in loads]
     logs = [fly(plant, ControllerPilot(controller), x0, ticks=15) for plant in plants]
@@ -70,9 +70,9 @@ def test_a_load_on_a_cable_swings_the_same(parts):
     assert np.abs(logs[0].true.p[-1] - logs[1].true.p[-1]).max() > 0.01
 
 
-def test_a_late_measurement_is_taken_for_what_it_says_of_now(parts):
-    """By the frame of effective gravity, in both ways of flying; a vehicle that drifts is seen where it is."""
-    model, push, controller, x0 = parts
+def test_late_measurement_is_predicted_to_present(plant_and_pilot):
+    """The frame of effective gravity does this in both ways of flying: a drifting vehicle has its true position."""
+    model, push, controller, x0 = plant_and_pilot
     observer = DisturbanceObserver(
         PointMass(0.02), jnp.array(0.05), jnp.array(6.0), jnp.array(4.0), CommandPath.of(0.02)
     )
@@ -82,14 +82,14 @@ def test_a_late_measurement_is_taken_for_what_it_says_of_now(parts):
     log = fly(late, ControllerPilot(in_frame), moving, ticks=15)
     assert_same(jax.jit(lambda x0: batch_flight(late.simulation, in_frame, x0, ticks=15))(moving), log)
     expected = fly(now, ControllerPilot(in_frame), moving, ticks=15)
-    unaware = fly(late, ControllerPilot(Unaware(in_frame)), moving, ticks=15)
-    # Rates are the policy's; thrust is the observer's, which is late. The first sample is not.
+    unaware = fly(late, ControllerPilot(IgnoresAge(in_frame)), moving, ticks=15)
+    # Rates are those of the policy; thrust is that of the observer, which is delayed. The first sample is not.
     off, blind = (np.abs(each.u - expected.u)[3:, 1:].max() for each in (log, unaware))
     assert off < 0.5 * blind
 
 
-class Unaware(AbstractController):
-    """A controller that takes measurements as they are."""
+class IgnoresAge(AbstractController):
+    """A controller that ignores the age of measurements."""
 
     inner: AbstractController
 
@@ -100,8 +100,8 @@ class Unaware(AbstractController):
         return self.inner(memory, t, x)
 
 
-class Greedy(AbstractController[Command]):
-    """Wants ever more thrust, from what it was granted."""
+class IncreasingThrust(AbstractController[Command]):
+    """A controller that requests more thrust than was accepted."""
 
     def init(self, x):
         return Command.hover(x.p.dtype)
@@ -114,17 +114,17 @@ class Greedy(AbstractController[Command]):
         return u
 
 
-def test_limits_are_those_of_the_plant_and_are_remembered(parts):
-    model, push, _, x0 = parts
+def test_limits_of_plant_reach_memory_of_controller(plant_and_pilot):
+    model, push, _, x0 = plant_and_pilot
     plant = SimPlant(model, push)
-    log = fly(plant, ControllerPilot(Greedy()), x0, ticks=8)
-    flight = jax.jit(lambda x0: batch_flight(plant.simulation, Greedy(), x0, ticks=8))(x0)
+    log = fly(plant, ControllerPilot(IncreasingThrust()), x0, ticks=8)
+    flight = jax.jit(lambda x0: batch_flight(plant.simulation, IncreasingThrust(), x0, ticks=8))(x0)
     assert_same(flight, log)
     assert float(flight.issued.c[-1]) == pytest.approx(1.5 * float(flight.accepted.c[-1]))  # no windup
 
 
-def test_maps_over_vehicles_that_see_other_noise(parts):
-    model, push, controller, x0 = parts
+def test_maps_over_vehicles_with_different_noise(plant_and_pilot):
+    model, push, controller, x0 = plant_and_pilot
     plants = [SimPlant(model, push, sensors=SENSORS, seed=seed) for seed in (0, 1)]
     together = stack([plant.simulation for plant in plants])
     flight = jax.jit(jax.vmap(lambda s: batch_flight(s, controller, x0, ticks=5)))(together)

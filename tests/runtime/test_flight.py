@@ -1,4 +1,4 @@
-"""The flight loop: clocks that start anywhere, ticks that are missed, commands that are limited, and who is told."""
+"""The flight loop: clock origins, missed ticks, limited commands, and observers."""
 
 import json
 import threading
@@ -21,8 +21,8 @@ START = State.at(jnp.array([0.3, -0.2, 1.5]))
 HOVER = FunctionPilot(lambda measurement: Command.hover())
 
 
-class Odd(Plant):
-    """The simple plant with another clock, with commands limited, or with measurements missed."""
+class OddPlant(Plant):
+    """The simple plant with a shifted clock, with limited commands, or with missed measurements."""
 
     def __init__(self, *, clock=0.0, limit=None, stalls=(), sensors="ideal", disturbance="none"):
         self._inner = Scenario(disturbance, "simple", sensors=sensors).make()
@@ -51,8 +51,8 @@ class Odd(Plant):
         return measurement._replace(t=self._clock + measurement.t)
 
 
-class Witness:
-    """An observer that keeps what it is told, in order."""
+class RecordingObserver:
+    """An observer that stores its inputs in order."""
 
     def __init__(self):
         self.calls = []
@@ -65,7 +65,7 @@ class Witness:
 
 
 class Climb(AbstractController[None]):
-    """Thrust that depends on the time since the start of the flight."""
+    """Commands thrust as a function of the time since the start of the flight."""
 
     def init(self, x):
         return None
@@ -74,8 +74,8 @@ class Climb(AbstractController[None]):
         return Command(9.81 + t, jnp.zeros(3)), None
 
 
-class Eventful(Pilot):
-    """Hovers, and has something to tell at its third tick."""
+class PilotWithEvent(Pilot):
+    """A pilot that hovers, and reports an event at its third tick."""
 
     def __init__(self):
         self._t, self._start = 0.0, 0.0
@@ -100,8 +100,8 @@ def policy_controller(key, history=2):
 # ---- time
 
 
-def test_a_clock_may_start_anywhere():
-    """Pilots are told the time since the start of the flight, whatever the plant's clock says."""
+def test_flight_is_independent_of_clock_origin():
+    """Pilots receive the time since the start of the flight for any clock of the plant."""
     calls = []
 
     def late(t, x):
@@ -109,7 +109,7 @@ def test_a_clock_may_start_anywhere():
         return t > 0.29
 
     flight = [
-        fly(Odd(clock=clock), ControllerPilot(Climb()), START, ticks=50, terminated=late) for clock in (0.0, 1.7e9)
+        fly(OddPlant(clock=clock), ControllerPilot(Climb()), START, ticks=50, terminated=late) for clock in (0.0, 1.7e9)
     ]
     for log in flight:
         assert len(log.t) == 16
@@ -121,9 +121,9 @@ def test_a_clock_may_start_anywhere():
     np.testing.assert_allclose(flight[1].p, flight[0].p, atol=1e-6)
 
 
-def test_missed_ticks_count_and_shorten_the_flight():
+def test_missed_ticks_count_as_flight_time():
     """The clock jumps by three ticks at the fifth and eighth step: 20 ticks take 16 steps."""
-    plant = Odd(stalls=(4, 7))
+    plant = OddPlant(stalls=(4, 7))
     log = fly(plant, HOVER, START, ticks=20)
     assert log.missed_ticks == 4
     assert len(log.t) == 17
@@ -131,7 +131,7 @@ def test_missed_ticks_count_and_shorten_the_flight():
     steps = np.full(16, 0.02)
     steps[[4, 7]] = 0.06
     np.testing.assert_allclose(np.diff(log.t), steps)
-    assert fly(Odd(), HOVER, START, ticks=20).missed_ticks == 0
+    assert fly(OddPlant(), HOVER, START, ticks=20).missed_ticks == 0
 
 
 # ---- commands that a plant limits
@@ -141,9 +141,9 @@ def limit(u):
     return Command(jnp.clip(u.c, 9.5, 10.0), jnp.clip(u.omega, -0.05, 0.05))
 
 
-def test_log_and_observation_hold_the_accepted_command(key):
-    """The policy's next observation has the accepted command: replayed with it, each issued command is the same."""
-    controller, plant = policy_controller(key), Odd(limit=limit)
+def test_log_and_observation_have_accepted_command(key):
+    """The next observation of the policy has the accepted command: a replay with it reproduces each issued command."""
+    controller, plant = policy_controller(key), OddPlant(limit=limit)
     log = fly(plant, ControllerPilot(controller), START, ticks=12)
     commands = np.stack([u.vector() for u in plant.commands])
     accepted_command = np.stack([limit(u).vector() for u in plant.commands])
@@ -168,11 +168,11 @@ def test_log_and_observation_hold_the_accepted_command(key):
 # ---- the record
 
 
-def test_a_log_gives_the_window_that_was_seen_in_flight(key):
-    """Of a log and of a buffer, each measured, noisy state stands with the command that followed it."""
+def test_window_of_log_equals_window_in_flight(key):
+    """In a log and in a buffer, each measured, noisy state is paired with the command that followed it."""
     buffer, inner = RollingBuffer(10), ControllerPilot(policy_controller(key))
 
-    class Keeping(Pilot):
+    class BufferingPilot(Pilot):
         def reset(self, measurement):
             inner.reset(measurement)
 
@@ -185,7 +185,7 @@ def test_a_log_gives_the_window_that_was_seen_in_flight(key):
             inner.accepted(u)
             buffer.accepted(u)
 
-    log = fly(Odd(sensors="rough", limit=limit), Keeping(), START, ticks=15)
+    log = fly(OddPlant(sensors="rough", limit=limit), BufferingPilot(), START, ticks=15)
     observation, window = buffer.window(), log.window(10)
     for a, b in zip(jax.tree.leaves(observation), jax.tree.leaves(window), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
@@ -199,18 +199,18 @@ def test_a_log_gives_the_window_that_was_seen_in_flight(key):
         log.window(4, end=16)
 
 
-def test_flights_of_noisy_plants_keep_truth_and_measurement():
-    log = fly(Odd(sensors="mocap"), HOVER, START, ticks=8)
-    np.testing.assert_array_equal(log.p, fly(Odd(), HOVER, START, ticks=8).p)
+def test_log_of_noisy_plant_has_true_and_measured_states():
+    log = fly(OddPlant(sensors="mocap"), HOVER, START, ticks=8)
+    np.testing.assert_array_equal(log.p, fly(OddPlant(), HOVER, START, ticks=8).p)
     assert np.all(np.any(log.measured.p != log.true.p, axis=1))
 
 
-# ---- who is told
+# ---- observers
 
 
-def test_observers_see_the_first_measurement_every_tick_and_every_event():
-    witness, second, plant = Witness(), Witness(), Odd(clock=100.0)
-    log = fly(plant, Eventful(), START, ticks=5, observers=[witness, second])
+def test_observers_receive_all_measurements_and_events():
+    witness, second, plant = RecordingObserver(), RecordingObserver(), OddPlant(clock=100.0)
+    log = fly(plant, PilotWithEvent(), START, ticks=5, observers=[witness, second])
     measurements = [message for message in witness.calls if not isinstance(message, Event)]
     assert len(measurements) == 6
     first, u = measurements[0]
@@ -222,12 +222,12 @@ def test_observers_see_the_first_measurement_every_tick_and_every_event():
     assert event.t == pytest.approx(0.04)
     assert log.events == (event,)
     assert [type(message) for message in witness.calls] == [type(message) for message in second.calls]
-    assert witness.calls.index(event) == 3  # with the tick that it happened in, before its measurement
+    assert witness.calls.index(event) == 3  # in the tick of the event, before its measurement
 
 
 def test_events_as_lines_of_json(tmp_path):
     observer = JsonlObserver(tmp_path / "events.jsonl", method="full")
-    fly(Odd(), Eventful(), START, ticks=5, observers=[observer])
+    fly(OddPlant(), PilotWithEvent(), START, ticks=5, observers=[observer])
     observer.close()
     (line,) = (tmp_path / "events.jsonl").read_text().splitlines()
     assert json.loads(line) == {
@@ -238,8 +238,8 @@ def test_events_as_lines_of_json(tmp_path):
     }
 
 
-def test_a_stop_token_gives_the_flight_up_and_stops_the_plant():
-    stop, witness, plant = threading.Event(), Witness(), Odd()
+def test_stop_token_ends_flight_and_stops_plant():
+    stop, witness, plant = threading.Event(), RecordingObserver(), OddPlant()
 
     def until_the_third(measurement):
         if measurement.t > 0.03:
@@ -255,8 +255,8 @@ def test_a_stop_token_gives_the_flight_up_and_stops_the_plant():
         plant.step(Command.hover())
 
 
-def test_a_pilot_that_fails_stops_the_plant():
-    plant = Odd()
+def test_failing_pilot_stops_plant():
+    plant = OddPlant()
 
     def failing(measurement):
         raise ZeroDivisionError
@@ -266,21 +266,21 @@ def test_a_pilot_that_fails_stops_the_plant():
     assert plant.stops == 1
 
 
-def test_termination_ends_the_flight_and_is_logged():
-    log = fly(Odd(), HOVER, START, ticks=50, terminated=lambda t, x: t >= 0.1 - 1e-9)
+def test_termination_ends_flight_and_is_logged():
+    log = fly(OddPlant(), HOVER, START, ticks=50, terminated=lambda t, x: t >= 0.1 - 1e-9)
     assert log.terminated
     assert log.t[-1] == pytest.approx(0.1)
-    assert not fly(Odd(), HOVER, START, ticks=5).terminated
+    assert not fly(OddPlant(), HOVER, START, ticks=5).terminated
 
 
-def test_termination_is_judged_by_the_true_state():
+def test_termination_depends_on_true_state():
     observation = []
-    fly(Odd(sensors="rough"), HOVER, START, ticks=5, terminated=lambda t, x: observation.append(x.p) or False)
-    np.testing.assert_array_equal(np.stack(observation), fly(Odd(), HOVER, START, ticks=5).p[1:])
+    fly(OddPlant(sensors="rough"), HOVER, START, ticks=5, terminated=lambda t, x: observation.append(x.p) or False)
+    np.testing.assert_array_equal(np.stack(observation), fly(OddPlant(), HOVER, START, ticks=5).p[1:])
 
 
-def test_pilot_starts_its_memory_anew_at_time_zero(key):
-    pilot, plant = ControllerPilot(policy_controller(key)), Odd()
+def test_pilot_resets_memory_at_time_zero(key):
+    pilot, plant = ControllerPilot(policy_controller(key)), OddPlant()
     with plant:
         start = plant.reset(START)
         pilot.reset(start)

@@ -1,4 +1,4 @@
-"""The layers of hover/retrim, end to end: effective gravity compensates, learning does not disturb it."""
+"""The layers of hover/retrim, end to end: effective gravity compensates, and learning does not disturb it."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def trained_policy(as_a_user):
 
 @pytest.fixture(scope="module")
 def flights(trained_policy):
-    """6 s from one start, a step of 2 m/s^2 per axis at 3 s, by each layer."""
+    """Return 6 s of flight from one start with each layer, with a step of 2 m/s^2 per axis at 3 s."""
     step = Push(lambda t, x: jnp.where(t < 3.0, 0.0, 2.0) * jnp.ones(3))
     setup, policy = trained_policy
 
@@ -44,7 +44,7 @@ def flights(trained_policy):
 
 
 @pytest.mark.parametrize("layers", ["base-do", "full", "rough"])
-def test_a_step_is_answered_within_two_seconds(flights, layers):
+def test_step_is_rejected_within_two_seconds(flights, layers):
     log, error, _ = flights[layers]
     base = flights["base"][1]
     assert base[log.t > 5.2].min() > 0.2
@@ -56,14 +56,15 @@ def test_a_step_is_answered_within_two_seconds(flights, layers):
 def test_wrong_velocities_are_excluded_and_reported(flights):
     """One velocity in 25 is wrong by 2 m/s."""
     log, error, pilot = flights["spikes"]
-    assert error[log.t > 2.0].max() < 0.2  # the step at 3 s and the wrong velocities, which the policy sees, included
+    # including the step at 3 s and the wrong velocities, which the policy receives
+    assert error[log.t > 2.0].max() < 0.2
     assert error[log.t > 5.2].mean() < 0.3 * flights["base"][1][log.t > 5.2].mean()
     notes = [event.note for event in pilot.events if event.kind == "residual"]
     assert "velocity is not the derivative of position" in notes[-1]
     np.testing.assert_allclose(pilot.state.residual.mean[:3], 2.0, atol=0.4)
 
 
-def test_learning_does_not_harm_the_layer_below(flights):
+def test_learning_does_not_degrade_lower_layer(flights):
     log, in_frame, _ = flights["base-do"]
     _, learning, pilot = flights["full"]
     kinds = [event.kind for event in pilot.events]
@@ -74,13 +75,13 @@ def test_learning_does_not_harm_the_layer_below(flights):
         assert learning[late].mean() < in_frame[late].mean() + 0.005
 
 
-def test_the_residual_has_found_the_push(flights):
-    """After the step, its constant is the push; nothing of the calm before is left in it."""
+def test_residual_equals_push(flights):
+    """After the step, its constant is the push, and the calm before has no effect any more."""
     _, _, pilot = flights["full"]
     np.testing.assert_allclose(pilot.state.residual.mean[:3], 2.0, atol=0.3)
 
 
-def test_what_was_learnt_is_kept(flights, trained_policy, tmp_path):
+def test_learner_state_is_saved(flights, trained_policy, tmp_path):
     setup, _ = trained_policy
     _, _, pilot = flights["full"]
     save_learner_state(tmp_path / "learner_state.safetensors", pilot.state, setup.preset)

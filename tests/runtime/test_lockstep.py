@@ -1,4 +1,4 @@
-"""The virtual clock: a result appears after its latency, in whole ticks; one window is under way at a time."""
+"""The virtual clock: a result appears after its latency in whole ticks, and one window at a time is in progress."""
 
 import types
 
@@ -10,8 +10,8 @@ from retrim.physics import Command, State
 from retrim.runtime import LockstepLearner, lockstep
 
 
-class Refusing(Worker):
-    """Refuses each window at once."""
+class RefusingWorker(Worker):
+    """A worker that refuses each window immediately."""
 
     layer = "policy"
 
@@ -32,8 +32,8 @@ def window(t):
     return buffer.window()
 
 
-def appears(learner, tick):
-    """Tick at which the update of a window that was submitted at ``tick`` appears."""
+def tick_of_update(learner, tick):
+    """Return the tick at which the update of a window from ``tick`` appears."""
     learner.submit(window(0.02 * tick), tick)
     for later in range(tick, tick + 100):
         if learner.poll(later):
@@ -43,24 +43,24 @@ def appears(learner, tick):
 
 @pytest.mark.parametrize(("latency_s", "ticks"), [(0.001, 1), (0.02, 1), (0.021, 2), (0.1, 5), (0.3, 15), (1.0, 50)])
 def test_latencies_are_rounded_up_to_whole_ticks(latency_s, ticks):
-    assert appears(LockstepLearner(Refusing(), latency_s, 0.02), 7) == 7 + ticks
+    assert tick_of_update(LockstepLearner(RefusingWorker(), latency_s, 0.02), 7) == 7 + ticks
 
 
-def test_the_same_latency_is_twice_the_ticks_at_twice_the_rate():
-    assert appears(LockstepLearner(Refusing(), 0.2, 0.01), 0) == 20
+def test_latency_in_ticks_is_proportional_to_rate():
+    assert tick_of_update(LockstepLearner(RefusingWorker(), 0.2, 0.01), 0) == 20
 
 
-def test_measured_latency_is_what_the_clock_shows(monkeypatch):
-    """The worker takes 0.37 s by the clock."""
+def test_measured_latency_equals_clock(monkeypatch):
+    """The worker takes 0.37 s."""
     readings = iter([100.0, 100.37, 200.0, 200.05])
     monkeypatch.setattr(lockstep, "time", types.SimpleNamespace(perf_counter=lambda: next(readings)))
-    learner = LockstepLearner(Refusing(), None, 0.02)
-    assert appears(learner, 0) == 19
-    assert appears(learner, 50) == 53
+    learner = LockstepLearner(RefusingWorker(), None, 0.02)
+    assert tick_of_update(learner, 0) == 19
+    assert tick_of_update(learner, 50) == 53
 
 
-def test_a_window_is_skipped_while_another_is_under_way():
-    worker = Refusing()
+def test_window_is_skipped_while_learner_is_busy():
+    worker = RefusingWorker()
     learner = LockstepLearner(worker, 0.1, 0.02)
     learner.submit(window(1.0), 50)
     learner.submit(window(1.04), 52)
@@ -71,8 +71,8 @@ def test_a_window_is_skipped_while_another_is_under_way():
     assert learner.poll(56) == []
 
 
-def test_reset_drops_what_is_under_way():
-    worker = Refusing()
+def test_reset_discards_window_in_progress():
+    worker = RefusingWorker()
     learner = LockstepLearner(worker, 0.1, 0.02)
     learner.submit(window(1.0), 50)
     learner.submit(window(1.02), 51)
@@ -82,8 +82,8 @@ def test_reset_drops_what_is_under_way():
     assert worker.count == 2
 
 
-def test_published_updates_reach_the_worker():
-    worker = Refusing()
+def test_worker_receives_published_updates():
+    worker = RefusingWorker()
     update = Skip(1.0, "residual")
     LockstepLearner(worker, 0.1, 0.02).receive(update)
     assert worker.updates == [update]

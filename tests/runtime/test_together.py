@@ -1,4 +1,4 @@
-"""A batch of flights that learn is the same as each flown alone with its own pilot."""
+"""A batch of flights with learning equals single flights with their pilots."""
 
 import threading
 
@@ -23,7 +23,7 @@ from retrim.runtime.together import can_fly_together, fly_together
 TICKS = 70
 
 
-class Counting(Worker):
+class CountingWorker(Worker):
     """A worker that learns nothing."""
 
     layer = "policy"
@@ -39,8 +39,8 @@ STILL = Window.of(np.zeros(1), np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 3
 
 
 @given(period=st.integers(1, 12), latency=st.integers(1, 30))
-def test_offers_are_those_of_a_learner_on_the_virtual_clock(period, latency):
-    learner, message = LockstepLearner(Counting(), 0.02 * latency, 0.02), []
+def test_offers_equal_those_of_virtual_clock(period, latency):
+    learner, message = LockstepLearner(CountingWorker(), 0.02 * latency, 0.02), []
     for tick in range(60):
         message += [(tick, type(update)) for update in learner.poll(tick)]
         if tick and tick % period == 0:
@@ -53,7 +53,7 @@ def test_offers_are_those_of_a_learner_on_the_virtual_clock(period, latency):
 
 
 @given(n=st.integers(1, 400), size=st.integers(1, 2 * IN_CACHE))
-def test_few_updates_are_made_at_once_and_hardly_any_in_vain(n, size):
+def test_rounds_have_limited_size_and_little_padding(n, size):
     few = at_once(n, size)
     assert 1 <= few <= AT_ONCE
     assert few == 1 or few * size <= IN_CACHE
@@ -63,9 +63,9 @@ def test_few_updates_are_made_at_once_and_hardly_any_in_vain(n, size):
 
 @pytest.fixture(scope="module")
 def sample_flight(as_a_user):
-    """Five flights that train a delta, with noisy sensors; every other offer finds the learner busy.
+    """Return five flights that train a delta, with noisy sensors; every other offer finds the learner busy.
 
-    Three learn at once, so that the last round has a place to spare.
+    Three learn at the same time, so that the last round has an empty slot.
     """
     soon = {"window": 20, "fit_every": 0.2, "update_every": 0.3, "fit_latency": 0.1, "update_latency": 0.38}
     preset = tiny_preset(adapt=soon)
@@ -88,7 +88,7 @@ def sample_flight(as_a_user):
     return logs, pilots, each, alone, message, setup
 
 
-def test_states_commands_and_times_are_the_same(sample_flight):
+def test_states_commands_and_times_are_equal(sample_flight):
     logs, _, each, _, message, _ = sample_flight
     for log, other in zip(logs, each, strict=True):
         np.testing.assert_array_equal(log.t, other.t)
@@ -101,7 +101,7 @@ def test_states_commands_and_times_are_the_same(sample_flight):
     assert message == sorted(message)
 
 
-def test_events_are_the_same(sample_flight):
+def test_events_are_equal(sample_flight):
     logs, _, each, _, _, _ = sample_flight
     for log, other in zip(logs, each, strict=True):
         assert [(e.t, e.kind) for e in log.events] == [(e.t, e.kind) for e in other.events]
@@ -110,25 +110,25 @@ def test_events_are_the_same(sample_flight):
     assert kinds & {"policy", "rejected"}
 
 
-def test_pilots_have_learnt_the_same(sample_flight):
-    """By what it does: Adam moves a weight of hardly any gradient either way, by rounding."""
+def test_learner_states_are_equal(sample_flight):
+    """The outputs are compared: by rounding, Adam moves a weight with a tiny gradient in either direction."""
     _, pilots, _, alone, _, setup = sample_flight
     inputs = np.random.default_rng(0).normal(size=(50, 23)).astype(np.float32)
     start, model = setup.flight_starts(1)[0], setup.learner.residual_model
 
     @jax.jit
-    def does(state):
+    def outputs(state):
         return jax.vmap(state.policy.policy.merged())(inputs), model.predict(state.residual, start, Command.hover())
 
     for pilot, other in zip(pilots, alone, strict=True):
-        (a, specific_force), (b, expected) = does(pilot.state), does(other.state)
+        (a, specific_force), (b, expected) = outputs(pilot.state), outputs(other.state)
         np.testing.assert_allclose(a.c, b.c, atol=0.03)
         np.testing.assert_allclose(a.omega, b.omega, atol=0.03)
         np.testing.assert_allclose(specific_force, expected, atol=0.05)
 
 
-def test_a_pilot_flies_on_with_what_it_learnt(sample_flight):
-    """And its learners go on from there, with the next random numbers: nothing of it is left as it was before."""
+def test_pilot_continues_with_its_learner_state(sample_flight):
+    """Its learners continue from there with the next random numbers."""
     _, pilots, _, alone, _, setup = sample_flight
     for pilot, other in zip(pilots, alone, strict=True):
         mine, theirs = (jax.random.key_data(each.learners[1].learner.worker.key) for each in (pilot, other))
@@ -145,7 +145,7 @@ def test_a_pilot_flies_on_with_what_it_learnt(sample_flight):
             jax.tree.map(np.testing.assert_array_equal, worker._policy, pilot.state.policy)
 
 
-def test_what_cannot_be_one_program_is_told(as_a_user):
+def test_flights_that_cannot_share_a_program_are_reported(as_a_user):
     setup = Setup.from_preset(tiny_preset())
     policy = setup.new_policy(jax.random.key(0))
     calm, windy = ([SimPlant(CheapModel(0.02), disturbance(name), seed=i) for i in (0, 1)] for name in ("none", "wind"))

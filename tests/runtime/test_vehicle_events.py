@@ -1,4 +1,4 @@
-"""The identified vehicle is reported in the first second, alike by a batch of flights and by a single pilot."""
+"""The identified vehicle is reported in the first second, equally in a batch of flights and by a single pilot."""
 
 import re
 
@@ -22,7 +22,7 @@ SECONDS = 1.2
 
 @pytest.fixture(scope="module")
 def preset(as_a_user):
-    """The file of the preset states twice the lag of the vehicle that flies, and no delay."""
+    """Return a preset whose vehicle file states twice the true lag and no delay."""
     declaration = {**VEHICLE, "rate_lag": [0.2, 0.2, 0.2], "command_delay": 0.02}
     return changed(load("hover/any"), pretrain=SHORT, vehicle=declaration)
 
@@ -36,7 +36,7 @@ def notes(log):
     return [(event.t, event.note) for event in log.events if event.kind == "vehicle"]
 
 
-def test_a_batch_and_a_pilot_report_the_same_vehicle(preset, scenario):
+def test_batch_and_pilot_report_same_vehicle(preset, scenario):
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(random.key(0))
     (flight,) = Fleet(preset, {0: policy}, [scenario], methods=["base-id"], starts=1, seconds=SECONDS).run().flights

@@ -1,4 +1,4 @@
-"""Hover looks the same from every heading, in the world and in another frame."""
+"""The hover observation is independent of the heading, in the world and in a different frame."""
 
 import math
 
@@ -21,8 +21,8 @@ def observe(observation, x, u):
     return observation(observation.init(x), jnp.array(0.0), x, u)[0]
 
 
-def turned(x, angle, origin):
-    """Return the state turned about the vertical through ``origin``."""
+def rotate_state(x, angle, origin):
+    """Return the state rotated about the vertical through ``origin``."""
     turn = so3.rotz(jnp.array(angle))
     return State(origin + turn @ (x.p - origin), turn @ x.R, turn @ x.v)
 
@@ -34,20 +34,20 @@ def observation():
 
 
 @pytest.mark.parametrize("angle", [0.3, 2.0, math.pi, -2.5])
-def test_a_turn_about_the_vertical_through_the_goal_changes_nothing(observation, angle, key):
+def test_observation_is_invariant_to_rotation_about_goal(observation, angle, key):
     a, b = random.split(key)
     x, u = random_state(a), random_command(b)
-    same = turned(x, angle, observation.origin)
+    same = rotate_state(x, angle, observation.origin)
     np.testing.assert_allclose(observe(observation, same, u), observe(observation, x, u), atol=1e-12)
 
 
-def test_a_vehicle_that_heads_along_x_observes_the_world(observation, key):
+def test_heading_along_x_gives_world_observation(observation, key):
     x = State(jnp.array([1.0, 2.0, 3.0]), so3.exp(jnp.array([0.4, -0.3, 0.0])), jnp.array([0.1, 0.2, 0.3]))
     u = random_command(key)
     np.testing.assert_allclose(observe(observation, x, u), observe(observation.inner, x, u), atol=1e-12)
 
 
-def test_lengths_heights_and_tilt_are_kept(observation, key):
+def test_lengths_heights_and_tilt_are_invariant(observation, key):
     a, b = random.split(key)
     x, u = random_state(a), random_command(b)
     view, world = observe(observation, x, u), observe(observation.inner, x, u)
@@ -57,12 +57,12 @@ def test_lengths_heights_and_tilt_are_kept(observation, key):
         assert view[row] == pytest.approx(float(world[row]), rel=1e-12)
 
 
-def test_the_law_holds_in_another_frame(observation, key):
-    """There the vertical is the thrust that balances a disturbance."""
+def test_invariance_holds_in_other_frame(observation, key):
+    """In that frame the vertical is the thrust that balances a disturbance."""
     frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5]))
     other, a, b = observation.in_frame(frame), *random.split(key)
     x, u = random_state(a), random_command(b)
-    same = turned(x, 1.2, frame.vector(observation.origin))
+    same = rotate_state(x, 1.2, frame.vector(observation.origin))
     np.testing.assert_allclose(observe(other, same, u), observe(other, x, u), atol=1e-12)
 
 
@@ -75,7 +75,7 @@ def test_gradients_are_finite_upside_down(observation, key):
     assert np.isfinite(gradient).all()
 
 
-def test_a_policy_of_such_a_preset_commands_the_same_at_every_heading(key):
+def test_commands_of_policy_are_independent_of_heading(key):
     setup = Setup.from_preset(changed(load("hover/any"), pretrain={"hidden_sizes": (8,)}))
     policy = setup.new_policy(key)
     x, last = random_state(key), random_command(key)
@@ -84,9 +84,9 @@ def test_a_policy_of_such_a_preset_commands_the_same_at_every_heading(key):
     def command(x):
         return policy(observe(task.observation, x, last)).vector()
 
-    np.testing.assert_allclose(command(turned(x, 1.0, task.home())), command(x), atol=1e-9)
+    np.testing.assert_allclose(command(rotate_state(x, 1.0, task.home())), command(x), atol=1e-9)
 
 
-def test_only_hover_has_no_heading():
+def test_only_hover_is_independent_of_heading():
     with pytest.raises(ConfigError, match="axes = 'heading' is for task = 'hover', not for 'track'"):
         changed(load("track/paper"), axes="heading")

@@ -1,4 +1,4 @@
-"""The paper's rewards by hand-computed cases; starts; bounds; observations, the same in training and in flight."""
+"""The rewards of the paper in hand-computed cases; starts; bounds; observations, equal in training and in flight."""
 
 import math
 
@@ -22,7 +22,7 @@ from retrim.tasks import Hover, L2Hover, StateObs, huber
 @pytest.mark.parametrize(
     ("y", "value"), [((3.0, 4.0, 0.0), 4.5), ((0.3, 0.4, 0.0), 0.125), ((0.6, 0.8, 0.0), 0.5), ((0.0, 0.0, 0.0), 0.0)]
 )
-def test_huber_of_the_norm(y, value):
+def test_huber_of_norm(y, value):
     assert huber(jnp.array(y)) == pytest.approx(value, abs=1e-15)
 
 
@@ -33,7 +33,7 @@ def test_huber_gradient():
 
 
 def test_reward_by_hand():
-    """|5 (p - p_des)| = 2.5 -> 2; |v| = .5 -> .125; |omega| = 2 -> 1.5; |u - u_hover| = sqrt(1.5^2 + 2^2) -> 2."""
+    """|5 (p - p_des)| = 2.5 -> 2; |v| = 0.5 -> 0.125; |omega| = 2 -> 1.5; |u - u_hover| = sqrt(1.5^2 + 2^2) -> 2."""
     task = hover_task()
     x = State(jnp.array([0.5, 0.0, 1.0]), jnp.eye(3), jnp.array([0.0, 0.3, 0.4]))
     u = Command(jnp.array(9.81 + 1.5), jnp.array([0.0, 2.0, 0.0]))
@@ -45,8 +45,8 @@ reward = eqx.filter_jit(lambda task, t, x, u: task.reward(t, x, u))
 
 
 @pytest.mark.parametrize("away", [(0.0, 0.0, 0.0), (0.03, 0.0, 0.04), (-0.6, 0.8, 0.0)])
-def test_the_l2_reward_has_a_tip_at_the_goal(away, key):
-    """It is the paper's - 3 (sqrt(d^2 + (1 cm)^2) - 1 cm), whatever attitude, velocity and command."""
+def test_l2_reward_has_cusp_at_goal(away, key):
+    """It is that of the paper - 3 (sqrt(d^2 + (1 cm)^2) - 1 cm), for any attitude, velocity and command."""
     x, u = random_state(key), random_command(key)
     x = replace_fields(x, p=jnp.asarray(np.array(GOAL) + away))
     paper, ours = (reward(task, jnp.array(0.0), x, u) for task in (hover_task(), hover_task(make=L2Hover)))
@@ -56,12 +56,12 @@ def test_the_l2_reward_has_a_tip_at_the_goal(away, key):
 
 @eqx.filter_jit
 def slope(task, x):
-    """Of the reward by position, in hover."""
+    """Return the gradient of the reward by position, in hover."""
     return jax.grad(lambda p: task.reward(jnp.array(0.0), replace_fields(x, p=p), Command.hover()))(x.p)
 
 
-def test_only_the_l2_reward_is_steep_close_to_the_goal():
-    """Three centimetres off, the slope of the paper's has fallen to 0.75 per metre; the tip's is 2.85 more."""
+def test_only_l2_reward_is_steep_near_goal():
+    """At 3 cm, the slope of the paper's reward is 0.75 per metre, and that of the cusp is 2.85 more."""
     x = State.at(jnp.array(GOAL) + jnp.array([0.03, 0.0, 0.0]))
     slopes = [float(slope(task, x)[0]) for task in (hover_task(), hover_task(make=L2Hover))]
     assert slopes[0] == pytest.approx(-0.75)
@@ -78,12 +78,12 @@ def test_reward_is_differentiable_everywhere(make, key):
 
 
 @pytest.mark.parametrize("heading", [math.pi, 0.1 * math.pi])
-def test_starts_keep_to_their_bounds(heading):
+def test_starts_fill_their_bounds(heading):
     task = hover_task(heading=heading)
     x = draw_starts(task, random.key(3), 2000).x
     away = np.asarray(x.p) - GOAL
     assert np.abs(away).max() <= 1.0
-    assert np.abs(away).max(axis=0).min() > 0.95  # and use them
+    assert np.abs(away).max(axis=0).min() > 0.95  # and extend over the whole range
     gram = np.einsum("nij,nkj->nik", x.R, x.R)
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
     tilt = np.arccos(np.asarray(x.R)[:, 2, 2])
@@ -102,7 +102,7 @@ def test_termination():
     assert task.terminated(t, replace_fields(x, v=jnp.array([jnp.inf, 0.0, 0.0])))
 
 
-def test_error_is_the_distance():
+def test_error_is_distance():
     assert hover_task().error(jnp.array(0.0), State.at(jnp.array([0.3, 0.4, 1.0]))) == pytest.approx(0.5)
 
 
@@ -122,12 +122,13 @@ def test_observation_layout(history, key):
     np.testing.assert_allclose(o[15:], np.reshape(newest, -1), atol=1e-12)
 
 
-def test_simulation_and_flight_see_the_same(key):
-    """Fly the states of a simulated roll-out through the pilot: it must issue the very commands of the roll-out."""
+def test_observations_in_simulation_and_flight_are_equal(key):
+    """From the states of a simulated roll-out, the pilot issues the commands of the roll-out."""
     env = hover_env(horizon=12, history=3)
     task = env.task
     policy = Policy.of(task.observation.size, small(), key=key, hidden=(8,))
-    policy = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), policy)  # so that what is seen matters
+    # so that the observation has an effect
+    policy = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), policy)
     x0 = eqx.filter_jit(task.reset)(key)
     simulation = jax.tree.map(np.asarray, eqx.filter_jit(rollout)(env, policy, x0))
     pilot = ControllerPilot(PolicyController(task.observation, policy))
@@ -141,7 +142,7 @@ def test_simulation_and_flight_see_the_same(key):
 rotation = jax.jit(so3.log)
 
 
-def test_flight_starts_are_the_same_for_every_preset():
+def test_flight_starts_are_equal_for_every_preset():
     starts = [Setup.from_preset(preset).flight_starts(8) for preset in PRESETS.values()]
     for others in starts[1:]:
         jax.tree.map(np.testing.assert_array_equal, starts[0], others)

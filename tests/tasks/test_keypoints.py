@@ -1,4 +1,4 @@
-"""Keypoints: as published, whitened; learning to see."""
+"""Keypoints: published values, whitening, and training of the encoder."""
 
 import equinox as eqx
 import jax
@@ -28,8 +28,8 @@ def keypoints(**options):
     return Keypoints.of(jnp.array(GOAL), small().omega_max, **({"whitened": False} | options))
 
 
-def near():
-    """Sees everything for a while."""
+def near_state():
+    """Return a state with all points visible for a while."""
     return State(jnp.array([0.05, -0.1, 1.1]), jnp.eye(3), jnp.array([0.1, 0.2, -0.05]))
 
 
@@ -46,7 +46,7 @@ def white():
 look = eqx.filter_jit(lambda o, x: o.pixels(x))
 
 
-def test_published_projections_at_the_goal(plain):
+def test_published_projections_at_goal(plain):
     pixels, visible = look(plain, State.at(jnp.array(GOAL)))
     np.testing.assert_allclose(pixels, PUBLISHED, atol=6e-4)
     assert visible.all()
@@ -63,8 +63,8 @@ stack = eqx.filter_jit(lambda o, frames: o.stacked(frames))
 rotation = jax.jit(so3.exp)
 
 
-def watch(observation, x, us):
-    """Observations of a point mass under the commands ``us``, as a policy would get them; and the last state."""
+def observe_motion(observation, x, us):
+    """Return the observations of a point mass under the commands ``us``, as in flight, and the last state."""
     memory, last, display = begin(observation, x), Command.hover(), []
     for u in us:
         o, memory = see(observation, memory, x, last)
@@ -73,44 +73,47 @@ def watch(observation, x, us):
     return np.array(display), memory, x
 
 
-def gentle(key, n):
+def small_commands(key, n):
     draws = jax.jit(jax.vmap(lambda k: (random.normal(k, ()), random.normal(k, (3,)))))(random.split(key, n))
     return [
         Command(jnp.asarray(9.81 + 0.5 * c), jnp.asarray(0.3 * w)) for c, w in zip(*map(np.asarray, draws), strict=True)
     ]
 
 
-def test_no_silent_broadcast(plain):
-    jax.make_jaxpr(lambda x: plain(plain.init(x), jnp.array(0.0), x, Command.hover()))(near())
+def test_wrong_shape_is_refused(plain):
+    jax.make_jaxpr(lambda x: plain(plain.init(x), jnp.array(0.0), x, Command.hover()))(near_state())
 
 
-def test_layout(plain, key):
-    us = gentle(key, 6)
-    display, _, _ = watch(plain, near(), us)
+def test_observation_layout(plain, key):
+    us = small_commands(key, 6)
+    display, _, _ = observe_motion(plain, near_state(), us)
     assert display.shape == (6, plain.size) == (6, 89)
     assert plain.size == 89
-    pixels, _ = look(plain, near())
+    pixels, _ = look(plain, near_state())
     np.testing.assert_allclose(np.clip(display[0, :14], -5, 5), np.reshape(pixels, 14), atol=1e-9)  # newest first
-    np.testing.assert_allclose(display[3, 14:28], display[0, :14], atol=1e-12)  # 60 ms later it is one frame back
+    np.testing.assert_allclose(display[3, 14:28], display[0, :14], atol=1e-12)  # one frame later than 60 ms ago
     np.testing.assert_array_equal(display[:, 70:77], 1.0)
     commands = [[float(u.c) / 9.81 - 1.0, *(np.asarray(u.omega) / [6.0, 6.0, 4.0])] for u in us[2:5]]
     np.testing.assert_allclose(display[5, 77:], np.reshape(commands, 12), atol=1e-12)
 
 
-def test_the_same_start_sees_the_same(key):
-    noisy, us = keypoints(noise=2.0), gentle(key, 4)
-    first, again = watch(noisy, near(), us)[0], watch(noisy, near(), us)[0]
+def test_equal_starts_have_equal_observations(key):
+    noisy, us = keypoints(noise=2.0), small_commands(key, 4)
+    first, again = observe_motion(noisy, near_state(), us)[0], observe_motion(noisy, near_observation(), us)[0]
     np.testing.assert_array_equal(first, again)
-    elsewhere = replace_fields(near(), v=near().v + 0.01)
-    quiet = watch(keypoints(noise=0.0), elsewhere, us)[0] - watch(keypoints(noise=0.0), near(), us)[0]
-    assert not np.allclose(watch(noisy, elsewhere, us)[0] - first, quiet, atol=1e-4)  # other noise
+    elsewhere = replace_fields(near_state(), v=near_observation().v + 0.01)
+    quiet = (
+        observe_motion(keypoints(noise=0.0), elsewhere, us)[0]
+        - observe_motion(keypoints(noise=0.0), near_state(), us)[0]
+    )
+    assert not np.allclose(observe_motion(noisy, elsewhere, us)[0] - first, quiet, atol=1e-4)  # different noise
 
 
-def test_without_noise_it_shows_the_projection_and_with_noise_its_deviation(plain):
-    """In pixels: of 1280 and 720 across an image that is 2 wide and high."""
-    exact = np.asarray(look(plain, near())[0])
+def test_observation_is_projection_plus_stated_noise(plain):
+    """In pixels: 1280 by 720 across an image that is 2 wide and high."""
+    exact = np.asarray(look(plain, near_state())[0])
     noisy = keypoints(noise=3.0)
-    starts = jax.vmap(lambda k: State(near().p, near().R, 0.1 * random.normal(k, (3,))))(
+    starts = jax.vmap(lambda k: State(near_state().p, near_observation().R, 0.1 * random.normal(k, (3,))))(
         random.split(random.key(4), 600)
     )
 
@@ -131,7 +134,7 @@ def slope(o, x):
 
 
 @pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (0.9, 0.0, 1.0), (4.0, 0.0, 0.3)])
-def test_gradient_of_the_observation_is_finite(place, white):
+def test_gradient_of_observation_is_finite(place, white):
     x = State(jnp.array(place), rotation(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
     leaves = jax.tree.leaves(slope(white, x))
     assert all(np.isfinite(leaf).all() for leaf in leaves)
@@ -141,13 +144,13 @@ def test_gradient_of_the_observation_is_finite(place, white):
 
 @jax.jit
 def move(x, omega):
-    """A tick later."""
+    """Return the state one tick later."""
     return State(x.p + 0.02 * x.v, x.R @ so3.exp(0.02 * omega), x.v)
 
 
-def test_history_is_a_steady_motion(plain):
-    """Position by velocity, attitude by body rates, step by step, oldest first."""
-    omega, x = jnp.array([0.5, -0.3, 0.8]), near()
+def test_initial_history_is_steady_motion(plain):
+    """Position follows from velocity and attitude from body rates, step by step, oldest first."""
+    omega, x = jnp.array([0.5, -0.3, 0.8]), near_state()
     frames = []
     for _ in range(13):
         frames.append(np.asarray(look(plain, x)[0]).reshape(14))
@@ -160,18 +163,18 @@ def test_history_is_a_steady_motion(plain):
 
 @pytest.fixture(scope="module")
 def motions(white):
-    """Whitened, before the cut: the motions of the whitening itself, and others."""
+    """Return whitened features before clipping: of the motions of the whitening, and of others."""
 
     @jax.jit
-    def whitened(key):
+    def whiten(key):
         stack = jax.vmap(lambda k: white.stacked(white.history(*NEAR.draw(k, white.goal))))
         return (stack(random.split(key, 20000)) - white.mean[None]) @ white.whiten.T
 
-    return np.asarray(whitened(random.key(0))), np.asarray(whitened(random.key(5)))
+    return np.asarray(whiten(random.key(0))), np.asarray(whiten(random.key(5)))
 
 
 def test_whitening(white, motions):
-    """Symmetric; unit covariance of the motions it was made from, less where a pixel's noise is all there is."""
+    """The covariance of the motions of the whitening is one, or less where a pixel contains only noise."""
     own, other = motions
     np.testing.assert_allclose(white.whiten, white.whiten.T, atol=1e-10)
     np.testing.assert_allclose(own.mean(axis=0), 0.0, atol=1e-9)
@@ -180,21 +183,21 @@ def test_whitening(white, motions):
     assert spectrum.max() <= 1.0 + 1e-6
     assert np.median(spectrum) > 0.95
     assert spectrum.min() > 0.3
-    variance = other.var(axis=0)  # rare frames, with points far outside, weigh much
+    variance = other.var(axis=0)  # rare frames with distant points have a large weight
     assert 0.8 < np.median(variance) < 1.5
     np.testing.assert_allclose(other.mean(axis=0), 0.0, atol=0.1)
 
 
 def test_features_of_other_motions_are_white(white, motions):
-    """What a policy is shown of motions that the whitening was not made from: the cut takes what rare frames leave."""
-    own, other = (np.clip(whitened, -FEATURE_LIMIT, FEATURE_LIMIT) for whitened in motions)
+    """Clipping removes the large values of rare frames, for motions that did not determine the whitening."""
+    own, other = (np.clip(features, -FEATURE_LIMIT, FEATURE_LIMIT) for features in motions)
     spectrum = np.linalg.eigvalsh(np.cov(other.T))
     assert spectrum.max() < 1.5
     np.testing.assert_allclose(np.sort(spectrum), np.linalg.eigvalsh(np.cov(own.T)), rtol=0.15, atol=0.02)
     assert np.mean(np.abs(motions[1]) > FEATURE_LIMIT) < 0.01
 
 
-def test_features_are_cut_off(white):
+def test_features_are_clipped(white):
     wild = 2.5 * random.normal(random.key(3), (70,))
     features = white.features(wild)
     raw = white.whiten @ (wild - white.mean)
@@ -204,31 +207,34 @@ def test_features_are_cut_off(white):
 
 @pytest.mark.parametrize(("dt", "depth", "stride"), [(0.02, 13, 3), (0.01, 25, 6), (0.06, 5, 1)])
 def test_frames_are_60_ms_apart_at_every_rate(dt, depth, stride, plain):
-    """Of a steady motion the frames show where it was 0, 60, ..., 240 ms ago."""
+    """The frames of a steady motion show the positions 0, 60, ..., 240 ms ago."""
     observation = keypoints(dt=dt)
     assert (observation.depth, observation.stride) == (depth, stride)
     assert stride * dt == pytest.approx(0.06)
-    frames = history(observation, near(), jnp.zeros(3))
+    frames = history(observation, near_state(), jnp.zeros(3))
     assert frames.shape == (depth, 14)
     for i, display in enumerate(np.asarray(stack(observation, frames)).reshape(5, 14)):
-        then = replace_fields(near(), p=jnp.asarray(np.asarray(near().p) - 0.06 * i * np.asarray(near().v)))
+        then = replace_fields(
+            near_state(),
+            p=jnp.asarray(np.asarray(near_state().p) - 0.06 * i * np.asarray(near_observation().v)),
+        )
         np.testing.assert_allclose(display, np.reshape(look(plain, then)[0], 14), atol=1e-12)
-    # So they do at the first look of a flight.
-    _, memory = see(observation, begin(observation, near()), near(), Command.hover())
+    # This also holds for the first observation of a flight.
+    _, memory = see(observation, begin(observation, near_state()), near_observation(), Command.hover())
     np.testing.assert_allclose(memory.frames, frames, atol=1e-12)
 
 
-def test_impossible_rates():
+def test_unsuitable_rates_are_refused():
     with pytest.raises(ValueError, match=r"dt = 0\.05 s must divide the frame time"):
         keypoints(dt=0.05)
 
 
-# ---- learning, and flying
+# ---- training and flight
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_learns_to_see(white, key):
-    """A hundred small steps: the error falls; the output layer and the limits are as they were."""
+def test_encoder_training(white, key):
+    """In a hundred small steps the error decreases; the output layer and the limits are unchanged."""
     policy = Policy.of(white.size, small(), key=key, hidden=(16,))
     learner_state, errors = pretrain_encoder(policy, white, key, steps=100, batch=32)
     assert errors.shape == (100,)
@@ -245,8 +251,8 @@ def test_learns_to_see(white, key):
 
 
 @pytest.mark.parametrize("occluded", [True, False])
-def test_simulation_and_flight_see_the_same(occluded, white, key):
-    """Noise and lost points included: the pilot, given the states of a roll-out, issues its very commands."""
+def test_observations_in_simulation_and_flight_are_equal(occluded, white, key):
+    """With noise and lost points, the pilot issues the commands of the roll-out from its states."""
     observation = replace_fields(white, noise=jnp.array(1.0))
     observation = OccludedKeypoints(observation, jnp.array(0.1)) if occluded else observation
     task = Hover(jnp.array(GOAL), observation, jnp.array(5.0), jnp.array(0.3), 0.02, 12)

@@ -1,4 +1,4 @@
-"""Random motions: as wide as they say, and those that a preset names are those that its encoder sees."""
+"""Random motions have their stated width, and the motions of a preset are those of its encoder."""
 
 from typing import get_args
 
@@ -16,7 +16,7 @@ from retrim.tasks.motions import MOTIONS, NEAR, WILD
 
 
 @pytest.mark.parametrize("motions", [NEAR, WILD])
-def test_motions_are_as_wide_as_they_say(motions, key):
+def test_motions_have_stated_width(motions, key):
     @jax.jit
     @jax.vmap
     def draw(key):
@@ -29,13 +29,13 @@ def test_motions_are_as_wide_as_they_say(motions, key):
     np.testing.assert_allclose(off.std(axis=0), motions.box / 3**0.5, rtol=0.05)
     np.testing.assert_allclose(np.asarray(x.v).std(axis=0), motions.speed, rtol=0.05)
     np.testing.assert_allclose(np.asarray(omega).std(axis=0), motions.rates, rtol=0.05)
-    # About an axis in the ground the vehicle leans; about the vertical it turns, too.
+    # About a horizontal axis the vehicle tilts; about the vertical axis it also turns.
     np.testing.assert_allclose(np.asarray(turn_rates)[:, :2].std(axis=0), motions.tilt, rtol=0.1)
     np.testing.assert_allclose(np.asarray(turn_rates)[:, 2].std(), np.hypot(motions.tilt, motions.turn), rtol=0.1)
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_an_encoder_sees_the_motions_of_its_preset():
+def test_encoder_uses_motions_of_preset():
     assert set(get_args(Vision.__annotations__["encoder_motions"])) == set(MOTIONS)
 
     def with_motions(motions):

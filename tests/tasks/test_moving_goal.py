@@ -36,7 +36,7 @@ def hover(goal):
 
 
 class Height(AbstractTask):
-    """A task with defaults only, whose target moves."""
+    """A task with defaults only and a moving target."""
 
     observation: StateObs
     dt: float = 0.02
@@ -66,7 +66,7 @@ def test_conformance(task):
     check_task(task)
 
 
-def test_a_goal_at_rest_is_hover(key):
+def test_goal_at_rest_is_hover(key):
     at = jnp.array([0.5, -1.0, 2.0])
     x, u, t = random_state(key), Command.of(jnp.array([9.0, 0.3, -0.2, 0.1])), jnp.array(3.0)
     one, other = moving(lambda t: at + 0.0 * t), hover(at)
@@ -76,8 +76,8 @@ def test_a_goal_at_rest_is_hover(key):
     np.testing.assert_allclose(observe(one, t, x, u), observe(other, t, x, u), rtol=1e-12, atol=1e-12)
 
 
-def test_uniform_motion_is_invisible(key):
-    """Galilean relativity: a vehicle that moves with the goal observes a hover, and receives its reward."""
+def test_uniform_motion_is_unobservable(key):
+    """By Galilean relativity, a vehicle that moves with the goal has the observation and the reward of hover."""
     x, u, t = random_state(key), Command.hover(), jnp.array(7.0)
     along = State(x.p + straight(t), x.R, x.v + VELOCITY)
     one, other = moving(straight), hover(jnp.zeros(3))
@@ -85,7 +85,7 @@ def test_uniform_motion_is_invisible(key):
     np.testing.assert_allclose(one.reward(t, along, u), other.reward(t, x, u), rtol=1e-9)
 
 
-def test_derivatives_of_the_goal():
+def test_derivatives_of_goal():
     task, t, h = moving(), jnp.array(2.0), 1e-4
     here, after, before = (task.setpoint(t + k * h) for k in (0, 1, -1))
     np.testing.assert_allclose(here.v, (after.p - before.p) / (2 * h), atol=1e-7)
@@ -94,7 +94,7 @@ def test_derivatives_of_the_goal():
     np.testing.assert_allclose(here.u[0], np.linalg.norm(here.a + np.array([0.0, 0.0, 9.81])), rtol=1e-3)
 
 
-def test_starts_are_near_the_moving_target(key):
+def test_starts_are_near_moving_target(key):
     for task, path in ((moving(), circle), (Height(StateObs(jnp.zeros(3), jnp.full(3, 6.0), 0)), straight)):
         starts = draw_starts(task, key, 200)
         assert np.ptp(starts.t) > 20.0
@@ -105,7 +105,7 @@ def test_starts_are_near_the_moving_target(key):
 
 
 def test_frames(key):
-    """The task in a frame: the same target, and the same error up to the scale of the frame for built-in hover."""
+    """In a frame, the target is the same, and for built-in hover the error is equal up to the scale of the frame."""
     frame, t = EffectiveGravityFrame.of(PUSH), jnp.array(4.0)
     x, u = random_state(key), Command.of(jnp.array([10.0, 0.1, 0.2, -0.1]))
     task = moving()
@@ -121,14 +121,14 @@ def test_frames(key):
         task_in_frame.in_frame(frame)
 
 
-def test_only_a_task_without_a_moving_target_rests():
+def test_only_task_with_fixed_target_rests():
     assert hover(jnp.zeros(3)).rests
     assert not moving().rests
     assert not Height(StateObs(jnp.zeros(3), jnp.full(3, 6.0), 0)).rests
 
 
-def test_only_a_policy_whose_task_rests_is_shifted_at_rest():
-    """A policy for many vehicles commands hover at home, but not at the first position of a moving goal."""
+def test_only_policy_of_resting_task_is_shifted():
+    """A policy for many vehicles commands hover at the goal, but not at the first position of a moving goal."""
     register_task("orbit-family", TaskEntry(lambda request: request.hover(goal=circle)))
     try:
         kinds = []

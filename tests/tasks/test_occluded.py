@@ -1,4 +1,4 @@
-"""Keypoints that a camera can see: hidden ones are unknown, and corrections are no motion."""
+"""Keypoints with occlusion: hidden points are not observed, and corrections of the filter are not motion."""
 
 import equinox as eqx
 import jax
@@ -29,39 +29,39 @@ def observe(noise=0.0, dropout=0.0, **options):
     return OccludedKeypoints(full(noise), jnp.array(dropout), **options)
 
 
-def near():
-    """Sees everything for a while."""
+def near_state():
+    """Return a state with all points visible for a while."""
     return State(jnp.array([0.05, -0.1, 1.1]), jnp.eye(3), jnp.array([0.1, 0.2, -0.05]))
 
 
-def aside():
-    """Sees some of the points."""
+def partly_visible_state():
+    """Return a state with some points visible."""
     return State(jnp.array([0.9, 0.0, 1.0]), jnp.eye(3), jnp.zeros(3))
 
 
-def sure(observation, x):
-    """The memory of a filter that starts from the truth, so that nothing but its prediction makes an error."""
+def exact_memory(observation, x):
+    """Return the memory of a filter that starts from the true state, so that only its prediction has an error."""
     memory = begin(observation, x)
     ago = 0.02 * np.arange(12.0, -1.0, -1.0)
     poses = stack_trees([replace_fields(x, p=jnp.asarray(np.asarray(x.p) - s * np.asarray(x.v))) for s in ago])
     return memory._replace(pose=replace_fields(memory.pose, x=x, P=jnp.asarray(SURE)), poses=poses)
 
 
-def gentle(key, n):
+def small_commands(key, n):
     draws = jax.jit(jax.vmap(lambda k: (random.normal(k, ()), random.normal(k, (3,)))))(random.split(key, n))
     return [
         Command(jnp.asarray(9.81 + 0.5 * c), jnp.asarray(0.3 * w)) for c, w in zip(*map(np.asarray, draws), strict=True)
     ]
 
 
-def test_while_everything_is_seen_it_shows_what_training_shows(key):
-    """All five frames, the flags and the commands, of a vehicle that flies as Eq. (1) has it."""
-    x, last, hidden, plain = near(), Command.hover(), observe(), full()
-    memory, model = begin(plain, x), sure(hidden, x)
+def test_observation_without_occlusion_equals_training(key):
+    """All five frames, the flags and the commands are compared, for a vehicle that follows Eq. (1)."""
+    x, last, hidden, plain = near_state(), Command.hover(), observe(), full()
+    memory, model = begin(plain, x), exact_memory(hidden, x)
     a_tick_ago = jnp.asarray(np.asarray(x.p) - 0.02 * np.asarray(x.v))
     model = model._replace(pose=replace_fields(model.pose, x=replace_fields(x, p=a_tick_ago)))
     model = model._replace(poses=jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[[0, *range(12)]]), model.poses))
-    for u in gentle(key, 14):
+    for u in small_commands(key, 14):
         expected, memory = see(plain, memory, x, last)
         result, model = see(hidden, model, x, last)
         x, last = step(x, u), u
@@ -69,9 +69,9 @@ def test_while_everything_is_seen_it_shows_what_training_shows(key):
     np.testing.assert_allclose(result, expected, atol=2e-4)
 
 
-def test_only_what_is_in_the_image_is_observed():
-    """The estimate is the filter's, of the points inside; those outside can be anywhere."""
-    hidden, x = observe(), aside()
+def test_only_points_in_image_are_observed():
+    """The estimate uses the points inside the image; those outside may have any position."""
+    hidden, x = observe(), partly_visible_state()
     pixels, inside = map(np.asarray, pixels_of(hidden.full, x))
     np.testing.assert_array_equal(inside, ~(np.abs(pixels) > 1.0).any(axis=1))
     assert 0 < int(inside.sum()) < 7
@@ -89,23 +89,23 @@ def test_only_what_is_in_the_image_is_observed():
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), after.pose, by_hand)
 
 
-def test_what_is_missed_is_not_observed(key):
-    """Where every point is missed, it does not matter where the vehicle is; where half are, more is in doubt."""
-    never, memory = observe(dropout=1.0), begin(observe(dropout=1.0), near())
-    here, _ = see(never, memory, near(), Command.hover())
-    there, _ = see(never, memory, aside(), Command.hover())
+def test_missed_points_are_not_observed(key):
+    """If all points are missed, the position has no effect; if half are missed, the uncertainty grows."""
+    never, memory = observe(dropout=1.0), begin(observe(dropout=1.0), near_state())
+    here, _ = see(never, memory, near_state(), Command.hover())
+    there, _ = see(never, memory, partly_visible_state(), Command.hover())
     np.testing.assert_array_equal(here, there)
     doubt = {}
     for dropout in (0.0, 0.5):
-        memory = begin(observe(), near())
+        memory = begin(observe(), near_state())
         for _ in range(4):
-            _, memory = see(observe(dropout=dropout), memory, near(), Command.hover())
+            _, memory = see(observe(dropout=dropout), memory, near_state(), Command.hover())
         doubt[dropout] = float(jnp.trace(memory.pose.P[:3, :3]))
     assert doubt[0.5] > 1.1 * doubt[0.0]
 
 
-def test_a_correction_is_no_motion():
-    """A hand-over that is 20 cm and 6 degrees off is mended at the first look: in all five frames."""
+def test_correction_is_not_motion():
+    """An initial error of 20 cm and 6 degrees is corrected at the first observation, in all five frames."""
     x, hidden = State.at(jnp.array([0.1, 0.1, 1.2])), observe()
     off = State(jnp.array([0.25, 0.0, 1.3]), rotation(jnp.array([0.05, -0.05, 0.08])), x.v)
     memory = begin(hidden, off)
@@ -116,13 +116,13 @@ def test_a_correction_is_no_motion():
     assert np.ptp(frames, axis=0).max() < 0.02
 
 
-def blind(observation, us, delay):
-    """Fly a point mass that hears commands ``delay`` ticks late, for the last half without any visible point.
+def blind_velocity_error(observation, us, delay):
+    """Fly a point mass whose commands act ``delay`` ticks late, for the last half without visible points.
 
     Returns the error of the filter's velocity after each tick [m/s].
     """
     x, last, errors = State.at(jnp.array(GOAL)), Command.hover(), []
-    memory, acting = sure(observation, x), [Command.hover()] * delay
+    memory, acting = exact_memory(observation, x), [Command.hover()] * delay
     for u in us:
         _, memory = see(observation, memory, x, last)
         errors.append(np.linalg.norm(np.asarray(memory.pose.x.v) - np.asarray(x.v)))
@@ -132,30 +132,30 @@ def blind(observation, us, delay):
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
-def test_the_filter_predicts_under_the_command_that_acted(delay):
-    """No point is ever visible: the declared delay follows the true velocity exactly, any other does not.
+def test_filter_predicts_with_delayed_command(delay):
+    """No point is visible: the filter follows the true velocity exactly only with the declared delay.
 
-    After a step of thrust and roll the wrong command is in force for as many ticks as the delay is off by.
+    After a step of thrust and roll, the wrong command acts for the difference of the delays.
     """
     us = [Command.hover()] * 6 + [Command(jnp.array(13.0), jnp.array([1.5, 0.0, 0.0]))] * 6
     declaration = {max(delay - 1, 0), delay, min(delay + 1, 3)}
-    result = {d: blind(observe(dropout=1.0, delay_ticks=d), us, delay) for d in declaration}
+    result = {d: blind_velocity_error(observe(dropout=1.0, delay_ticks=d), us, delay) for d in declaration}
     assert result[delay].max() < 1e-9
     for d, errors in result.items():
-        assert errors[:6].max() < 1e-9  # in hover every delay is the same
+        assert errors[:6].max() < 1e-9  # in hover every delay is equivalent
         if d != delay:
             assert errors[-1] > 0.05
 
 
-def test_a_wrong_delay_shows_even_while_points_are_seen():
-    """With points in sight the filter is corrected, and still follows a step of commands less well."""
+def test_wrong_delay_degrades_filter_with_visible_points():
+    """With visible points the filter is corrected, and still follows a step of commands less accurately."""
     us = [Command.hover()] * 6 + [Command(jnp.array(14.0), jnp.zeros(3)), Command(jnp.array(6.0), jnp.zeros(3))] * 5
-    right, wrong = (blind(observe(delay_ticks=d), us, delay=1).max() for d in (1, 0))
+    right, wrong = (blind_velocity_error(observe(delay_ticks=d), us, delay=1).max() for d in (1, 0))
     assert right < 1e-3
     assert wrong > 20.0 * right
 
 
-def test_impossible_delays():
+def test_invalid_delays_are_refused():
     for delay in (-1, 4):
         with pytest.raises(ValueError, match=rf"delay_ticks = {delay} must be 0 to 3"):
             observe(delay_ticks=delay)
@@ -170,8 +170,8 @@ def observed_and_slope(observation, memory, x):
 
 
 @pytest.mark.parametrize("place", [(0.05, -0.1, 1.1), (4.0, 0.0, 0.3)])
-def test_it_is_for_flight(place):
-    """Finite wherever the vehicle is, and no gradient passes."""
+def test_occlusion_is_finite_without_gradient(place):
+    """The observation is finite at every position of the vehicle, and has no gradient."""
     x = State(jnp.array(place), rotation(jnp.array([0.1, 0.5, 0.0])), jnp.array([0.3, 0.0, 0.0]))
     hidden = observe(noise=1.0, dropout=0.1)
     o, slope = observed_and_slope(hidden, begin(hidden, x), x)
@@ -180,37 +180,39 @@ def test_it_is_for_flight(place):
 
 
 @pytest.mark.parametrize("d", [(0.0, 0.0, 0.0), (1.0, -0.5, 1.5)])
-def test_in_a_frame_the_camera_sees_level_ground(d):
-    """A camera in the world, with a pose estimate that is right, shows what one in the frame would: in all frames."""
-    frame, before = EffectiveGravityFrame.of(jnp.array(d)), near()
+def test_camera_in_frame_sees_level_ground(d):
+    """With a correct pose estimate, a camera in the world shows the image of a camera in the frame, in all frames."""
+    frame, before = EffectiveGravityFrame.of(jnp.array(d)), near_state()
     x = step(before, Command.hover())
     inside = full().in_frame(frame)
     hovering = frame.command(Command.hover())
-    soon = replace_fields(before, p=before.p + 0.02 * before.v)  # a memory is that of a tick ago
+    soon = replace_fields(before, p=before.p + 0.02 * before.v)  # a memory is one tick old
     expected, _ = see(inside, begin(inside, frame.state(soon)), frame.state(x), hovering)
     hidden = observe()
-    result, after = see(hidden.in_frame(frame), sure(hidden, before), frame.state(x), hovering)
+    result, after = see(hidden.in_frame(frame), exact_memory(hidden, before), frame.state(x), hovering)
     np.testing.assert_allclose(result[:77], expected[:77], atol=1e-5)
-    np.testing.assert_allclose(result[85:], expected[85:], atol=1e-9)  # the last command, as the policy gave it
-    np.testing.assert_allclose(after.pose.x.p, x.p, atol=1e-5)  # the filter is in the world
+    np.testing.assert_allclose(result[85:], expected[85:], atol=1e-9)  # the last command, as issued by the policy
+    np.testing.assert_allclose(after.pose.x.p, x.p, atol=1e-5)  # the filter is in the world frame
 
 
-def test_keeping_points_in_sight_is_rewarded():
-    """Nothing is lost while every point is well inside; the farther one is outside, the more; with a gradient."""
+def test_visible_points_are_rewarded():
+    """There is no penalty while every point is well inside; farther outside it grows, with a gradient."""
     plain, task = (
         kind(jnp.array(GOAL), full(), jnp.array(5.0), jnp.array(0.3), 0.02, 10) for kind in (L2Hover, ViewHover)
     )
 
     @jax.jit
-    def lose(x):
+    def penalty(x):
         return plain.reward(jnp.array(0.0), x, Command.hover()) - task.reward(jnp.array(0.0), x, Command.hover())
 
     tilts = [
         replace_fields(State.at(jnp.array([0.0, 0.0, 1.3])), R=rotation(jnp.array([a, 0.0, 0.0])))
         for a in (0.0, 0.8, 1.1)
     ]
-    level, some, more = (float(lose(x)) for x in tilts)
+    level, some, more = (float(penalty(x)) for x in tilts)
     assert level == 0.0
     assert 0.0 < some < more
-    slope = jax.jit(jax.grad(lambda a: lose(replace_fields(tilts[0], R=so3.exp(a * jnp.array([1.0, 0.0, 0.0]))))))(0.8)
+    slope = jax.jit(jax.grad(lambda a: penalty(replace_fields(tilts[0], R=so3.exp(a * jnp.array([1.0, 0.0, 0.0]))))))(
+        0.8
+    )
     assert 0.0 < float(slope) < np.inf

@@ -28,14 +28,14 @@ def points(reference, times):
     return jax.vmap(reference)(jnp.asarray(times))
 
 
-def test_at_a_pace_of_one_it_is_the_reference(reference):
+def test_unit_pace_equals_reference(reference):
     times = np.linspace(0.0, 6.0, 50)
     same = points(PacedReference(reference, Clock.at_pace(jnp.ones(()))), times)
     for leaf, other in zip(same, points(reference, times), strict=True):
         np.testing.assert_allclose(leaf, other, atol=2e-3)
 
 
-def test_derivatives_are_those_of_the_position(reference):
+def test_derivatives_equal_finite_differences(reference):
     """Central differences of the position and of the heading, while the pace changes."""
     h, times = 1e-2, np.linspace(1.95, 2.3, 8)
     paced = PacedReference(reference, clock())
@@ -48,7 +48,7 @@ def test_derivatives_are_those_of_the_position(reference):
     np.testing.assert_allclose(here.u[:, 0], thrust, rtol=1e-4)
 
 
-def test_phase_is_the_integral_of_the_pace():
+def test_phase_is_integral_of_pace():
     c, times = clock(growth=-1.5), np.linspace(2.0, 4.0, 2001)
     pace = jax.vmap(c.pace_at)(jnp.asarray(times))
     assert float(pace.min()) > 0.0  # also for a clock without a successor
@@ -58,8 +58,8 @@ def test_phase_is_the_integral_of_the_pace():
     np.testing.assert_allclose(pace[later], pace[-1])
 
 
-def test_a_new_clock_continues_the_old_one(reference):
-    """Position and velocity do not jump when the growth changes."""
+def test_new_clock_continues_old_one(reference):
+    """Position and velocity are continuous when the growth changes."""
     old, t = clock(), jnp.array(2.2)
     new = Clock(t, old.phase_at(t), old.pace_at(t), jnp.array(-2.0))
     before, after = PacedReference(reference, old)(t), PacedReference(reference, new)(t)
@@ -75,7 +75,7 @@ def test_laps_and_joins_are_flight_times(reference):
 
 
 def test_frames_and_paces_commute(reference):
-    """A turned paced reference is the turned position, at the same times, with the derivatives of the path."""
+    """A rotated paced reference has the rotated position at the same times, with the derivatives of the path."""
     frame = EffectiveGravityFrame.of(jnp.array([1.0, -2.0, 0.5]))
     paced = PacedReference(reference, clock())
     t, h = jnp.array(2.1), 1e-2
@@ -86,7 +86,7 @@ def test_frames_and_paces_commute(reference):
     assert float(paced.in_frame(frame).distance(here.p)) < 1e-3
 
 
-def test_clocks_of_a_tree_are_set_together():
+def test_clocks_of_tree_are_set_together():
     tree = {"a": figure8(), "b": [figure8().in_frame(EffectiveGravityFrame.of(jnp.zeros(3)))], "c": jnp.ones(3)}
     paced = set_clock(pace_references(tree, Clock.at_pace(jnp.ones(()))), clock())
     assert float(paced["a"].clock.pace) == float(paced["b"][0].reference.clock.pace) == 1.7

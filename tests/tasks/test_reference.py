@@ -1,4 +1,4 @@
-"""References as tables: shapes as published, derivatives, flatness, laps, families, what cannot be flown."""
+"""References as tables: published shapes, derivatives, flatness, laps, families, and infeasible references."""
 
 import math
 
@@ -49,7 +49,7 @@ def line(t):
 
 
 @names
-def test_starts_at_rest_at_the_origin(name, tables):
+def test_starts_at_rest_at_origin(name, tables):
     here = at_one(tables[name], 0.0)
     np.testing.assert_allclose(here.p, [0.0, 0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(here.v, 0.0, atol=1e-6)
@@ -58,7 +58,7 @@ def test_starts_at_rest_at_the_origin(name, tables):
 
 
 @names
-def test_repeats_with_its_period_and_no_other(name, tables):
+def test_repeats_with_its_period_only(name, tables):
     reference, period = tables[name], PERIODS[name]
     assert float(reference.lap[1] - reference.lap[0]) == period
     times = RAMP + period * np.linspace(0.0, 0.99, 57)
@@ -81,7 +81,7 @@ def test_extent(name, tables):
     np.testing.assert_array_equal(tables[name].rows[:, 2], 1.0)
 
 
-def test_circle_is_round_and_starts_towards_minus_y(tables):
+def test_circle_has_constant_radius_and_starts_towards_minus_y(tables):
     points = np.asarray(at(tables["circle"], np.linspace(0.0, 6.0, 500)).p)
     np.testing.assert_allclose(np.hypot(points[:, 0] - 1.0, points[:, 1]), 1.0, atol=1e-4)
     assert points[100, 1] < -0.01
@@ -94,7 +94,7 @@ def test_star_has_five_corners_and_straight_edges(tables):
     for corner in CORNERS:
         assert np.abs(z - corner).min() < 0.01
     assert np.abs(z - 1.0).max() <= 1.0 + 1e-9
-    # an edge is on a line that passes the centre at cos 72 of the radius
+    # the line of an edge passes the centre at cos 72 of the radius
     v = lap[:, 3] + 1j * lap[:, 4]
     straight = np.abs(np.abs(v) - 1.585) < 1e-3
     assert straight.mean() > 0.95
@@ -110,7 +110,7 @@ def test_speeds_after_spin_up(tables):
         assert np.percentile(speeds, 95) - np.percentile(speeds, 5) < 2e-3
 
 
-def test_the_start_is_smooth():
+def test_start_is_smooth():
     times = np.linspace(0.0, 4.0, 4001)
     path = np.array([smooth_start(float(t)) for t in times])
     assert (np.diff(path) >= 0.0).all()
@@ -118,7 +118,7 @@ def test_the_start_is_smooth():
     assert path[0] == 0.0
     assert rate[0] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(rate[times > 3.0], 1.0, atol=1e-6)
-    assert np.abs(np.diff(rate)).max() < 1e-3  # no jump of velocity
+    assert np.abs(np.diff(rate)).max() < 1e-3  # the velocity is continuous
     assert path[-1] == pytest.approx(1.5 + 1.0)
 
 
@@ -126,8 +126,8 @@ def test_the_start_is_smooth():
 
 
 @names
-def test_continuous_also_across_the_lap(name, tables):
-    """No step is longer than the fastest speed allows; nor at the seam."""
+def test_position_is_continuous_across_lap(name, tables):
+    """No step is longer than the fastest speed allows, including that between laps."""
     reference, end = tables[name], RAMP + PERIODS[name]
     fastest = float(np.linalg.norm(np.asarray(reference.rows)[:, 3:6], axis=1).max())
     times = np.linspace(0.0, end + PERIODS[name] + 0.5, 6000)
@@ -140,16 +140,16 @@ def test_continuous_also_across_the_lap(name, tables):
 
 
 @names
-def test_velocity_is_the_derivative_of_position(name, tables):
+def test_velocity_is_derivative_of_position(name, tables):
     rows, every = np.asarray(tables[name].rows), float(tables[name].every)
     slopes = (rows[2:, :3] - rows[:-2, :3]) / (2.0 * every)
     wrong = np.linalg.norm(slopes - rows[1:-1, 3:6], axis=1)
-    if name == "star":  # at a corner there is none
+    if name == "star":  # a corner has no derivative
         near = np.abs((rows[1:-1, 0] + 1j * rows[1:-1, 1])[:, None] - np.array(CORNERS)[None]).min(axis=1) < 0.03
         assert near.mean() < 0.15
         wrong = wrong[~near]
     assert wrong.max() < 1e-3
-    assert np.linalg.norm(rows[:, 3:6], axis=1).max() > 1.0  # the bound says something
+    assert np.linalg.norm(rows[:, 3:6], axis=1).max() > 1.0  # the bound is meaningful
 
 
 def test_interpolates_linearly_between_rows(tables):
@@ -160,11 +160,11 @@ def test_interpolates_linearly_between_rows(tables):
     np.testing.assert_allclose(jnp.concatenate([jnp.atleast_1d(leaf) for leaf in here]), mixture, atol=1e-12)
 
 
-# ---- headings that wind
+# ---- headings over several turns
 
 
-def along(phase):
-    """A circle of 3 s whose nose points along the path, folded at the west or not; the phase is where it begins."""
+def heading_along_path(phase):
+    """Return a circle of 3 s whose heading follows the path, wrapped or not; ``phase`` is its beginning."""
 
     def path(t, fold):
         phi = 2.0 * math.pi * smooth_start(t) / 3.0
@@ -179,7 +179,7 @@ winding = pytest.mark.parametrize(("fold", "phase"), [(False, 0.0), (True, 0.0),
 
 
 def make(fold, phase):
-    path = along(phase)
+    path = heading_along_path(phase)
     return Reference.of(lambda t: path(t, fold), seconds=6.0, lap=3.0)
 
 
@@ -188,7 +188,7 @@ def turned_by(angle):
 
 
 def check_heading(reference, first, last):
-    """The nose turns steadily, and its rate is the derivative of its heading but for whole turns."""
+    """Assert that the heading turns steadily, and that its rate is its derivative except for whole turns."""
     step = 1e-3
     times = np.arange(first, last, step)
     points = at(reference, times)
@@ -197,16 +197,16 @@ def check_heading(reference, first, last):
 
 
 @winding
-def test_the_rate_of_a_heading_is_its_derivative(fold, phase):
+def test_rate_of_heading_is_its_derivative(fold, phase):
     reference = make(fold, phase)
     assert np.abs(reference.rows[:, 17]).max() == pytest.approx(2.0 * math.pi / 3.0, rel=1e-3)
-    assert np.abs(np.diff(reference.rows[:, 10])).max() < 0.02  # it may be interpolated
+    assert np.abs(np.diff(reference.rows[:, 10])).max() < 0.02  # the value may be interpolated
     assert float(reference.rows[-1, 10] - at_one(reference, 3.0).heading) == pytest.approx(2.0 * math.pi, abs=1e-4)
     check_heading(reference, 0.0, 14.0)
 
 
 @winding
-def test_a_family_turns_as_its_members_do(fold, phase):
+def test_heading_of_family_equals_members(fold, phase):
     check_heading(join_references([make(fold, phase), circle()]), 0.0, 19.9)
 
 
@@ -214,7 +214,7 @@ def test_a_family_turns_as_its_members_do(fold, phase):
 
 
 def attitude_of(reference, t, h=0.02):
-    """Body axes from the table's velocity alone: z along the thrust that its change needs, x towards the heading."""
+    """Return body axes from the velocity of the table only: z along the required thrust, x towards the heading."""
     ahead, behind = at_one(reference, t + h).v, at_one(reference, t - h).v
     thrust = (ahead - behind) / (2.0 * h) + np.array([0.0, 0.0, 9.81])
     z = thrust / np.linalg.norm(thrust)
@@ -224,8 +224,8 @@ def attitude_of(reference, t, h=0.02):
     return jnp.asarray(np.stack([np.cross(y, z), y, z], axis=1))
 
 
-def flown_open_loop(reference, t0, seconds, h=0.005):
-    """A point mass under the reference's own command, from the reference's own state; and where it should be."""
+def open_loop_flight(reference, t0, seconds, h=0.005):
+    """Return a point mass under the command and from the state of the reference, and the expected state."""
     here = at_one(reference, t0)
     x = State(jnp.array(here.p), attitude_of(reference, t0) if t0 > 0.0 else jnp.eye(3), jnp.array(here.v))
     times = t0 + h * np.arange(round(seconds / h))
@@ -243,43 +243,43 @@ def _open_loop(x, commands, h):
 
 
 @pytest.mark.parametrize(("name", "t0"), [("circle", 4.0), ("circle", 0.0), ("figure8", 3.5), ("figure8", 4.7)])
-def test_its_command_flies_it(name, t0, tables):
-    assert flown_open_loop(tables[name], t0, 1.0).max() < 5e-3
+def test_command_tracks_reference_open_loop(name, t0, tables):
+    assert open_loop_flight(tables[name], t0, 1.0).max() < 5e-3
 
 
-def test_its_command_flies_it_while_turning():
-    """A climbing circle, the nose along the motion."""
+def test_command_tracks_turning_reference_open_loop():
+    """A climbing circle with the heading along the motion."""
 
     def helix(t):
         return [math.cos(t), math.sin(t), 1.0 + 0.2 * t, t + 0.5 * math.pi]
 
     reference = Reference.of(helix, seconds=6.0)
-    assert flown_open_loop(reference, 2.0, 1.0).max() < 5e-3
+    assert open_loop_flight(reference, 2.0, 1.0).max() < 5e-3
     spin = np.asarray(at_one(reference, 3.0).u)
     assert spin[3] == pytest.approx(1.0, abs=0.02)
 
 
 def test_thrust_of_the_circle_by_hand(tables):
-    """(2 pi / 3 s)^2 x 1 m sideways on top of gravity."""
+    """(2 pi / 3 s)^2 x 1 m sideways plus gravity."""
     c = at(tables["circle"], np.linspace(3.5, 5.5, 50)).u[:, 0]
     np.testing.assert_allclose(c, math.hypot((2.0 * math.pi / 3.0) ** 2, 9.81), rtol=1e-3)
 
 
-def test_at_a_jump_it_hovers(tables):
+def test_command_at_velocity_jump_is_hover(tables):
     rows = np.asarray(tables["star"].rows)
-    assert np.abs(rows[:, 6] - 9.81).max() < 0.5  # no command flies a corner, and none pretends to
+    assert np.abs(rows[:, 6] - 9.81).max() < 0.5  # no command flies a corner
 
 
-# ---- what a vehicle cannot fly
+# ---- infeasible references
 
 
-def test_the_papers_smooth_shapes_can_be_flown(tables):
+def test_smooth_shapes_of_paper_are_feasible(tables):
     assert tables["circle"].infeasibility(small()) is None
     assert tables["figure8"].infeasibility(small()) is None
 
 
-def test_names_the_jump(tables):
-    """Edges meet at 36 degrees: the velocity turns by 144, 2 x 1.585 m/s x sin 72 = 3.02 m/s."""
+def test_velocity_jump_is_reported(tables):
+    """Edges meet at 36 degrees: the velocity turns by 144 degrees, 2 x 1.585 m/s x sin 72 = 3.02 m/s."""
     text = tables["star"].infeasibility(small())
     assert "velocity jumps by 3.0" in text
     when = float(text.split(" at ")[1].split(" s")[0])
@@ -287,8 +287,8 @@ def test_names_the_jump(tables):
     assert np.abs(complex(corner[0], corner[1]) - np.array(CORNERS)).min() < 0.03
 
 
-def test_names_the_thrust():
-    """Loaded with more than its weight, the small one has 28.6 m/s^2; a circle at 27.4 m/s^2 needs 29.1."""
+def test_excessive_thrust_is_reported():
+    """With a load above its weight, the small vehicle has 28.6 m/s^2; a circle at 27.4 m/s^2 needs 29.1."""
     heavy = with_payload(small(), 0.3)
     text = circle(radius=1.0, period=1.2).infeasibility(heavy)
     assert "needs 29.1 m/s² of thrust" in text
@@ -296,12 +296,12 @@ def test_names_the_thrust():
     assert "thrust" not in circle(radius=1.0, period=1.3).infeasibility(heavy)
 
 
-def test_names_the_thrust_of_a_far_too_fast_circle():
+def test_thrust_of_far_too_fast_circle_is_reported():
     assert "of thrust" in circle(radius=3.0, period=1.0).infeasibility(small())
 
 
-def test_names_the_axis_of_the_rate():
-    """A nose that turns at 6 rad/s on the spot; a circle that needs more roll than a lazy vehicle has."""
+def test_axis_of_excessive_rate_is_reported():
+    """A heading that turns at 6 rad/s on the spot, and a circle that needs more roll rate than a slow vehicle has."""
     spin = Reference.of(lambda t: [0.0, 0.0, 1.0, 6.0 * t], seconds=2.0)
     text = spin.infeasibility(small())
     assert "it needs 6.0 rad/s about z" in text
@@ -310,7 +310,7 @@ def test_names_the_axis_of_the_rate():
     assert "rad/s about x" in circle().infeasibility(lazy)
 
 
-def test_names_a_start_and_an_end_at_speed():
+def test_start_and_end_at_speed_are_reported():
     text = Reference.of(lambda t: [2.0 * t, 0.0, 1.0], seconds=2.0).infeasibility(small())
     assert "it starts at speed, 2.00 m/s" in text
     assert "it ends at speed, 2.00 m/s" in text
@@ -320,21 +320,21 @@ def test_names_a_start_and_an_end_at_speed():
 
 
 def dive(depth, seconds=1.0):
-    """Down by ``depth`` [m] from rest to rest; the largest acceleration is 2 pi depth / seconds^2."""
+    """Return a descent by ``depth`` [m] from rest to rest, with a largest acceleration of 2 pi depth / seconds^2."""
     w = 2.0 * math.pi / seconds
     return lambda t: [0.0, 0.0, 9.0 - depth * (w * t - math.sin(w * t)) / (2.0 * math.pi)]
 
 
-def test_names_what_is_steeper_than_free_fall():
-    """1.5 m in 1 s need 9.42 m/s^2 downwards, 1.7 m need 10.68."""
+def test_descent_faster_than_free_fall_is_reported():
+    """1.5 m in 1 s need 9.42 m/s^2 downwards, and 1.7 m need 10.68 m/s^2."""
     assert Reference.of(dive(1.5), seconds=1.0).infeasibility(small()) is None
     text = Reference.of(dive(1.7), seconds=1.0).infeasibility(small())
     assert "steeper than free fall at 0.2" in text
     assert "(10.7 m/s² downwards)" in text
 
 
-def test_in_free_fall_it_hovers():
-    """Without thrust there is no attitude: the command is finite, and the reason named."""
+def test_command_in_free_fall_is_hover():
+    """Without thrust the attitude is undefined: the command is finite, and the reason is reported."""
     height = 9.0 - 0.5 * 9.81 * np.linspace(0.0, 1.0, 5) ** 2
     reference = Reference.of(lambda t: [0.0, 0.0, 9.0 - 0.5 * 9.81 * t**2], seconds=1.0)
     assert np.isfinite(np.asarray(reference.rows)).all()
@@ -342,12 +342,12 @@ def test_in_free_fall_it_hovers():
     assert "ends at speed" in reference.infeasibility(small())
 
 
-def test_names_the_ground():
+def test_ground_contact_is_reported():
     text = Reference.of(lambda t: [0.0, 0.0, 0.5 - 0.9 * smooth_start(t, 2.0)], seconds=2.0).infeasibility(small())
     assert "0.40 m below the ground, z = 0, at 2.00 s" in text
 
 
-def test_names_a_lap_that_does_not_close():
+def test_open_lap_is_reported():
     def path(t):
         return [0.1 * smooth_start(t), 0.0, 1.0]
 
@@ -356,8 +356,8 @@ def test_names_a_lap_that_does_not_close():
     )
 
 
-def test_names_a_jump_from_lap_to_lap():
-    """There and back at 1 m/s: the velocity turns at the seam, within a millimetre of the start."""
+def test_velocity_jump_between_laps_is_reported():
+    """Back and forth at 1 m/s: the velocity reverses between laps, within a millimetre of the start."""
 
     def path(t):
         s = smooth_start(t) % 2.0
@@ -369,17 +369,17 @@ def test_names_a_jump_from_lap_to_lap():
     assert "velocity jumps by" in bow.infeasibility(small())
 
 
-def test_all_reasons_are_named():
+def test_all_reasons_are_reported():
     text = Reference.of(lambda t: [2.0 * t, 0.0, -1.0, 9.0 * t], seconds=2.0).infeasibility(small())
     assert text.count(";") == 3
     for reason in ("starts at speed", "ends at speed", "rad/s about z", "below the ground"):
         assert reason in text
 
 
-# ---- what is refused
+# ---- refusals
 
 
-def test_a_path_must_be_finite_and_of_three_or_four_numbers():
+def test_path_must_be_finite_with_three_or_four_numbers():
     with pytest.raises(ValueError, match=r"at 1\.\d+ s the path gives .*nan"):
         Reference.of(lambda t: [math.nan if t > 1.0 else 0.0, 0.0, 1.0], seconds=2.0)
     with pytest.raises(ValueError, match=r"the path gives \[.*inf"):
@@ -392,7 +392,7 @@ def test_a_path_must_be_finite_and_of_three_or_four_numbers():
 @pytest.mark.parametrize(
     "sizes", [{"seconds": 0.0}, {"lap": 2.0}, {"lap": -0.1}, {"lap": 2.5}, {"points": 1}, {"seconds": math.nan}]
 )
-def test_impossible_sizes(sizes):
+def test_invalid_sizes_are_refused(sizes):
     name, value = next(iter(sizes.items()))
     with pytest.raises(ValueError, match=f"Reference: {name} must be .*got {value}"):
         Reference.of(line, **({"seconds": 2.0} | sizes))
@@ -406,7 +406,7 @@ def test_number_of_rows():
 # ---- without a lap
 
 
-def test_the_end_is_held():
+def test_end_is_held():
     reference = Reference.of(lambda t: [math.sin(0.5 * math.pi * t), 0.0, 1.0], seconds=1.0)
     end = at_one(reference, 1.0)
     for t in (1.001, 5.0, 1e4):
@@ -421,14 +421,14 @@ def test_the_end_is_held():
 
 
 @pytest.mark.parametrize("what", ["joined", "distance"])
-def test_no_silent_promotion(what, tables):
+def test_no_silent_type_promotion(what, tables):
     if what == "joined":
         join_references([tables["circle"]], seconds=6.0)
     else:
         tables["circle"].distance(jnp.zeros(3))
 
 
-def test_each_stretch_of_a_family_is_its_reference(tables):
+def test_each_part_of_family_is_its_reference(tables):
     family = join_references(list(tables.values()))
     times = 0.02 * np.arange(950)
     for k, reference in enumerate(tables.values()):
@@ -439,8 +439,8 @@ def test_each_stretch_of_a_family_is_its_reference(tables):
     assert np.abs(between).max() < 1e-3
 
 
-def test_starts_of_a_family_never_straddle(tables):
-    """4 s of roll-out, and half a second of preview, from wherever one may start, stay in the stretch."""
+def test_roll_outs_stay_in_one_part_of_family(tables):
+    """From every possible start, 4 s of roll-out and 0.5 s of preview stay in the part."""
     family = join_references(list(tables.values()), seconds=8.0, every=0.02)
     for k, (first, last) in enumerate(np.asarray(family.joins)):
         assert 8.0 * k <= first < last
@@ -448,7 +448,7 @@ def test_starts_of_a_family_never_straddle(tables):
     assert family.joins.shape == (len(tables), 2)
 
 
-def test_a_family_needs_members_and_time(tables):
+def test_family_needs_members_and_time(tables):
     for members, seconds in (([], 20.0), (list(tables.values()), 5.9)):
         with pytest.raises(ValueError, match="at least 1, of at least 6 s"):
             join_references(members, seconds=seconds)
@@ -461,7 +461,7 @@ distances = eqx.filter_jit(lambda reference, p: jax.vmap(reference.distance)(p))
 
 
 @names
-def test_no_distance_on_the_lap(name, tables):
+def test_cross_track_error_is_zero_on_lap(name, tables):
     reference = tables[name]
     rows, times = np.asarray(reference.rows), row_times(reference)
     on = rows[times >= RAMP][::37, :3]
@@ -470,7 +470,7 @@ def test_no_distance_on_the_lap(name, tables):
     assert float(distances(reference, between).max()) < 1e-9
 
 
-def test_distance_from_a_circle_is_the_radial_offset(tables, key):
+def test_cross_track_error_of_circle_is_radial_offset(tables, key):
     angle, offset = random.uniform(key, (2, 20))
     for a, d in zip(6.28 * np.asarray(angle), 0.9 * np.asarray(offset) + 0.05, strict=True):
         for way in (1.0 + d, 1.0 - 0.9 * d):
@@ -480,8 +480,8 @@ def test_distance_from_a_circle_is_the_radial_offset(tables, key):
     assert float(tables["circle"].distance(above)) == pytest.approx(0.7, abs=2e-5)
 
 
-def test_distance_knows_the_lap_only(tables):
-    """The way into the lap does not count; without a lap everything does."""
+def test_cross_track_error_uses_lap_only(tables):
+    """The path to the lap does not count; without a lap the whole path does."""
 
     def path(t):
         return [0.0, 0.0, t] if t < 1.0 else [math.sin(2.0 * math.pi * t), 0.0, 1.0]
@@ -501,7 +501,7 @@ def test_size_and_period_can_be_chosen(make):
 # ---- with a top speed
 
 
-def test_a_slow_lissajous_takes_ten_seconds():
+def test_slow_lissajous_takes_ten_seconds():
     reference = AT_SPEED["lissajous"](0.8886)
     start, end = np.asarray(reference.lap)
     assert end - start == pytest.approx(10.0, abs=2e-3)
@@ -510,8 +510,10 @@ def test_a_slow_lissajous_takes_ten_seconds():
 
 @pytest.mark.parametrize("speed", [1.5, 4.0, 8.0])
 @pytest.mark.parametrize("shape", AT_SPEED)
-def test_a_shape_with_a_top_speed(shape, speed):
-    """It is that fast on the lap, never faster, and a vehicle of 2 g can fly it, corners of the star aside."""
+def test_shape_with_top_speed(shape, speed):
+    """The lap has this speed and never exceeds it, and a vehicle with 2 g can fly it except for the corners of the
+    star.
+    """
     reference = AT_SPEED[shape](speed)
     rows, lap = np.asarray(reference.rows), np.asarray(reference.lap)
     speeds = np.linalg.norm(rows[:, 3:6], axis=1)

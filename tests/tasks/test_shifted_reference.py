@@ -18,7 +18,7 @@ def reference():
     return figure8()
 
 
-def test_without_a_shift_it_is_the_reference(reference):
+def test_zero_shift_equals_reference(reference):
     times = jnp.linspace(0.0, 12.0, 60)
     shifted, plain = jax.vmap(ShiftedReference.of(reference))(times), jax.vmap(reference)(times)
     for leaf, other in zip(shifted, plain, strict=True):
@@ -26,7 +26,7 @@ def test_without_a_shift_it_is_the_reference(reference):
     np.testing.assert_allclose(shifted.p, plain.p, atol=1e-12)
 
 
-def test_the_functions_are_periodic_and_have_their_derivatives(reference):
+def test_functions_are_periodic_with_correct_derivatives(reference):
     t, h, period = jnp.array(4.3), 1e-4, reference.lap[1] - reference.lap[0]
     for order in range(3):
         rate = (basis(reference.lap, t + h, order) - basis(reference.lap, t - h, order)) / (2 * h)
@@ -36,7 +36,7 @@ def test_the_functions_are_periodic_and_have_their_derivatives(reference):
         )
 
 
-def test_velocity_and_command_belong_to_the_shifted_path(reference):
+def test_velocity_and_command_belong_to_shifted_path(reference):
     shifted, h = set_shift({"a": ShiftedReference.of(reference)}, SHIFT)["a"], 1e-4
     for t in (4.0, 5.7):
         here, before, after = (shifted(jnp.array(t + k * h)) for k in (0, -1, 1))
@@ -45,14 +45,14 @@ def test_velocity_and_command_belong_to_the_shifted_path(reference):
         np.testing.assert_allclose(here.u[0], thrust, rtol=1e-9)
 
 
-def test_a_path_without_laps_is_not_shifted():
+def test_path_without_laps_is_not_shifted():
     once = Reference.of(lambda t: [np.sin(t), 0.0, 1.0], seconds=3.0)
     shifted = set_shift(ShiftedReference.of(once), SHIFT)
     np.testing.assert_array_equal(shifted(jnp.array(1.0)).p, once(jnp.array(1.0)).p)
 
 
-def test_the_pace_moves_the_shifted_path(reference):
-    """The shift is a function of the phase, so it stays at its place when the pace changes."""
+def test_pace_applies_to_shifted_path(reference):
+    """The shift is a function of the phase, so its position is constant when the pace changes."""
     clock = Clock(jnp.array(0.0), jnp.array(4.0), jnp.array(2.0), jnp.array(0.0))
     tree = set_shift(pace_references(shift_references([reference]), clock), SHIFT)
     assert isinstance(tree[0], PacedReference)

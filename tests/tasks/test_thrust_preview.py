@@ -1,4 +1,4 @@
-"""The thrust preview: invariances of its numbers, and the place of a known disturbance in them."""
+"""The thrust preview: invariances of its numbers, and the effect of a known disturbance on them."""
 
 import dataclasses
 
@@ -38,7 +38,7 @@ def constant(a):
     return lambda x, u: jnp.array(a)
 
 
-def test_a_constant_residual_and_the_frame_of_the_same_push_give_the_same_directions():
+def test_constant_residual_and_frame_of_same_push_give_same_directions():
     d = (1.5, -1.0, 0.5)
     frame = EffectiveGravityFrame.of(jnp.array(d))
     framed = observe(OBSERVATION.in_frame(frame), frame.state(X), frame.command(LAST))
@@ -49,7 +49,7 @@ def test_a_constant_residual_and_the_frame_of_the_same_push_give_the_same_direct
     np.testing.assert_allclose(framed[end : end + 2], plain[end : end + 2], atol=1e-5)
 
 
-def test_a_turn_of_the_vehicle_turns_the_observed_vectors():
+def test_observed_vectors_rotate_with_vehicle():
     turn = so3.exp(jnp.array([0.4, 0.2, -0.6]))
     before, after = (observe(OBSERVATION, State(X.p, R, X.v)) for R in (X.R, so3.mul(X.R, turn)))
     count = 2 + POINTS
@@ -57,7 +57,7 @@ def test_a_turn_of_the_vehicle_turns_the_observed_vectors():
     np.testing.assert_allclose(after[: 3 * count].reshape(count, 3), vectors @ np.asarray(turn), atol=1e-5)
 
 
-def test_a_residual_that_depends_on_velocity_is_evaluated_along_the_reference():
+def test_velocity_dependent_residual_is_evaluated_along_reference():
     drag = OBSERVATION.with_residual(lambda x, u: -0.4 * x.v)
     end = 6 + 3 * POINTS
     change = (observe(drag) - observe(OBSERVATION))[6:end].reshape(POINTS, 3) * STANDARD_GRAVITY
@@ -66,7 +66,7 @@ def test_a_residual_that_depends_on_velocity_is_evaluated_along_the_reference():
     np.testing.assert_allclose(change, expected @ np.asarray(X.R), atol=1e-4)
 
 
-def test_the_network_hovers_at_rest():
+def test_network_commands_hover_at_rest():
     vehicle = small()
     network = ThrustNetwork.of(OBSERVATION.size, vehicle, random.key(0), (8,))
     rest = dataclasses.replace(OBSERVATION, reference=figure8(1e-3, 1e-3))
@@ -76,7 +76,7 @@ def test_the_network_hovers_at_rest():
 
 
 @pytest.mark.parametrize("length", [3.0, 8.0])
-def test_a_free_heading_turns_about_the_thrust_axis_at_a_constant_rate(length):
+def test_free_heading_turns_about_thrust_axis_at_constant_rate(length):
     free, plain = with_free_heading(figure8(length, 1.0)), figure8(length, 1.0)
     np.testing.assert_array_equal(free.rows[:, :7], plain.rows[:, :7])
     rates, own = np.asarray(free.rows[:, 7:10]), np.asarray(plain.rows[:, 7:10])
@@ -86,13 +86,13 @@ def test_a_free_heading_turns_about_the_thrust_axis_at_a_constant_rate(length):
     np.testing.assert_allclose(np.linalg.norm(rates[:, :2], axis=1), np.linalg.norm(own[:, :2], axis=1), atol=0.02)
 
 
-def test_a_free_heading_closes_the_lap():
+def test_free_heading_closes_lap():
     free = with_free_heading(figure8(8.0, 3.0))
     start, end = (free(jnp.array(t)).heading for t in (float(free.lap[0]), float(free.lap[1]) - 1e-4))
     np.testing.assert_allclose([np.cos(start), np.sin(start)], [np.cos(end), np.sin(end)], atol=0.02)
 
 
-def test_the_gradient_of_the_network_is_that_of_finite_differences():
+def test_gradient_of_network_equals_finite_differences():
     network = ThrustNetwork.of(OBSERVATION.size, small(), random.key(1), (8, 8))
     o = OBSERVATION(OBSERVATION.init(X), T, X, LAST)[0]
 
@@ -102,7 +102,7 @@ def test_the_gradient_of_the_network_is_that_of_finite_differences():
     check_grads(output, (network.gains, network.lead), order=1, modes=["rev"], atol=1e-3, rtol=1e-3)
 
 
-def test_feedback_is_limited_so_that_a_distant_vehicle_stays_upright():
+def test_limited_feedback_keeps_distant_vehicle_upright():
     network = ThrustNetwork.of(OBSERVATION.size, small(), random.key(1), (8,))
     policy = NetworkPolicy.create(network, small())
     far = State(X.p + jnp.array([50.0, -30.0, 0.0]), jnp.eye(3), REFERENCE(T).v)
@@ -111,7 +111,7 @@ def test_feedback_is_limited_so_that_a_distant_vehicle_stays_upright():
     assert float(u.c) > 8.0
 
 
-def test_a_network_that_needs_the_thrust_preview_refuses_other_observations():
+def test_network_refuses_observations_without_thrust_preview():
     preset = load("track/retrim")
     preset = dataclasses.replace(preset, pretrain=dataclasses.replace(preset.pretrain, network="thrust"))
     with pytest.raises(ConfigError, match="needs \\[track\\] observation = 'thrust'"):

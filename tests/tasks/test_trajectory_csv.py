@@ -1,4 +1,4 @@
-"""Trajectory files: what is read, what repeats, what is refused and why."""
+"""Trajectory files: accepted forms, repetition, and refusals with their reasons."""
 
 import itertools
 import math
@@ -25,15 +25,15 @@ def write(tmp_path, text):
     return file
 
 
-def sampled(tmp_path, path, times, *, decimals=6, header="t,x,y,z,yaw"):
+def sample_to_file(tmp_path, path, times, *, decimals=6, header="t,x,y,z,yaw"):
     rows = [[t, *path(float(t))] for t in times]
     names = ",".join(header.split(",")[: len(rows[0])])
     lines = [",".join(f"{value:.{decimals}f}" for value in row) for row in rows]
     return write(tmp_path, "\n".join([names, *lines]) + "\n")
 
 
-def round_lap(t):
-    """The paper's circle from its first lap on, without the start from rest."""
+def circle_lap(t):
+    """Return the circle of the paper from its first lap on, without the start from rest."""
     phi = TURN * t / 3.0
     return [1.0 - math.cos(phi), -math.sin(phi), 1.0]
 
@@ -46,10 +46,10 @@ def eight_lap(t):
 # ---- laps
 
 
-@pytest.mark.parametrize(("lap", "shape", "period"), [(round_lap, circle, 3.0), (eight_lap, figure8, 5.0)])
-def test_a_sampled_lap_is_the_built_in_shape(lap, shape, period, tmp_path):
-    """Positions within 1 mm, also in the smooth start and in the tenth lap; and it can be flown."""
-    reference = from_csv(sampled(tmp_path, lap, np.linspace(0.0, period, round(50 * period) + 1)))
+@pytest.mark.parametrize(("lap", "shape", "period"), [(circle_lap, circle, 3.0), (eight_lap, figure8, 5.0)])
+def test_sampled_lap_equals_built_in_shape(lap, shape, period, tmp_path):
+    """Positions agree within 1 mm, including the smooth start and the tenth lap, and the reference is feasible."""
+    reference = from_csv(sample_to_file(tmp_path, lap, np.linspace(0.0, period, round(50 * period) + 1)))
     np.testing.assert_array_equal(reference.lap, shape().lap)
     times = np.concatenate([np.linspace(0.0, 3.0 + 2.0 * period, 501), 3.0 + 9.0 * period + np.linspace(0, 3, 50)])
     result, expected = at(reference, times), at(shape(), times)
@@ -61,8 +61,8 @@ def test_a_sampled_lap_is_the_built_in_shape(lap, shape, period, tmp_path):
     assert (rates < 0.8 * np.asarray(small().omega_max)).all()
 
 
-def test_a_lap_of_few_points_is_smooth_from_lap_to_lap(tmp_path):
-    reference = from_csv(sampled(tmp_path, round_lap, np.linspace(0.0, 3.0, 9)))
+def test_lap_of_few_points_is_smooth_between_laps(tmp_path):
+    reference = from_csv(sample_to_file(tmp_path, circle_lap, np.linspace(0.0, 3.0, 9)))
     radius = np.linalg.norm(np.asarray(reference.rows)[:, :2] - np.array([1.0, 0.0]), axis=1)
     np.testing.assert_allclose(radius, 1.0, atol=0.01)
     seam = at(reference, [6.0 - 1e-3, 6.0 + 1e-3])
@@ -71,9 +71,11 @@ def test_a_lap_of_few_points_is_smooth_from_lap_to_lap(tmp_path):
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.005, 0.0099])
-def test_ends_that_nearly_meet_are_closed_without_a_step(gap, tmp_path):
-    """The gap is spread over the lap: it is not flown in one step between two points."""
-    file = sampled(tmp_path, lambda t: [round_lap(t)[0] + gap * t / 3.0, *round_lap(t)[1:]], np.linspace(0, 3, 151))
+def test_small_gap_between_ends_is_closed_smoothly(gap, tmp_path):
+    """The gap is distributed over the lap, and not closed in one step between two points."""
+    file = sample_to_file(
+        tmp_path, lambda t: [circle_lap(t)[0] + gap * t / 3.0, *circle_lap(t)[1:]], np.linspace(0, 3, 151)
+    )
     reference = from_csv(file)
     assert float(reference.lap[1] - reference.lap[0]) == 3.0
     assert reference.infeasibility(small()) is None
@@ -81,119 +83,121 @@ def test_ends_that_nearly_meet_are_closed_without_a_step(gap, tmp_path):
     np.testing.assert_allclose(np.linalg.norm(rows[:, :2] - np.array([1.0, 0.0]), axis=1), 1.0, atol=1.01 * gap + 1e-4)
 
 
-def test_ends_that_are_two_centimetres_apart_do_not_meet(tmp_path):
-    file = sampled(tmp_path, lambda t: [round_lap(t)[0] + 0.02 * t / 3.0, *round_lap(t)[1:]], np.linspace(0, 3, 151))
+def test_gap_of_two_centimetres_is_not_closed(tmp_path):
+    file = sample_to_file(
+        tmp_path, lambda t: [circle_lap(t)[0] + 0.02 * t / 3.0, *circle_lap(t)[1:]], np.linspace(0, 3, 151)
+    )
     reference = from_csv(file)
     assert float(reference.lap[0]) == float(reference.lap[1]) == 3.0
     with pytest.raises(ConfigError, match=r"path.csv: its last point is 0\.020 m from its first.*a lap ends with"):
         from_csv(file, laps=True)
 
 
-def test_a_closed_file_can_be_flown_once(tmp_path):
-    file = sampled(tmp_path, round_lap, np.linspace(0.0, 3.0, 151))
+def test_closed_file_can_be_flown_once(tmp_path):
+    file = sample_to_file(tmp_path, circle_lap, np.linspace(0.0, 3.0, 151))
     reference = from_csv(file, laps=False)
     np.testing.assert_array_equal(reference.lap, [3.0, 3.0])
-    np.testing.assert_allclose(at(reference, [1.0]).p[0], round_lap(1.0), atol=1e-5)
+    np.testing.assert_allclose(at(reference, [1.0]).p[0], circle_lap(1.0), atol=1e-5)
     text = reference.infeasibility(small())
     assert "starts at speed, 2.09 m/s" in text
     assert "ends at speed, 2.09 m/s" in text
-    assert "rad/s" not in text  # no false spike at the ends
+    assert "rad/s" not in text  # no false peak at the ends
 
 
-def test_a_lap_from_rest_to_rest_keeps_its_times(tmp_path):
-    """There and back in 4 s, at rest at both ends: nothing is slowed down."""
+def test_lap_from_rest_to_rest_keeps_its_times(tmp_path):
+    """Back and forth in 4 s, at rest at both ends: no part is slowed down."""
 
     def path(t):
         return [0.5 - 0.5 * math.cos(TURN * t / 4.0), 0.0, 1.0]
 
-    reference = from_csv(sampled(tmp_path, path, np.linspace(0.0, 4.0, 101)))
+    reference = from_csv(sample_to_file(tmp_path, path, np.linspace(0.0, 4.0, 101)))
     np.testing.assert_array_equal(reference.lap, [0.0, 4.0])
     times = np.linspace(0.0, 12.0, 100)
     np.testing.assert_allclose(at(reference, times).p, [path(t) for t in times], atol=1e-3)
     assert reference.infeasibility(small()) is None
 
 
-def test_the_nose_turns_on_from_lap_to_lap(tmp_path):
-    """The nose along the motion, its angle wrapped in the file: a turn more in every lap, without a rate spike."""
+def test_heading_is_continuous_between_laps(tmp_path):
+    """The heading follows the motion and is wrapped in the file: it gains a turn per lap, without a peak."""
 
     def path(t):
-        return [*round_lap(t), math.remainder(-0.5 * math.pi + TURN * t / 3.0, TURN)]
+        return [*circle_lap(t), math.remainder(-0.5 * math.pi + TURN * t / 3.0, TURN)]
 
-    reference = from_csv(sampled(tmp_path, path, np.linspace(0.0, 3.0, 151)))
+    reference = from_csv(sample_to_file(tmp_path, path, np.linspace(0.0, 3.0, 151)))
     np.testing.assert_array_equal(reference.lap, [3.0, 6.0])
     times = np.linspace(3.1, 11.9, 200)
     points = at(reference, times)
     expected = -0.5 * math.pi + TURN * (times - 1.5) / 3.0
     np.testing.assert_allclose(np.cos(points.heading - expected), 1.0, atol=1e-6)
-    steady = np.asarray(points.u)[:, 1:]  # 2 pi / 3 s about the vertical, seen from the tilted body
+    steady = np.asarray(points.u)[:, 1:]  # 2 pi / 3 s about the vertical, in the tilted body frame
     np.testing.assert_allclose(np.linalg.norm(steady, axis=1), TURN / 3.0, atol=0.1)
     assert reference.infeasibility(small()) is None
 
 
-def test_another_yaw_at_the_end_is_no_lap(tmp_path):
-    file = sampled(tmp_path, lambda t: [*round_lap(t), 0.5 * t], np.linspace(0.0, 3.0, 151))
+def test_different_yaw_at_end_is_not_a_lap(tmp_path):
+    file = sample_to_file(tmp_path, lambda t: [*circle_lap(t), 0.5 * t], np.linspace(0.0, 3.0, 151))
     assert float(from_csv(file).lap[0]) == 3.0
     with pytest.raises(ConfigError, match="where its first is, but with another yaw"):
         from_csv(file, laps=True)
 
 
-def test_two_or_three_points_are_no_lap(tmp_path):
+def test_two_or_three_points_are_not_a_lap(tmp_path):
     file = write(tmp_path, "0,0,0,1\n2,1,0,1\n4,0,0,1\n")
     np.testing.assert_array_equal(from_csv(file).lap, [4.0, 4.0])
     with pytest.raises(ConfigError, match="3 points; a lap needs at least four"):
         from_csv(file, laps=True)
 
 
-def run_in(lap):
-    """A lap with a smooth start of its own, as published tables of such shapes have it."""
+def with_smooth_start(lap):
+    """Return a lap with its own smooth start, as in published tables of such shapes."""
     return lambda t: lap(smooth_start(t))
 
 
-@pytest.mark.parametrize(("lap", "period", "end"), [(round_lap, 3.0, 9.32), (eight_lap, 5.0, 10.98)])
-def test_a_file_that_ends_in_its_lap_goes_on(lap, period, end, tmp_path):
-    """A start from rest and some laps, cut off anywhere: the last lap repeats, the start stays as it is."""
-    path = run_in(lap)
-    reference = from_csv(sampled(tmp_path, path, np.arange(0.0, end, 0.02), decimals=9))
+@pytest.mark.parametrize(("lap", "period", "end"), [(circle_lap, 3.0, 9.32), (eight_lap, 5.0, 10.98)])
+def test_file_that_ends_within_lap_repeats_last_lap(lap, period, end, tmp_path):
+    """The file has a start from rest and some laps: the last lap repeats, and the start is unchanged."""
+    path = with_smooth_start(lap)
+    reference = from_csv(sample_to_file(tmp_path, path, np.arange(0.0, end, 0.02), decimals=9))
     assert float(reference.lap[1] - reference.lap[0]) == pytest.approx(period, abs=1e-3)
     times = np.linspace(0.0, 30.0, 700)
     np.testing.assert_allclose(at(reference, times).p, [path(t) for t in times], atol=5e-3)
     assert reference.infeasibility(small()) is None
 
 
-def test_a_file_that_starts_and_ends_in_its_lap_is_spun_up(tmp_path):
-    """A lap and a half: the smooth start comes first, and a lap is one lap."""
-    reference = from_csv(sampled(tmp_path, round_lap, np.linspace(0.0, 4.5, 226)))
+def test_file_within_lap_gets_smooth_start(tmp_path):
+    """For 1.5 laps, a smooth start is added, and a lap has the length of one lap."""
+    reference = from_csv(sample_to_file(tmp_path, circle_lap, np.linspace(0.0, 4.5, 226)))
     assert float(reference.lap[1] - reference.lap[0]) == pytest.approx(3.0, abs=1e-3)
     times = np.linspace(0.0, 20.0, 300)
     np.testing.assert_allclose(at(reference, times).p, at(circle(), times).p, atol=5e-3)
     assert reference.infeasibility(small()) is None
 
 
-def test_a_crossing_is_no_lap(tmp_path):
-    """The figure-8 ends where it was before, but in another direction."""
-    reference = from_csv(sampled(tmp_path, eight_lap, np.arange(0.0, 3.7501, 0.02)[1:]))
+def test_crossing_is_not_a_lap(tmp_path):
+    """The figure-8 ends at an earlier position in a different direction."""
+    reference = from_csv(sample_to_file(tmp_path, eight_lap, np.arange(0.0, 3.7501, 0.02)[1:]))
     assert float(reference.lap[0]) == float(reference.lap[1])
 
 
-def test_a_hover_at_the_end_is_no_lap(tmp_path):
+def test_hover_at_end_is_not_a_lap(tmp_path):
     def path(t):
         x = min(0.5 * t, 1.0)
         return [10.0 * x**3 - 15.0 * x**4 + 6.0 * x**5, 0.0, 1.0]
 
-    reference = from_csv(sampled(tmp_path, path, np.arange(0.0, 4.0, 0.02)))
+    reference = from_csv(sample_to_file(tmp_path, path, np.arange(0.0, 4.0, 0.02)))
     assert float(reference.lap[0]) == float(reference.lap[1])
     assert reference.infeasibility(small()) is None
 
 
-def test_a_start_at_rest_and_an_end_at_speed_in_one_place_are_no_lap(tmp_path):
-    file = sampled(tmp_path, run_in(round_lap), np.linspace(0.0, 4.5, 226))
+def test_start_at_rest_and_end_at_speed_are_not_a_lap(tmp_path):
+    file = sample_to_file(tmp_path, with_smooth_start(circle_lap), np.linspace(0.0, 4.5, 226))
     reference = from_csv(file)
     assert "ends at speed, 2.09 m/s" in reference.infeasibility(small())
     with pytest.raises(ConfigError, match="it rests at one of its ends and moves at the other"):
         from_csv(file, laps=True)
 
 
-def test_corners_of_a_sampled_star_are_named(tmp_path):
+def test_corners_of_sampled_star_are_reported(tmp_path):
     times = np.linspace(3.0, 9.0, 301)
     rows = np.column_stack([times, at(star(), times).p])
     reference = from_csv(write(tmp_path, "\n".join(",".join(map(str, row)) for row in rows)))
@@ -201,9 +205,9 @@ def test_corners_of_a_sampled_star_are_named(tmp_path):
     assert "velocity jumps" in reference.infeasibility(small())
 
 
-def test_long_files_keep_their_rows_near_each_other(tmp_path):
+def test_long_files_keep_row_spacing(tmp_path):
     times = np.linspace(0.0, 45.0, 451)
-    reference = from_csv(sampled(tmp_path, lambda t: [math.sin(TURN * t / 3.0), 0.0, 1.0], times))
+    reference = from_csv(sample_to_file(tmp_path, lambda t: [math.sin(TURN * t / 3.0), 0.0, 1.0], times))
     assert float(reference.every) <= 0.02
     assert reference.rows.shape[0] % 1024 == 0
 
@@ -215,8 +219,8 @@ def helix(s):
     return [math.cos(s), math.sin(s), 0.2 * s, 0.5 * s]
 
 
-def test_once_through_its_points_from_rest_to_rest(tmp_path):
-    """Way-points: passed at their times, at rest at both ends, held for ever."""
+def test_once_passes_points_from_rest_to_rest(tmp_path):
+    """Way-points are passed at their times, at rest at both ends, and the last one is held."""
     points = np.array([[0.0, 0.0, 0.0, 1.0], [1.5, 1.0, 0.0, 1.2], [3.0, 1.0, 1.0, 1.5], [5.0, 0.0, 2.0, 1.0]])
     text = "\n".join(",".join(map(str, row)) for row in points)
     reference = from_csv(write(tmp_path, text))
@@ -227,12 +231,12 @@ def test_once_through_its_points_from_rest_to_rest(tmp_path):
     np.testing.assert_allclose(hold.p, [points[-1, 1:]] * 2, atol=1e-9)
     np.testing.assert_array_equal(hold.v, 0.0)
     np.testing.assert_allclose(hold.u, [[9.81, 0.0, 0.0, 0.0]] * 2)
-    np.testing.assert_array_equal(reference.rows[:, 10], 0.0)  # it heads along x
+    np.testing.assert_array_equal(reference.rows[:, 10], 0.0)  # the heading is along x
     assert reference.infeasibility(small()) is None
 
 
-def test_once_between_its_points_is_their_curve(tmp_path):
-    reference = from_csv(sampled(tmp_path, helix, np.linspace(2.0, 8.0, 121)))
+def test_once_follows_curve_between_points(tmp_path):
+    reference = from_csv(sample_to_file(tmp_path, helix, np.linspace(2.0, 8.0, 121)))
     times = np.linspace(0.0, 5.99, 77)
     result = at(reference, times)
     np.testing.assert_allclose(result.p, [helix(t + 2.0)[:3] for t in times], atol=1e-4)
@@ -245,7 +249,7 @@ def test_once_between_its_points_is_their_curve(tmp_path):
     )
 
 
-# ---- what is read
+# ---- accepted forms
 
 ROWS = np.array([[0.0, 0.0, 0.0, 1.0, 0.1], [1.0, 1.0, 0.5, 2.0, 0.2], [2.5, 2.0, 0.0, 3.0, 0.3]])
 
@@ -300,27 +304,27 @@ def test_headers(header, tmp_path):
         "t,x,y,z,_gate,_note",
     ],
 )
-def test_names_of_others_and_columns_that_the_positions_determine(names, tmp_path):
-    """The first is that of rpg_time_optimal and gym-pybullet-drones; what is not read may hold anything."""
+def test_other_column_names_and_derived_columns(names, tmp_path):
+    """The first is that of rpg_time_optimal and gym-pybullet-drones; unused columns may contain anything."""
     more = ",oops" * (names.count(",") - 3)
     text = names + "\n" + "".join(",".join(f"{x:g}" for x in row[:4]) + more + "\n" for row in ROWS)
     np.testing.assert_array_equal(read_table(write(tmp_path, text))[:, :4], ROWS[:, :4])
 
 
 @pytest.mark.parametrize("later", [0.0, 5e-7, -5e-7])
-def test_a_point_that_two_segments_share_is_there_once(later, tmp_path):
+def test_shared_point_of_segments_is_used_once(later, tmp_path):
     again = np.insert(ROWS, 2, ROWS[1] + [later, 0.0, 0.0, 0.0, 0.0], axis=0)
     text = "\n".join(",".join(f"{x:.9f}" for x in row) for row in again)
     np.testing.assert_array_equal(read_table(write(tmp_path, text)), ROWS)
 
 
-def test_two_places_at_one_time_are_refused(tmp_path):
+def test_two_positions_at_one_time_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="line 3: time 1 s does not come after 1 s"):
         read_table(write(tmp_path, "0,0,0,1\n1,0,0,1\n1,0.1,0,1\n"))
 
 
-def test_a_commented_header_sets_the_order(tmp_path):
-    """NumPy writes its headers so."""
+def test_commented_header_sets_column_order(tmp_path):
+    """NumPy writes its headers as comments."""
     order = ("t", "y", "x", "z")
     file = tmp_path / "path.csv"
     np.savetxt(file, ROWS[:, [0, 2, 1, 3]], header=" ".join(order))
@@ -336,12 +340,12 @@ def test_comments_blanks_quotes_and_trailing_separators(tmp_path):
     np.testing.assert_array_equal(result[:, 4], 0.0)
 
 
-def test_times_count_from_the_first_point(tmp_path):
+def test_times_count_from_first_point(tmp_path):
     text = "\n".join(f"{t + 170.0},{t},0,1" for t in range(5))
     np.testing.assert_array_equal(read_table(write(tmp_path, text))[:, 0], range(5))
 
 
-def test_a_wrapped_yaw_is_unwrapped(tmp_path):
+def test_wrapped_yaw_is_unwrapped(tmp_path):
     expected = np.linspace(0.5, 11.0, 50)
     text = "\n".join(f"{0.1 * k},0,0,1,{math.remainder(yaw, TURN)}" for k, yaw in enumerate(expected))
     np.testing.assert_allclose(read_table(write(tmp_path, text))[:, 4], expected, atol=1e-9)
@@ -356,9 +360,10 @@ numbers = st.floats(-900.0, 900.0).map(lambda v: round(v, 6))
     sign=st.sampled_from([",", ";", "\t", " "]),
 )
 @settings(max_examples=50, deadline=None)
-def test_what_is_written_is_read(rows, columns, sign, tmp_path_factory):
-    """Any plausible points, in any order of columns, with any separator; yaw but for whole turns."""
-    assume(max(math.dist(a[:3], b[:3]) for a, b in itertools.pairwise(rows)) >= 25.0)  # else: are the times in ms?
+def test_written_points_are_read(rows, columns, sign, tmp_path_factory):
+    """Points are plausible, in any order of columns, with any separator, and yaw is equal except for whole turns."""
+    # otherwise the times could be in ms
+    assume(max(math.dist(a[:3], b[:3]) for a, b in itertools.pairwise(rows)) >= 25.0)
     points = [dict(zip(("x", "y", "z", "yaw"), row, strict=True), t=25.0 * k) for k, row in enumerate(rows)]
     text = "\n".join([sign.join(columns), *(sign.join(repr(float(p[name])) for name in columns) for p in points)])
     table = read_table(write(tmp_path_factory.mktemp("points"), text))
@@ -369,8 +374,8 @@ def test_what_is_written_is_read(rows, columns, sign, tmp_path_factory):
 
 @given(content=st.binary(max_size=60) | st.text("0123456789.,;\t #\"'txyzaw[]()-+enif\n", max_size=80))
 @settings(max_examples=200, deadline=None)
-def test_no_text_is_read_but_points(content, tmp_path_factory):
-    """Any file gives finite points at rising times, or one clear error."""
+def test_any_text_gives_points_or_one_error(content, tmp_path_factory):
+    """Any file gives finite points at increasing times, or one clear error."""
     file = write(tmp_path_factory.getbasetemp(), content)
     try:
         table = read_table(file)
@@ -383,7 +388,7 @@ def test_no_text_is_read_but_points(content, tmp_path_factory):
         assert (np.diff(table[:, 0]) > 0.0).all()
 
 
-# ---- what is refused
+# ---- refusals
 
 EXPECTED = r"t \[s\], x, y, z \[m\] and, if wanted, yaw \[rad\]"
 
@@ -428,16 +433,16 @@ EXPECTED = r"t \[s\], x, y, z \[m\] and, if wanted, yaw \[rad\]"
         (b"\xff\xfe0\x00,\x000\x00", "is not UTF-8 text"),
     ],
 )
-def test_faults_of_a_file_are_named_with_their_line(text, message, tmp_path):
+def test_faults_of_file_are_reported_with_line(text, message, tmp_path):
     with pytest.raises(ConfigError, match=message) as error:
         from_csv(write(tmp_path, text))
     assert "path.csv" in str(error.value)
 
 
 def test_times_in_milliseconds_are_recognised(tmp_path):
-    """A lap at 50 Hz lasts 3000 "s"; a short piece of it is too slow to be true; way-points in s are not mistaken."""
+    """A lap at 50 Hz lasts 3000 "s"; a short part of it is too slow to be plausible; way-points in s are accepted."""
     for n in (151, 20):
-        rows = [[20.0 * k, *round_lap(0.02 * k)] for k in range(n)]
+        rows = [[20.0 * k, *circle_lap(0.02 * k)] for k in range(n)]
         with pytest.raises(ConfigError, match=r"are the times in ms\?"):
             read_table(write(tmp_path, "\n".join(",".join(map(str, row)) for row in rows)))
     with pytest.raises(ConfigError, match=r"lasts 700 s; at most 600 s can be flown$"):
@@ -446,6 +451,6 @@ def test_times_in_milliseconds_are_recognised(tmp_path):
     read_table(write(tmp_path, "\n".join(f"{20 * k},0,0,1" for k in range(20))))  # a hover
 
 
-def test_below_the_ground_is_no_fault_of_the_file_but_named(tmp_path):
+def test_points_below_ground_are_accepted_and_reported(tmp_path):
     reference = from_csv(write(tmp_path, "0,0,0,1\n3,0,0,-0.5\n6,0,0,1\n9,0,0,2\n"))
     assert "m below the ground" in reference.infeasibility(small())

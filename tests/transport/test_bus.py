@@ -1,4 +1,4 @@
-"""Laws of every bus: the last message, whole, with a version that rises; a writer that dies leaves the last one."""
+"""Laws of every bus: readers get the last complete message with an increasing version, even if its writer has died."""
 
 import multiprocessing
 import os
@@ -28,11 +28,11 @@ TOPICS = {"a": 100, "b.c": 100, "there": 100, "back": 100, "nothing": 100, "agai
 
 @pytest.fixture(scope="module", params=[*LOCAL, *NETWORK])
 def ends(request):
-    """One pair for all tests; each has its own topics, or goes on where another one was."""
+    """Return one pair of ends for all tests; each test has separate topics, or continues those of an earlier test."""
     yield from two_ends(request.param, TOPICS)
 
 
-def test_the_last_message_counts(ends):
+def test_last_message_is_received(ends):
     writer, reader = ends
     version = 0
     for i in range(1, 6):
@@ -57,13 +57,13 @@ def test_messages_of_any_length(ends):
     assert len(await_message(reader, "big").data) == 200_000
 
 
-def test_a_topic_that_there_is_not(ends):
+def test_unknown_topic_is_refused(ends):
     for call in (lambda: ends.writer.publish("b", b""), lambda: ends.reader.latest("b")):
         with pytest.raises(MessageError, match=r"no topic 'b' on this bus; there are a, again, b\.c, back"):
             call()
 
 
-def test_both_ends_may_write_each_its_own_topic(ends):
+def test_each_end_writes_its_own_topic(ends):
     ends.writer.publish("there", b"there")
     ends.reader.publish("back", b"back")
     await_message(ends.reader, "there", data=b"there")
@@ -71,7 +71,7 @@ def test_both_ends_may_write_each_its_own_topic(ends):
 
 
 @pytest.mark.parametrize("backend", NETWORK)
-def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_counting(backend):
+def test_late_process_receives_last_message_and_continues_version(backend):
     where = network(backend)
     bus = where.join(TOPICS, listen=True)
     bus.publish("again", b"before")
@@ -87,7 +87,7 @@ def test_between_processes_one_who_joins_late_has_the_last_message_and_goes_on_c
         bus.close()
 
 
-def test_of_a_network_only_what_is_newer_and_fits_is_taken():
+def test_only_newer_messages_that_fit_are_accepted():
     class LoopBus(NetworkBus):
         def _send(self, topic, frame):
             self.frame = frame
@@ -117,18 +117,18 @@ def test_of_a_network_only_what_is_newer_and_fits_is_taken():
 @pytest.mark.parametrize("text", ["", "zenoh", "zenoh:", "zenoh::7447", "zenoh:host:0", "zenoh:host:99999",
                                   "tcp:host:1", "ros:host:port", "zenoh:host:1/", "ros:host:1/a b", "ros2", "ros2:",
                                   "ros2:233", "ros2:host:1", "ros2:1/"])  # fmt: skip
-def test_an_address_that_is_none_is_named(text):
+def test_invalid_address_is_refused(text):
     with pytest.raises(ConfigError, match="is no address of a bus; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:"):
         Address.of(text)
 
 
 @pytest.mark.parametrize("text", ["zenoh:10.0.0.5:7447", "ros:robot:11311/quad1", "ros2:42", "ros2:0/quad1"])
-def test_an_address_is_what_it_says(text):
+def test_address_survives_round_trip(text):
     assert str(Address.of(text)) == text
 
 
-def test_vehicles_at_one_place_do_not_hear_each_other():
-    """Each has a key; who listens for another one, or for none, gets nothing of it."""
+def test_vehicles_with_different_keys_are_separate():
+    """Each vehicle has a key; an end with a different key, or with none, receives nothing from it."""
     pytest.importorskip("zenoh")
     port = free_port()
     with ExitStack() as stack:
@@ -149,7 +149,7 @@ def test_vehicles_at_one_place_do_not_hear_each_other():
         assert none.latest("a") is None
 
 
-def test_what_an_end_of_ros_writes_has_readers_before_the_first_message(monkeypatch):
+def test_ros_topics_have_subscribers_before_first_message(monkeypatch):
     declaration, sending = [], []
 
     class Rospy:
@@ -172,19 +172,19 @@ def test_what_an_end_of_ros_writes_has_readers_before_the_first_message(monkeypa
     assert sending[1:] == [("/retrim/quad1/a", b"last"), ("/retrim/quad1/there", b"also")]
 
 
-def test_every_topic_between_machines_has_a_name_in_ros_2():
+def test_every_bridge_topic_has_a_ros_2_name():
     names = [name_of(topic) for topic in (*OUT, *INTO, *GREETINGS)]
     for name in names:
         check_topic(f"/retrim/quad1/{name}")
     assert len(set(names)) == len(names)
 
 
-def test_a_master_that_there_is_not_is_named():
+def test_missing_master_is_reported():
     with pytest.raises(ConfigError, match=r"ROS: no rosmaster at 'http://127.0.0.1:1'"):
         Address.of("ros:127.0.0.1:1").join(TOPICS, listen=True)
 
 
-def test_an_address_that_is_taken_is_named():
+def test_address_in_use_is_reported():
     pytest.importorskip("zenoh")
     with socket.create_server(("127.0.0.1", 0)) as server:
         where = Address("zenoh", "127.0.0.1", server.getsockname()[1])
@@ -192,7 +192,7 @@ def test_an_address_that_is_taken_is_named():
             where.join(TOPICS, listen=True)
 
 
-def test_one_who_joins_late_has_the_last_message():
+def test_late_reader_receives_last_message():
     bus = SharedMemoryBus.create(TOPICS)
     try:
         bus.publish("a", b"before")
@@ -209,11 +209,11 @@ def test_one_who_joins_late_has_the_last_message():
         SharedMemoryBus(bus.folder)
 
 
-def whole(data):
+def is_whole(data):
     return data.count(data[:1]) == len(data) > 0
 
 
-def test_readers_never_see_half_a_message_and_a_killed_writer_leaves_a_whole_one():
+def test_messages_are_complete_even_if_writer_is_killed():
     bus = SharedMemoryBus.create(TOPICS)
     try:
         for _ in range(3):
@@ -224,10 +224,10 @@ def test_readers_never_see_half_a_message_and_a_killed_writer_leaves_a_whole_one
             while observation < 200 and time.monotonic() < until:
                 if (result := bus.latest("big", after=version)) is not None:
                     version, observation = result.version, observation + 1
-                    assert whole(result.data)
+                    assert is_whole(result.data)
             os.kill(writer.pid, signal.SIGKILL)
             writer.join()
             assert observation == 200
-            assert whole(bus.latest("big").data)
+            assert is_whole(bus.latest("big").data)
     finally:
         bus.remove()

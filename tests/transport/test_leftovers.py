@@ -1,4 +1,4 @@
-"""A bus whose processes were killed is removed at the next start, and no other."""
+"""The next start removes a bus whose processes were killed, and keeps all others."""
 
 import subprocess
 import sys
@@ -23,7 +23,7 @@ time.sleep(60.0)
 
 
 def start(*words):
-    """Start a process that makes or joins a bus; return it and the folder."""
+    """Start a process that creates or joins a bus; return the process and the folder."""
     process = subprocess.Popen([sys.executable, "-c", MAKE, *map(str, words)], stdout=subprocess.PIPE, text=True)
     return process, Path(process.stdout.readline().strip())
 
@@ -34,7 +34,7 @@ def kill(process):
     process.stdout.close()
 
 
-def test_what_killed_processes_left_is_removed_at_the_next_start():
+def test_bus_of_killed_processes_is_removed_at_next_start():
     process, folder = start()
     kill(process)
     assert (folder / "sample").exists()
@@ -46,7 +46,7 @@ def test_what_killed_processes_left_is_removed_at_the_next_start():
         setup.remove()
 
 
-def test_a_bus_that_one_process_still_has_stays_until_that_one_is_gone():
+def test_bus_remains_until_last_process_ends():
     first, folder = start()
     second, _ = start(folder)
     try:
@@ -61,7 +61,7 @@ def test_a_bus_that_one_process_still_has_stays_until_that_one_is_gone():
     assert not folder.exists()
 
 
-def test_what_is_no_bus_of_ours_stays(tmp_path):
+def test_foreign_folders_remain(tmp_path):
     (tmp_path / "retrim-without-lock").mkdir()
     (tmp_path / "retrim-file").touch()
     (tmp_path / "other").mkdir()
@@ -73,7 +73,7 @@ def test_what_is_no_bus_of_ours_stays(tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_bus_that_is_gone_cannot_be_joined(tmp_path):
+def test_removed_bus_cannot_be_joined(tmp_path):
     bus = SharedMemoryBus.create({"sample": 4096})
     bus.remove()
     with pytest.raises(MessageError, match="no bus there"):

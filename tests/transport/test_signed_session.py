@@ -1,4 +1,4 @@
-"""Two ends with a key accept each message of the other end once, and no message of anybody else."""
+"""Two ends with a key accept each message of the other end once, and no messages of third parties."""
 
 import os
 import pickle
@@ -19,7 +19,7 @@ TOPICS = {"out": 1000, "mission": 1000, "into": 1000} | dict.fromkeys(GREETINGS,
 
 
 class End(NetworkBus):
-    """One end on a wire, which somebody else can read and write."""
+    """One end on a wire that a third party can read and write."""
 
     def __init__(self, wire, side, key=KEY, vehicle=""):
         super().__init__(TOPICS, None if key is None else Session(key, vehicle, GREETINGS[side]))
@@ -63,7 +63,7 @@ def read_messages(end, topic):
     return None if message is None else message.data
 
 
-def test_messages_arrive_in_both_directions_whoever_was_first(wire):
+def test_messages_arrive_in_both_directions_in_any_start_order(wire):
     flight = End(wire, 0)
     flight.publish("mission", b"before anybody is there")
     wire.settle()
@@ -79,8 +79,8 @@ def test_messages_arrive_in_both_directions_whoever_was_first(wire):
     assert flight.fault == ground.fault == ""
 
 
-def test_a_repeated_message_does_not_overtake_a_newer_one(wire):
-    """A network that keeps the last message only would lose the newer one."""
+def test_repeated_message_does_not_overtake_newer_one(wire):
+    """A network that keeps only the last message would lose the newer one."""
     flight, ground = End(wire, 0), End(wire, 1)
     flight.publish("out", b"first")
     newer = threading.Thread(target=flight.publish, args=("out", b"second"))
@@ -105,7 +105,7 @@ def test_a_repeated_message_does_not_overtake_a_newer_one(wire):
 
 
 @pytest.mark.parametrize("again", [0, 1])
-def test_an_end_that_is_started_again_goes_on_and_the_one_before_is_not_heard_any_more(wire, again):
+def test_restarted_end_continues_and_previous_end_is_ignored(wire, again):
     ends = [End(wire, 0), End(wire, 1)]
     topics = "out", "into"
     for end, topic in zip(ends, topics, strict=True):
@@ -127,8 +127,8 @@ def test_an_end_that_is_started_again_goes_on_and_the_one_before_is_not_heard_an
     assert read_messages(ends[1 - again], topics[again]) == b"second"
 
 
-def test_nothing_that_was_said_before_is_taken_again_by_anybody(wire):
-    """The receivers refuse it, and so do ends that have just been started, alone or with each other."""
+def test_replayed_messages_are_refused_by_all_ends(wire):
+    """The receivers refuse them, and so do new ends, alone or together."""
     flight, ground = End(wire, 0), End(wire, 1)
     flight.publish("out", b"old")
     ground.publish("into", b"old")
@@ -151,7 +151,7 @@ def test_nothing_that_was_said_before_is_taken_again_by_anybody(wire):
     ground.close()
     later = End(wire, 1)
     replay(flight, later)
-    assert read_messages(later, "out") == b"new"  # from the flight that lives
+    assert read_messages(later, "out") == b"new"  # from the current flight
     later.publish("into", b"newer")
     wire.settle()
     replay(flight, later)
@@ -163,7 +163,7 @@ def test_nothing_that_was_said_before_is_taken_again_by_anybody(wire):
     assert read_messages(alone, "into") is None
 
 
-def test_no_change_of_a_message_is_taken(wire):
+def test_changed_message_is_refused(wire):
     flight, ground = End(wire, 0), End(wire, 1)
     wire.settle()
     flight.publish("out", b"payload")
@@ -175,7 +175,7 @@ def test_no_change_of_a_message_is_taken(wire):
             ground._receive("out", frame[:i] + bytes([frame[i] ^ bit]) + frame[i + 1 :])
     for cut in (b"", frame[:-1], frame[: HEAD.size], frame[: HEAD.size - 1], frame + b"x", frame[1:]):
         ground._receive("out", cut)
-    for other in ("mission", "into", GREETINGS[0]):  # said of something else
+    for other in ("mission", "into", GREETINGS[0]):  # with a different topic
         ground._receive(other, frame)
     flight._receive("out", frame)  # sent back
     ground._receive("out", bytes(2000))
@@ -186,7 +186,7 @@ def test_no_change_of_a_message_is_taken(wire):
     assert read_messages(ground, "out") == b"payload"
 
 
-def test_vehicles_with_one_key_do_not_take_what_is_said_to_another(wire):
+def test_vehicles_with_same_key_refuse_messages_for_other_vehicle(wire):
     flight, ground = End(wire, 0, vehicle="quad1"), End(wire, 1, vehicle="quad2")
     flight.publish("out", b"for quad1")
     wire.settle()
@@ -197,7 +197,7 @@ def test_vehicles_with_one_key_do_not_take_what_is_said_to_another(wire):
 @pytest.mark.parametrize(
     ("here", "there", "fault"), [(KEY, OTHER, FOREIGN), (KEY, None, UNSIGNED), (None, KEY, MISSING)]
 )
-def test_another_key_or_none_is_one_clear_line_at_both_ends(wire, here, there, fault):
+def test_different_or_missing_key_gives_one_line_at_both_ends(wire, here, there, fault):
     flight, ground = End(wire, 0, here), End(wire, 1, there)
     flight.publish("out", b"out")
     ground.publish("into", b"into")
@@ -209,7 +209,7 @@ def test_another_key_or_none_is_one_clear_line_at_both_ends(wire, here, there, f
     assert len(fault) < 120
 
 
-def test_a_stranger_does_not_come_between_two_ends_that_have_met(wire):
+def test_third_party_cannot_join_established_session(wire):
     flight, ground = End(wire, 0), End(wire, 1)
     flight.publish("mission", b"mine")
     wire.settle()
@@ -224,14 +224,14 @@ def test_a_stranger_does_not_come_between_two_ends_that_have_met(wire):
     assert read_messages(ground, "mission") == b"mine still"
 
 
-def test_the_code_is_hmac_sha256_over_parts_that_cannot_be_shifted():
+def test_code_is_hmac_sha256_with_unambiguous_parts():
     assert len(KEY.sign(b"a")) == 32
     assert KEY.sign(b"ab", b"c") != KEY.sign(b"a", b"bc")
     assert KEY.sign(b"a", b"b") != KEY.sign(b"a", b"b", b"")
     assert KEY.sign(b"a") != OTHER.sign(b"a")
 
 
-def test_a_key_is_read_and_shown_nowhere(tmp_path, monkeypatch):
+def test_key_is_read_and_never_shown(tmp_path, monkeypatch):
     file = tmp_path / "key"
     file.write_text("0123456789abcdef-secret\n")
     key = read_key(file)
@@ -242,12 +242,12 @@ def test_a_key_is_read_and_shown_nowhere(tmp_path, monkeypatch):
     assert pickle.loads(pickle.dumps(address)).shared == key
     monkeypatch.setenv("RETRIM_KEY", " 0123456789abcdef-secret ")
     assert read_key(None) == key
-    assert "RETRIM_KEY" not in os.environ  # no process that is started now has it
+    assert "RETRIM_KEY" not in os.environ  # processes that are started from now on do not have it
     assert read_key(None) is None
 
 
 @pytest.mark.parametrize("text", ["", "short", "x" * 5000, " " * 50])
-def test_a_key_that_is_none_is_one_line_without_it(tmp_path, monkeypatch, text):
+def test_invalid_key_gives_one_line_without_it(tmp_path, monkeypatch, text):
     file = tmp_path / "key"
     file.write_text(text)
     with pytest.raises(ConfigError, match="a key has 16 to 4096 bytes") as error:
@@ -259,14 +259,14 @@ def test_a_key_that_is_none_is_one_line_without_it(tmp_path, monkeypatch, text):
             read_key(None)
 
 
-def test_a_file_that_cannot_be_read_is_named(tmp_path):
+def test_unreadable_key_file_is_refused(tmp_path):
     for file in (tmp_path / "none", tmp_path, tmp_path / "a\0b"):
         with pytest.raises(ConfigError, match="the key cannot be read") as error:
             read_key(file)
         assert str(error.value).isprintable()
 
 
-def test_beyond_loopback_a_key_is_needed():
+def test_key_is_required_beyond_loopback():
     for text in ("zenoh:192.168.1.5:7447", "ros:robot:11311/quad1", "zenoh:0.0.0.0:7447", "zenoh:127.0.0.1.evil:1"):
         with pytest.raises(ConfigError, match="need a shared key: --key FILE or the variable RETRIM_KEY"):
             Address.of(text).check_shared()
@@ -275,5 +275,5 @@ def test_beyond_loopback_a_key_is_needed():
         Address.of(text).check_shared()
 
 
-def test_a_mark_tells_signed_messages_from_others():
-    assert sessions.MARK[-1] > 0x80  # the numbers of writers of unsigned messages have 63 bits
+def test_mark_distinguishes_signed_messages():
+    assert sessions.MARK[-1] > 0x80  # writer numbers of unsigned messages have 63 bits

@@ -1,4 +1,4 @@
-"""Pytrees as bytes: exact, small, checksummed, and refused by name."""
+"""Pytrees as bytes: exact, small, with a checksum, and refused by name."""
 
 import json
 
@@ -33,7 +33,7 @@ def with_header(header):
 
 
 def edit(data, change=None, **header):
-    """The message with other tensors or another header, without the checksum's consent."""
+    """Return the message with changed tensors or header, without an update of the checksum."""
     tensors = load(data)
     return save(change(tensors) if change else tensors, metadata=message._header(data, "test") | header)
 
@@ -49,7 +49,7 @@ def test_round_trip_is_exact(like):
     assert wire.names(TREE).keys() == {"a", "b.0", "b.1"}
 
 
-def test_an_empty_tree_is_a_message():
+def test_empty_tree_survives_round_trip():
     assert unpack(pack(()), ()) == ()
 
 
@@ -67,19 +67,19 @@ def test_an_empty_tree_is_a_message():
         (lambda t: t | {"b.0": np.array(4)}, "the checksum does not match"),
     ],
 )
-def test_tensors_that_do_not_fit(change, message):
+def test_unsuitable_tensors_are_refused(change, message):
     with pytest.raises(MessageError, match=f"somewhere: {message}"):
         unpack(edit(pack(), change))
 
 
-def test_a_changed_header_breaks_the_checksum():
+def test_changed_header_breaks_checksum():
     with pytest.raises(MessageError, match="the checksum does not match"):
         unpack(edit(pack(who="me"), who="you"))
     with pytest.raises(MessageError, match="the checksum does not match"):
         unpack(edit(pack(), more="fields"))
 
 
-def test_another_kind_or_format():
+def test_other_kind_or_format_is_refused():
     with pytest.raises(MessageError, match="somewhere: holds a 'test', expected a 'policy'"):
         wire.unpack(pack(), TREE, kind="policy", source="somewhere")
     with pytest.raises(MessageError, match=r"format 'retrim/0', expected 'retrim/1'"):
@@ -87,19 +87,19 @@ def test_another_kind_or_format():
 
 
 @pytest.mark.parametrize("header", [{}, {"__metadata__": None}, {"__metadata__": {}}])
-def test_a_header_without_fields(header):
+def test_header_without_fields_is_refused(header):
     with pytest.raises(MessageError, match=r"somewhere: format 'none', expected 'retrim/1'"):
         unpack(with_header(header))
 
 
 @pytest.mark.parametrize("header", [[], "text", 3, {"__metadata__": {"kind": 3}}, {"a": {"dtype": "F64"}}])
-def test_a_header_that_is_none(header):
+def test_invalid_header_is_refused(header):
     with pytest.raises(MessageError, match="somewhere: not a whole safetensors file"):
         unpack(with_header(header))
 
 
 @pytest.mark.parametrize("dtype", ["BF16", "F8_E4M3"])
-def test_types_that_numpy_has_not(dtype):
+def test_types_outside_numpy_are_refused(dtype):
     width = 2 if dtype == "BF16" else 1
     data = with_header(
         {"__metadata__": {"format": message.FORMAT, "kind": "test"}}
@@ -109,13 +109,13 @@ def test_types_that_numpy_has_not(dtype):
         unpack(data)
 
 
-def test_more_bytes_than_are_accepted(monkeypatch):
+def test_too_large_message_is_refused(monkeypatch):
     monkeypatch.setattr(message, "MAX_BYTES", 100)
     with pytest.raises(MessageError, match=r"somewhere: \d+ bytes, more than the 100 that are accepted"):
         unpack(pack())
 
 
-def test_single_precision_is_read_in_the_expected_type():
+def test_single_precision_is_converted_to_expected_type():
     single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32) if leaf.ndim else leaf, TREE)
     result = unpack(pack(single))
     assert result["a"].dtype == jnp.float64
@@ -129,8 +129,8 @@ def test_size_of_a_paper_policy():
     assert len(data) == pytest.approx(1.09e6, rel=0.01)
 
 
-def test_the_same_content_has_the_same_bytes():
-    """The library that writes a header puts its fields in another order each time."""
+def test_equal_content_has_equal_bytes():
+    """The library that writes headers puts their fields in a different order each time."""
     about = {f"field{i}": str(i) for i in range(20)}
     setup = {pack(**dict(sorted(about.items(), reverse=back))) for back in (True, False) for _ in range(20)}
     assert len(setup) == 1
