@@ -29,7 +29,7 @@ def always(d, x, u):
 
 @eqx.filter_jit
 def random_policy(key, size):
-    """Return a policy whose command is nowhere exactly hover."""
+    """Return a policy whose command is not hover."""
     fresh = Policy.of(size, small(), key=key, hidden=(8, 8))
     weights = [0.3 * random.normal(k, l.weight.shape) for k, l in zip(random.split(key, 3), fresh.layers, strict=True)]
     return eqx.tree_at(lambda p: [l.weight for l in p.layers], fresh, weights)

@@ -1,4 +1,4 @@
-"""The ablation: every lever is one change that can be flown."""
+"""The ablation: every row is one change that can be flown."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from retrim_paper.ablation_options import CONTROL, OFF, ON
 
 
 @pytest.mark.parametrize(("task", "kind"), [(task, kind) for task in OFF for kind in ("retrim", "paper")])
-def test_every_lever_is_one_change_of_its_preset(task, kind):
+def test_every_row_is_one_change_of_its_preset(task, kind):
     preset = presets.PRESETS[f"{task}/{kind}"]
     each = OFF[task] if kind == "retrim" else ON[task]
     setup = [(changed(preset, **lever.changes), lever.method) for lever in (*CONTROL, *each)]

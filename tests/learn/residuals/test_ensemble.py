@@ -1,4 +1,4 @@
-"""The ensemble: recovery of known fields, warm starts, spread, the spectral penalty against the exact norm."""
+"""The ensemble: recovery of known fields, warm starts, spread, and the spectral penalty against the exact norm."""
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ def _fit(state, rows, weight):
 
 
 def fit(state, rows, spectral_weight=1e-4):
-    """A hundred steps, as one program for all tests."""
+    """Fit with a hundred steps, as one program for all tests."""
     return _fit(state, rows, jnp.array(spectral_weight))
 
 
@@ -43,7 +43,7 @@ def linear_drag(x, u):
     return -0.4 * x.v + jnp.array([0.5, 0.0, 0.2])
 
 
-def test_a_filling_window_counts_only_what_was_flown(key):
+def test_partly_filled_window_uses_valid_rows_only(key):
     window = random_field_flight(lambda x, u: jnp.array([1.0, 0.0, 0.0]), key)
     v = jnp.where(jnp.arange(100)[:, None] < 70, 100.0, window.x.v)
     spoilt = eqx.tree_at(lambda w: (w.x.v, w.valid), window, (v, jnp.arange(100) >= 71))
@@ -62,14 +62,14 @@ def fit_on(field, key, fits=3):
     return state, rows, errors
 
 
-def test_recovers_a_constant(key):
+def test_recovers_constant(key):
     a = jnp.array([2.0, -0.5, 0.3])
     state, rows, _ = fit_on(lambda x, u: a, key)
     prediction = np.asarray(predictions(state.residual, rows))
     np.testing.assert_allclose(prediction, np.broadcast_to(a, prediction.shape), atol=0.05)
 
 
-def test_recovers_a_field_linear_in_velocity(key):
+def test_recovers_field_linear_in_velocity(key):
     state, rows, _ = fit_on(linear_drag, key)
     prediction = np.asarray(predictions(state.residual, rows))
     assert np.sqrt(np.mean((prediction - np.asarray(rows.a_res)) ** 2)) < 0.1 * np.std(rows.a_res)
@@ -81,19 +81,19 @@ def test_warm_start_continues(key):
     assert float(second[0]) < 3.0 * float(first[-1]) < 0.1 * float(first[0])
 
 
-def test_fresh_ensemble_predicts_nothing_and_its_members_differ(key):
+def test_fresh_ensemble_predicts_zero_and_members_differ(key):
     residual, x, u = ensemble(key), random_state(key), random_command(key)
     np.testing.assert_array_equal(residual(x, u), 0.0)
     assert not np.allclose(residual.layers[0][0].weight, residual.layers[1][0].weight)
 
 
-def test_prediction_is_the_mean_of_the_members(key):
+def test_prediction_is_mean_of_members(key):
     state, rows, _ = fit_on(linear_drag, key, fits=1)
     x, u = jax.tree.map(lambda leaf: leaf[5], (rows.x, rows.u))
     np.testing.assert_allclose(state.residual(x, u), state.residual.members(x, u).mean(axis=0))
 
 
-def test_power_iteration_finds_the_spectral_norm_and_its_gradient(key):
+def test_power_iteration_gives_spectral_norm_and_gradient(key):
     W = random.normal(key, (30, 20))
     v = jnp.ones(20) / jnp.sqrt(20.0)
     spectral = jax.jit(_spectral)
@@ -105,7 +105,7 @@ def test_power_iteration_finds_the_spectral_norm_and_its_gradient(key):
     np.testing.assert_allclose(gradient, 2 * S[0] * np.outer(U[:, 0], Vt[0]), atol=1e-4 * S[0])
 
 
-def test_the_penalty_of_a_zero_matrix_is_zero_and_finite():
+def test_penalty_of_zero_matrix_is_zero_with_finite_gradient():
     value_and_slope = jax.jit(jax.value_and_grad(_spectral, has_aux=True))
     (square, v), slope = value_and_slope(jnp.zeros((3, 5)), jnp.ones(5))
     assert float(square) == 0.0
@@ -113,7 +113,7 @@ def test_the_penalty_of_a_zero_matrix_is_zero_and_finite():
     assert np.isfinite(slope).all()
 
 
-def test_the_penalty_shrinks_the_spectral_norm(key):
+def test_penalty_reduces_spectral_norm(key):
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
 
     def norm(spectral_weight):
@@ -133,7 +133,7 @@ def test_features_are_of_order_one(key):
     assert float(jnp.abs(features).max()) <= 1.0
 
 
-# ---- as the online learner takes it
+# ---- as a residual model of the online learner
 
 
 fresh_state = eqx.filter_jit(lambda model, key: model.init(key))
@@ -145,7 +145,7 @@ def model():
     return EnsembleModel(jnp.array(GOAL), small().omega_max, *weights, steps=30, hidden=(64, 64))
 
 
-def test_a_fresh_model_predicts_zero_and_is_sure_of_it(model, key):
+def test_fresh_model_predicts_zero_without_spread(model, key):
     assert isinstance(model, ResidualModel)
     state, x, u = fresh_state(model, key), random_state(key), random_command(key)
     np.testing.assert_array_equal(model.predict(state, x, u), 0.0)
@@ -153,8 +153,8 @@ def test_a_fresh_model_predicts_zero_and_is_sure_of_it(model, key):
     np.testing.assert_array_equal(FittedResidual(model, state)(x, u), 0.0)
 
 
-def test_a_fit_goes_on_where_the_last_one_ended(model, key):
-    """Two fits of 30 steps are one of 60: weights, Adam's moments and the vectors of the power iteration go on."""
+def test_fit_continues_from_last_state(model, key):
+    """Two fits of 30 steps equal one of 60 in weights, moments of Adam and vectors of the power iteration."""
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
     fresh = fresh_state(model, key)
     once, first = fit_of_model(model, fresh, rows)
@@ -170,13 +170,13 @@ def test_a_fit_goes_on_where_the_last_one_ended(model, key):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), twice, at_once)
 
 
-def test_a_fit_reports_the_error_before_its_last_step(model, key):
+def test_fit_reports_error_before_last_step(model, key):
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
     _, rms = fit_of_model(replace_fields(model, steps=1), fresh_state(model, key), rows)
     assert float(rms) == pytest.approx(np.sqrt(np.mean(np.sum(np.asarray(rows.a_res) ** 2, axis=1))))
 
 
-def test_the_spread_is_the_standard_deviation_of_the_members(model, key):
+def test_spread_is_standard_deviation_of_members(model, key):
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
     state, _ = fit_of_model(model, fresh_state(model, key), rows)
     x, u = random_state(key, spread=3.0), random_command(key)
@@ -188,14 +188,15 @@ def test_the_spread_is_the_standard_deviation_of_the_members(model, key):
     assert (expected > 1e-4).all()
 
 
-def test_the_spectral_weight_reaches_every_layer_of_every_member(key):
-    """Without any row that counts, the penalty alone moves the weights: one step of plain descent shows its gradient.
+def test_spectral_weight_applies_to_every_layer_and_member(key):
+    """Without valid rows, only the penalty changes the weights: one step of gradient descent shows its gradient.
 
-    Each weight matrix then moves along its leading singular vectors, by 2 w sigma u v^T; no bias moves.
+    Each weight matrix then changes along its leading singular vectors by 2 w sigma u v^T; biases are unchanged.
     """
     descent = optax.sgd(1e-2)
     residual = ensemble(key, hidden=(16, 16))
-    residual = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.02), residual)  # a fresh one ends in zeros
+    # the last layer of a fresh member is zero
+    residual = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.02), residual)
     state = EnsembleState.of(residual, descent)
     exact = jax.tree.map(
         lambda l: jnp.asarray(np.linalg.svd(np.asarray(l.weight))[2][0]),
@@ -219,7 +220,7 @@ def test_the_spectral_weight_reaches_every_layer_of_every_member(key):
             np.testing.assert_array_equal(same.weight, layer.weight)
 
 
-def test_the_weight_of_the_model_is_the_weight_of_the_fit(model, key):
+def test_fit_uses_spectral_weight_of_model(model, key):
     rows = residual_targets(random_field_flight(linear_drag, key), PointMass(0.02))
     heavy = replace_fields(model, spectral_weight=jnp.array(0.3), steps=5)
     fresh = fresh_state(heavy, key)
@@ -230,6 +231,6 @@ def test_the_weight_of_the_model_is_the_weight_of_the_fit(model, key):
     assert np.abs(np.asarray(result.residual.layers[0][1].weight) - np.asarray(without)).max() > 1e-3
 
 
-def test_a_fit_has_a_step():
+def test_fit_without_steps_is_refused():
     with pytest.raises(ValueError, match=r"EnsembleModel\.steps = 0 must be at least 1"):
         EnsembleModel(jnp.zeros(3), small().omega_max, jnp.array(0.01), jnp.array(0.0), steps=0)

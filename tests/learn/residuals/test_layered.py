@@ -1,4 +1,4 @@
-"""The ensemble on what the closed form leaves: it helps where there is something, and never makes it worse."""
+"""The ensemble on the remainder of the closed form helps if there is a remainder, and is never harmful."""
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ alone = eqx.filter_jit(lambda rows: FIRST.fit(FIRST.init(random.key(0)), rows)[0
 
 @eqx.filter_jit
 def rows_of(field, key, start=0, noise=0.0, n=N):
-    """Ticks from ``start`` on of a smooth flight through waves of position, attitude and thrust."""
+    """Return ticks from ``start`` on of a smooth flight through waves of position, attitude and thrust."""
     k_a, k_f, k_phase, k_noise = random.split(key, 4)
     size, phase = random.uniform(k_a, (7,)), 2.0 * jnp.pi * random.uniform(k_phase, (7,))
     rate = 1.0 + 2.0 * random.uniform(k_f, (7,))
@@ -40,25 +40,25 @@ def rows_of(field, key, start=0, noise=0.0, n=N):
 
 
 @eqx.filter_jit
-def miss(state, rows, first=None):
-    """Root mean square of what both layers miss, or a closed form alone."""
+def rms_error(state, rows, first=None):
+    """Return the root mean square error of both layers, or of a closed form alone."""
     predict = MODEL.predict if first is None else lambda _, x, u: FIRST.predict(first, x, u)
     prediction = jax.vmap(lambda x, u: predict(state, x, u))(rows.x, rows.u)
     return jnp.sqrt(jnp.mean(jnp.sum((rows.a_res - prediction) ** 2, axis=1)))
 
 
 def fly_once(field, key, fits=20):
-    """What both layers, and the closed form alone, miss ten ticks ahead of each window of one flight."""
+    """Return the errors of both layers and of the closed form alone, ten ticks ahead of each window of a flight."""
     state, errors = fresh(key), []
     for i in range(fits):
         state, _ = fit(state, rows_of(field, key, jnp.array(10.0 * i)))
         ahead = rows_of(field, key, jnp.array(10.0 * i + 10.0))
-        errors.append((float(miss(state, ahead)), float(miss(state, ahead, state.first))))
+        errors.append((float(rms_error(state, ahead)), float(rms_error(state, ahead, state.first))))
     return state, np.array(errors)
 
 
 def jet(x, u):
-    """What no physical feature of the closed form has: a push that depends on where the vehicle is."""
+    """A push that depends on position, which no physical feature of the closed form describes."""
     return jnp.array([1.0, 0.0, 0.0]) + 3.0 * jnp.tanh(2.0 * x.p[2] - 2.0) * jnp.array([0.0, 1.0, 0.5])
 
 
@@ -68,16 +68,16 @@ def in_the_jet():
         return fly_once(jet, random.key(0))
 
 
-def test_what_the_closed_form_leaves_is_learnt(in_the_jet):
-    """The ensemble takes a part of it off, and in no window does it add to it."""
+def test_remainder_of_closed_form_is_learned(in_the_jet):
+    """The ensemble reduces the error, and increases it in no window."""
     _, errors = in_the_jet
     both, alone = errors.T
     assert both[5:].mean() < 0.93 * alone[5:].mean()
     assert (both < 1.03 * alone).all()
 
 
-def test_noise_is_not_learnt(key):
-    """White noise, and noise of a velocity, whose differences are the targets: the share is next to nothing."""
+def test_noise_is_not_learned(key):
+    """For white noise, and for noise of a velocity whose differences are the targets, the share is almost zero."""
     push = lambda x, u: jnp.array([1.0, -0.5, 0.0])  # noqa: E731
     state = fresh(key)
     for i, k in enumerate(random.split(key, 10)):
@@ -92,30 +92,30 @@ def test_noise_is_not_learnt(key):
     assert float(state.share) < 0.2
 
 
-def test_an_ensemble_that_was_fitted_to_another_world_is_not_believed(in_the_jet, key):
-    """The world changes; the ensemble knows the old one. Within two fits the closed form alone is no better."""
+def test_ensemble_of_different_disturbance_is_not_used(in_the_jet, key):
+    """The disturbance changes after the ensemble was fitted. Within two fits the closed form alone is not better."""
     state, _ = in_the_jet
     opposite = lambda x, u: -jet(x, u)  # noqa: E731
     for i in range(2):
         rows = rows_of(opposite, key, jnp.array(250.0 + 10.0 * i))
         state, _ = fit(state, rows)
     ahead = rows_of(opposite, key, jnp.array(280.0))
-    assert float(miss(state, ahead)) < 1.1 * float(miss(state, ahead, alone(rows)))
+    assert float(rms_error(state, ahead)) < 1.1 * float(rms_error(state, ahead, alone(rows)))
 
 
-def test_it_is_a_residual_model():
+def test_conformance():
     check_residual(MODEL)
 
 
-def test_it_knows_how_the_vehicle_turns_as_the_closed_form_does(key):
+def test_rates_equal_those_of_closed_form(key):
     rows = rows_of(jet, key)
     rows = eqx.tree_at(lambda r: r.omega, rows, rows.omega + jnp.array([[0.3, 0.0, -0.2]]))
     state, _ = fit(fresh(key), rows)
     np.testing.assert_allclose(MODEL.turning(state).bias, [0.3, 0.0, -0.2], atol=0.02)
 
 
-def test_with_no_row_that_counts_it_knows_what_it_knew(key):
-    """Neither layer learns, nor forgets, while commands are at a limit."""
+def test_window_without_valid_rows_changes_no_layer(key):
+    """Neither layer changes while commands are at a limit."""
     limits = Command(jnp.array(5.0), -10.0 * jnp.ones(3)), Command(jnp.array(25.0), 10.0 * jnp.ones(3))
     model = LayeredModel(RegressionModel.of(0.02, limits=limits), SECOND)
     limited, rows = eqx.filter_jit(model.fit), rows_of(jet, key)

@@ -1,4 +1,4 @@
-"""The linear residual: recursive least squares equals one least squares of all rows; what is counted, and how often."""
+"""The linear residual: recursive least squares equals least squares over all rows; rows count once."""
 
 import dataclasses
 from functools import partial
@@ -21,7 +21,7 @@ MODEL = LinearModel.of(DT, every=EVERY, memory=1.5, noise=0.4)
 
 @partial(jax.jit, static_argnames="n")
 def flight(key, n=120, noise=0.3):
-    """Random states and commands, and what random weights make of them."""
+    """Return random states and commands, and the accelerations for random weights."""
     k_x, k_u, k_w, k_noise = random.split(key, 4)
     x = jax.vmap(random_state)(random.split(k_x, n))
     u = jax.vmap(random_command)(random.split(k_u, n))
@@ -39,7 +39,7 @@ def part(rows, start, stop):
 
 
 def carry(model, rows, count):
-    """States after each of ``count`` windows of N rows, STEP apart."""
+    """Return the states after each of ``count`` windows of N rows, STEP apart."""
     state, states = model.init(random.key(0)), []
     for k in range(count):
         state, rms = fit(model, state, part(rows, k * STEP, k * STEP + N))
@@ -47,12 +47,12 @@ def carry(model, rows, count):
     return states
 
 
-def test_the_laws_of_a_residual_model():
+def test_conformance():
     check_residual(MODEL)
 
 
-def test_windows_one_by_one_are_all_rows_at_once(key):
-    """Weighted ridge regression in NumPy on every row that was seen, each once."""
+def test_recursive_fit_equals_ridge_regression(key):
+    """Weighted ridge regression in NumPy uses every row once."""
     rows, count = flight(key), 5
     states = carry(MODEL, rows, count)
     observation = N + (count - 1) * STEP
@@ -67,7 +67,7 @@ def test_windows_one_by_one_are_all_rows_at_once(key):
     np.testing.assert_allclose(rms, np.sqrt(np.mean(np.sum(error**2, axis=1))), rtol=1e-7)
 
 
-def test_it_becomes_more_certain_and_is_as_wrong_as_it_says(key):
+def test_spread_shrinks_and_is_calibrated(key):
     rows = flight(key, n=400)
     states = [state for state, _ in carry(replace_fields(MODEL, memory=jnp.array(1e6), noise=jnp.array(0.3)), rows, 15)]
     new = part(rows, 380, 400)
@@ -78,7 +78,7 @@ def test_it_becomes_more_certain_and_is_as_wrong_as_it_says(key):
     assert np.sqrt(np.mean(error**2)) < 2.0 * 0.3
 
 
-def test_an_invalid_row_does_not_count(key):
+def test_invalid_row_has_no_effect(key):
     rows = flight(key, n=N)
     valid = jnp.arange(N) % 3 > 0
     spoilt = dataclasses.replace(rows, a_res=jnp.where(valid[:, None], rows.a_res, 99.0), valid=valid)
@@ -91,8 +91,8 @@ def test_an_invalid_row_does_not_count(key):
     jax.tree.map(np.testing.assert_array_equal, after, state)
 
 
-def test_single_precision_is_enough(key):
-    """Ten minutes of flight, and a memory that keeps them all."""
+def test_single_precision_suffices(key):
+    """Ten minutes of flight, with a memory that keeps all of them."""
     rows, model = flight(key, n=2000), replace_fields(MODEL, memory=jnp.array(600.0))
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, tree)  # noqa: E731
 

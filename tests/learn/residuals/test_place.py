@@ -1,4 +1,4 @@
-"""The map over position: a Bayesian regression that separates local forces from steady ones, and that can be wrong."""
+"""The map over position: a Bayesian regression that separates local forces from steady ones, and is correctable."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ at_place = eqx.filter_jit(lambda model, state, p: jax.vmap(lambda p: model.at_pl
 
 
 def on_lap(t):
-    """Position and velocity on a circle of 1 m."""
+    """Return position and velocity on a circle of 1 m."""
     angle = 2.0 * np.pi * t / LAP
     p = np.stack([1.0 - np.cos(angle), -np.sin(angle), np.ones_like(t)], axis=1)
     v = 2.0 * np.pi / LAP * np.stack([np.sin(angle), -np.cos(angle), np.zeros_like(t)], axis=1)
@@ -30,13 +30,13 @@ def on_lap(t):
 
 
 def local_force(p):
-    """A downward force near the far end of the circle."""
+    """Return a downward force near the far end of the circle."""
     near = np.exp(-0.5 * ((p[:, 0] - 2.0) ** 2 + p[:, 1] ** 2) / 0.2**2)
     return near[:, None] * np.array([0.0, 0.0, -4.0])
 
 
 def rows_at(p, v, a, valid=True):
-    """Rows of level hover commands along a path."""
+    """Return rows of level hover commands along a path."""
     n = len(p)
     x = jax.vmap(lambda p, v: State(p, jnp.eye(3), v))(jnp.asarray(p), jnp.asarray(v))
     u = jax.vmap(Command)(jnp.full(n, 9.80665), jnp.zeros((n, 3)))
@@ -44,7 +44,7 @@ def rows_at(p, v, a, valid=True):
 
 
 def window(end, force, noise=0.1, seed=0, valid=True):
-    """The rows of the last ticks before ``end`` [s]; hover commands."""
+    """Return the rows of the last ticks before ``end`` [s] with hover commands."""
     t = end - DT * np.arange(ROWS, 0, -1)
     p, v = on_lap(t)
     a = force(t, p) + noise * np.random.default_rng([seed, round(end / DT)]).normal(size=p.shape)
@@ -68,31 +68,31 @@ def lap_values(state):
     return p, np.asarray(at_place(MODEL, state, jnp.asarray(p)))
 
 
-def test_the_laws_of_a_residual_model():
+def test_conformance():
     check_residual(MODEL)
 
 
-def test_after_two_laps_the_map_is_the_local_force_without_the_steady_push(fit_model):
+def test_map_after_two_laps_is_local_force_without_steady_push(fit_model):
     p, a = lap_values(fit_model)
     error = a - local_force(p)
     np.testing.assert_allclose(error - error.mean(axis=0), 0.0, atol=0.5)
     assert np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)) < 0.1
-    assert np.abs(error.mean(axis=0)).max() < 0.4  # a small part of the push that repeats is a matter of the prior
+    assert np.abs(error.mean(axis=0)).max() < 0.4  # a small part of the push repeats and depends on the prior
 
 
-def test_far_from_the_path_the_map_is_zero(fit_model):
+def test_map_is_zero_far_from_path(fit_model):
     away = jnp.array([[0.0, 0.0, 3.0], [5.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
     np.testing.assert_allclose(at_place(MODEL, fit_model, away), 0.0, atol=1e-3)
 
 
-def test_a_push_that_changes_with_time_does_not_enter_the_map():
+def test_push_that_changes_with_time_is_not_in_map():
     state = learn(lambda t, p: np.where(t < LAP, 2.0, -2.0)[:, None] * np.ones(3), end=3.0 * LAP)
     _, a = lap_values(state)
     assert np.abs(a).max() < 0.25 * 4.0  # of a change of 4 m/s^2
 
 
-def test_one_fit_is_the_regression_on_all_rows_at_once():
-    """Against NumPy: precision = prior + variance of the wandering constant + information of the rows."""
+def test_fit_equals_regression_on_all_rows():
+    """In NumPy, precision = prior + variance of the random-walk constant + information of the rows."""
     rows = window(1.2, lambda t, p: local_force(p - np.array([-1.0, 0.0, 0.0])) + 1.0)
     model = dataclasses.replace(MODEL, memory=jnp.array(jnp.inf))
     state, _ = fit(model, model.init(random.key(0)), rows)
@@ -109,7 +109,7 @@ def test_one_fit_is_the_regression_on_all_rows_at_once():
     np.testing.assert_allclose(np.asarray(state.map.weights)[np.append(used, True)], weights, atol=1e-8)
 
 
-def test_a_force_that_disappears_loses_its_influence(fit_model):
+def test_vanished_force_loses_its_influence(fit_model):
     place = jnp.array([[2.0, 0.0, 1.0]])
     before = float(at_place(MODEL, fit_model, place)[0, 2])
     state = learn(lambda t, p: np.zeros_like(p), 2.0 * LAP, 4.0 * LAP, fit_model)
@@ -124,8 +124,8 @@ def test_windows_without_valid_rows_change_nothing(fit_model):
     jax.tree.map(np.testing.assert_array_equal, after, fit_model)
 
 
-def test_old_centres_make_room_for_new_places():
-    """A route longer than the map can hold: the newest part is known, the oldest is forgotten."""
+def test_new_places_replace_old_centres():
+    """A route longer than the capacity of the map: the newest part is known, and the oldest is forgotten."""
     state = MODEL.init(random.key(0))
     speed = 2.0
     for k in range(150):

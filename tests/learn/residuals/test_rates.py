@@ -1,4 +1,4 @@
-"""How a vehicle turns: bias and lag are identified on known ones, with noise and without, and noise is no bias."""
+"""Bias and lag of body rates are identified, with and without noise, and noise is not identified as bias."""
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ ENDLESS = replace_fields(MODEL, memory=jnp.array(1e9))
 
 @eqx.filter_jit
 def window_of(key, tau, bias, noise=0.0, n=100):
-    """A flight under random commands of a vehicle that turns late and too fast, measured with noise [rad]."""
+    """Return a flight under random commands of a vehicle with a rate lag and bias, measured with noise [rad]."""
     k_x, k_c, k_w, k_noise = random.split(key, 4)
     model = LaggedModel(RateBiasedModel(PointMass(DT), bias), first_order(tau))
     c = 9.81 + random.normal(k_c, (n,))
@@ -44,11 +44,11 @@ def fit(model, window):
 def test_lag_and_bias_are_identified(key, tau, bias):
     result = fit(ENDLESS, window_of(key, jnp.array(tau), jnp.array(bias)))
     np.testing.assert_allclose(result.bias, bias, atol=0.01)
-    np.testing.assert_allclose(np.log(result.tau / tau), 0.0, atol=0.15)  # the grid's step is a fifth
+    np.testing.assert_allclose(np.log(result.tau / tau), 0.0, atol=0.15)  # the step of the grid is a fifth
 
 
 @pytest.mark.parametrize("yaw", [0.02, 0.2, 0.5])
-def test_yaw_has_a_lag_of_its_own(key, yaw):
+def test_yaw_has_separate_lag(key, yaw):
     lag = Command(jnp.array(0.03), jnp.array([0.06, 0.06, yaw]))
     result = fit(ENDLESS, window_of(key, lag, jnp.array([0.1, -0.1, 0.1]), n=200))
     np.testing.assert_allclose(np.log(result.tau / lag.omega), 0.0, atol=0.2)
@@ -56,28 +56,28 @@ def test_yaw_has_a_lag_of_its_own(key, yaw):
     np.testing.assert_allclose(result.bias, [0.1, -0.1, 0.1], atol=0.03)
 
 
-def test_noise_does_not_shorten_the_lag(key):
-    """Attitudes to 0.2 degrees: rates of a tick to a quarter of a radian per second."""
+def test_noise_does_not_shorten_lag(key):
+    """Attitude noise of 0.2 degrees corresponds to rate noise of 0.25 rad/s over one tick."""
     window = window_of(key, jnp.array(0.06), jnp.array([0.2, 0.0, -0.2]), noise=0.0035, n=200)
     result = fit(ENDLESS, window)
     np.testing.assert_allclose(result.bias, [0.2, 0.0, -0.2], atol=3.0 * float(result.deviation[0]))
     assert ((result.tau > 0.04) & (result.tau < 0.09)).all()
 
 
-def test_a_bias_that_begins_is_learnt_within_the_memory(key):
+def test_new_bias_is_learned_within_memory(key):
     before, after = (window_of(key, jnp.array(0.03), jnp.array([b, 0.0, 0.0])) for b in (0.0, 0.4))
     whole = jax.tree.map(lambda a, b: jnp.concatenate([a[:50], b[50:]]), before, after)
     assert abs(float(fit(replace_fields(MODEL, memory=jnp.array(0.2)), whole).bias[0]) - 0.4) < 0.06
 
 
-def test_without_data_it_is_the_prior(key):
+def test_posterior_without_data_is_prior(key):
     window = window_of(key, jnp.array(0.03), jnp.array([0.4, 0.0, 0.0]))
     result = fit(MODEL, replace_fields(window, valid=jnp.zeros(100, dtype=bool)))
     jax.tree.map(np.testing.assert_array_equal, result, MODEL.init())
 
 
-def test_a_hover_says_nothing_of_the_lag(key):
-    """Commands that do not change leave the prior's time constant, and give the bias."""
+def test_hover_does_not_identify_lag(key):
+    """Constant commands leave the prior of the time constant unchanged, and identify the bias."""
     window = window_of(key, jnp.array(0.1), jnp.array([0.2, 0.0, 0.0]))
     still = replace_fields(window, u=jax.tree.map(jnp.zeros_like, window.u))
     R = jax.vmap(lambda t: so3.exp(t * jnp.array([0.2, 0.0, 0.0])))(still.t)

@@ -1,4 +1,4 @@
-"""The closed-form residual: its posterior, what it forgets, and what it identifies."""
+"""The closed-form residual: its posterior, its forgetting, and the parameters that it identifies."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ ENDLESS = replace_fields(MODEL, memory=jnp.array(1e9))
 
 
 def rows_of(parameters, key, n=96, noise=0.0, valid=None):
-    """Random states and commands, and what ``parameters`` (n x 10, or 10) make of them."""
+    """Return random states and commands, and the accelerations for ``parameters`` (n x 10, or 10)."""
     parameters = jnp.asarray(np.broadcast_to(parameters, (n, 10)))
     return _rows_of(parameters, key, jnp.array(noise), jnp.ones(n, dtype=bool) if valid is None else valid)
 
@@ -42,7 +42,7 @@ def fit(model, rows):
     return _fit(model, model.init(random.key(0)), rows)
 
 
-def test_without_data_it_is_the_prior(key):
+def test_posterior_without_data_is_prior(key):
     rows = rows_of(push(1.0, 2.0, 3.0), key, valid=jnp.zeros(96, dtype=bool))
     state, _ = fit(MODEL, rows)
     jax.tree.map(np.testing.assert_allclose, state, MODEL.init(key))
@@ -50,8 +50,8 @@ def test_without_data_it_is_the_prior(key):
     np.testing.assert_array_equal(MODEL.predict(state, x, u), 0.0)
 
 
-def test_the_posterior_is_the_one_of_the_textbook(key):
-    """Kalman's recursion, row by row in NumPy, ends where the closed form is."""
+def test_posterior_equals_kalman_recursion(key):
+    """The recursion in NumPy, row by row, ends at the closed form."""
     rows = rows_of(0.3 * random.normal(key, (10,)) * MODEL.prior, key, n=40, noise=0.3)
     mean, covariance = np.zeros(10), np.diag(np.asarray(MODEL.prior) ** 2)
     for phi, a in zip(np.asarray(jax.vmap(features_of)(rows.x, rows.u)), np.asarray(rows.a_res), strict=True):
@@ -62,8 +62,8 @@ def test_the_posterior_is_the_one_of_the_textbook(key):
     np.testing.assert_allclose(state.covariance, covariance, rtol=1e-7, atol=1e-12)
 
 
-def test_old_rows_count_for_less(key):
-    """A slow drift that no test calls a change: a short memory follows it more closely than a long one."""
+def test_old_rows_have_less_weight(key):
+    """For a slow drift without a detected change, a short memory follows more closely than a long one."""
     drift = np.linspace(0.0, 0.4, 96)[:, None] * np.asarray(push(1.0, 0.0, 0.0))
     rows = rows_of(drift, key)
     short, long = (float(fit(replace_fields(MODEL, memory=jnp.array(m)), rows)[0].mean[0]) for m in (0.1, 1e9))
@@ -72,8 +72,8 @@ def test_old_rows_count_for_less(key):
 
 
 @pytest.mark.parametrize("since", [BLOCK, 2 * BLOCK, 5 * BLOCK])
-def test_a_change_is_forgotten_at_once(key, since):
-    """Since a step of 2 m/s^2 on each axis: what lay before it has no say."""
+def test_rows_before_change_are_discarded(key, since):
+    """After a step of 2 m/s^2 on each axis, earlier rows have no effect."""
     n = 96
     before = (jnp.arange(n) < n - since)[:, None]
     rows = rows_of(jnp.where(before, push(-1.0, -1.0, -1.0), push(1.0, 1.0, 1.0)), key, noise=0.1)
@@ -81,8 +81,8 @@ def test_a_change_is_forgotten_at_once(key, since):
     np.testing.assert_allclose(state.mean[:3], 1.0, atol=0.2)
 
 
-def test_noise_is_no_change(key):
-    """Of hundreds of windows of pure noise of the stated size, nearly all are used as a whole."""
+def test_noise_is_not_a_change(key):
+    """Nearly all of several hundred windows with noise of the stated size are used completely."""
     model = ENDLESS
 
     def precision(key):
@@ -102,8 +102,10 @@ def test_noise_is_no_change(key):
     ],
     ids=["push", "thrust gain", "drag"],
 )
-def test_known_worlds_are_identified(key, field, parameter, value, tolerance):
-    """From states and commands of a flight, with the delay of the plant; priors made wide, since the data are many."""
+def test_known_disturbances_are_identified(key, field, parameter, value, tolerance):
+    """The data are states and commands of a flight with the delay of the plant; priors are wide, since the data are
+    many.
+    """
     model = replace_fields(ENDLESS, prior=10.0 * MODEL.prior, noise=jnp.array(0.05))
     window = random_field_flight(field, key, n=100, delay_ticks=1)
     rows = residual_targets(window, PointMass(0.02), delay_ticks=1)
@@ -112,8 +114,8 @@ def test_known_worlds_are_identified(key, field, parameter, value, tolerance):
     assert float(rms) < 0.05
 
 
-def test_it_turns_with_the_world(key):
-    """Turned rows give the turned prediction: features are physical, not of the axes."""
+def test_prediction_is_equivariant_to_rotation(key):
+    """Rotated rows give the rotated prediction: features are physical and independent of the axes."""
     isotropic = replace_fields(MODEL, prior=MODEL.prior)
     Q = so3.exp(random.normal(key, (3,)))
     rows = rows_of(0.5 * random.normal(key, (10,)) * MODEL.prior, key, noise=0.2)
@@ -125,7 +127,7 @@ def test_it_turns_with_the_world(key):
     np.testing.assert_allclose(MODEL.predict(there, *other), so3.act(Q, MODEL.predict(here, *one)), atol=1e-9)
 
 
-def test_the_spread_shrinks_with_data(key):
+def test_spread_shrinks_with_data(key):
     x, u = random_state(key), random_command(key)
     wide = MODEL.spread(MODEL.init(key), x, u)
     narrow = MODEL.spread(fit(MODEL, rows_of(jnp.zeros(10), key))[0], x, u)
@@ -136,8 +138,8 @@ def test_the_spread_shrinks_with_data(key):
 LIMITS = Command(jnp.array(0.5), -10.0 * jnp.ones(3)), Command(jnp.array(40.5), 10.0 * jnp.ones(3))
 
 
-def test_commands_at_a_limit_tell_nothing(key):
-    """At the least thrust a mixer lifts by what it takes to turn: no gain of the thrust, and no bias of the rates."""
+def test_commands_at_limit_are_excluded(key):
+    """At least thrust, a mixer adds thrust in order to rotate; this is neither a thrust gain nor a rate bias."""
     rows, model = rows_of(push(1.0, 0.0, 0.0), key), replace_fields(ENDLESS, limits=LIMITS)
     at = jnp.arange(96) % 2 == 0
     idle = jax.vmap(Command)(jnp.where(at, 1.0, rows.u.c), jnp.where(at[:, None], 9.5, rows.u.omega))
@@ -146,10 +148,10 @@ def test_commands_at_a_limit_tell_nothing(key):
     message, left = fit(model, mixture)[0], fit(model, replace_fields(mixture, valid=~at))[0]
     jax.tree.map(np.testing.assert_array_equal, message, left)
     np.testing.assert_allclose(message.mean, push(1.0, 0.0, 0.0), atol=0.05)
-    assert float(fit(ENDLESS, mixture)[0].mean[3]) < -0.5  # the gain that would explain it
+    assert float(fit(ENDLESS, mixture)[0].mean[3]) < -0.5  # the gain that would explain the data
 
 
-def test_with_no_row_that_counts_it_knows_what_it_knew(key):
+def test_window_without_valid_rows_changes_nothing(key):
     model = replace_fields(MODEL, limits=LIMITS)
     names, _ = fit(model, rows_of(push(1.0, 0.0, 0.0), key))
     assert float(names.mean[0]) > 0.5

@@ -1,4 +1,4 @@
-"""Targets of the residual: to the digit, under the command that acted; what a gap and a settling lag take away."""
+"""Targets of the residual: exact, for the acting command; rows excluded by a gap or by the settling of a lag."""
 
 import math
 
@@ -23,12 +23,12 @@ drag = jax.jit(jax.vmap(linear_drag))
 
 
 def pause(window, at, seconds=7.0):
-    """The same ticks, with ``seconds`` lost between the ticks ``at - 1`` and ``at``."""
+    """Return the same ticks, with ``seconds`` missing between the ticks ``at - 1`` and ``at``."""
     return replace_fields(window, t=window.t + seconds * (np.arange(window.t.size) >= at))
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
-def test_targets_are_exact_when_the_delay_is_right(delay, key):
+def test_targets_are_exact_for_correct_delay(delay, key):
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=delay)
     rows = residual_targets(window, PointMass(DT), delay_ticks=delay)
     assert rows.a_res.shape == (29 - delay, 3)
@@ -39,7 +39,7 @@ def test_targets_are_exact_when_the_delay_is_right(delay, key):
         assert np.abs(np.asarray(other.a_res) - np.asarray(drag(other.x, other.u))).max() > 0.1
 
 
-def test_a_row_holds_the_state_at_its_tick_and_the_command_that_acted(key):
+def test_row_has_state_at_its_tick_and_acting_command(key):
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=2)
     rows = residual_targets(window, PointMass(DT), delay_ticks=2)
     np.testing.assert_array_equal(rows.x.p, np.asarray(window.x.p)[2:29])
@@ -47,8 +47,8 @@ def test_a_row_holds_the_state_at_its_tick_and_the_command_that_acted(key):
 
 
 @pytest.mark.parametrize("delay", [0, 1])
-def test_measured_accelerations_take_the_place_of_differences(delay, key):
-    """Noise of the velocity then leaves the targets alone; without the measurement it is magnified by 1 / dt."""
+def test_measured_accelerations_replace_differences(delay, key):
+    """Noise of the velocity then has no effect; without the measurement it is multiplied by 1 / dt."""
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=delay)
     clean = residual_targets(window, PointMass(DT), delay_ticks=delay)
     measurement = jnp.asarray(np.append(np.diff(window.x.v, axis=0) / DT, np.zeros((1, 3)), axis=0))
@@ -61,15 +61,17 @@ def test_measured_accelerations_take_the_place_of_differences(delay, key):
     assert np.abs(np.asarray(without_aid.a_res) - np.asarray(clean.a_res)).max() > 1.0
 
 
-def test_a_window_must_be_longer_than_the_delay(key):
+def test_window_must_be_longer_than_delay(key):
     short = jax.tree.map(lambda leaf: jnp.asarray(leaf[:3]), random_field_flight(linear_drag, key, n=30))
     with pytest.raises(ValueError, match="window of 3 ticks is too short for a delay of 2"):
         residual_targets(short, PointMass(DT), delay_ticks=2)
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
-def test_a_gap_in_time_masks_the_rows_that_straddle_it(delay, key):
-    """Seven seconds between the ticks 11 and 12: row k takes the ticks k to k + delay + 1, so delay + 1 rows go."""
+def test_gap_in_time_excludes_rows_across_it(delay, key):
+    """Seven seconds between the ticks 11 and 12: row k uses the ticks k to k + delay + 1, so delay + 1 rows are
+    excluded.
+    """
     window = pause(random_field_flight(linear_drag, key, n=30, delay_ticks=delay), at=12)
     rows = residual_targets(window, PointMass(DT), delay_ticks=delay)
     straddling = [k for k in range(29 - delay) if k < 12 <= k + delay + 1]
@@ -77,8 +79,8 @@ def test_a_gap_in_time_masks_the_rows_that_straddle_it(delay, key):
     np.testing.assert_array_equal(np.flatnonzero(~np.asarray(rows.valid)), straddling)
 
 
-def test_jitter_of_the_clock_masks_nothing(key):
-    """A tick may be up to a quarter longer or shorter; one that was lost may not."""
+def test_clock_jitter_excludes_no_rows(key):
+    """A tick may be up to a quarter longer or shorter; a missed tick is excluded."""
     window = random_field_flight(linear_drag, key, n=30)
     jittery = replace_fields(window, t=window.t + 0.1 * DT * jnp.sin(jnp.arange(30.0)))
     assert residual_targets(jittery, PointMass(DT)).valid.all()
@@ -88,8 +90,8 @@ def test_jitter_of_the_clock_masks_nothing(key):
 
 @pytest.mark.parametrize("tau", [0.033, 0.1])
 @pytest.mark.parametrize("filling", [0, 9])
-def test_rows_wait_until_the_lag_has_settled(tau, filling, key):
-    """The first ceil(3 tau / dt) valid rows: until then the lag still remembers the hover that it assumed."""
+def test_rows_before_lag_has_settled_are_excluded(tau, filling, key):
+    """The first ceil(3 tau / dt) valid rows still depend on the assumed initial hover."""
     window = random_field_flight(linear_drag, key, n=30, delay_ticks=1)
     window = replace_fields(window, valid=jnp.arange(30) >= filling)
     valid = residual_targets(window, LaggedModel(PointMass(DT), first_order(tau)), delay_ticks=1).valid
@@ -103,8 +105,8 @@ def test_rows_wait_until_the_lag_has_settled(tau, filling, key):
 # ---- windows
 
 
-def test_a_window_of_columns_and_back(key):
-    """From the columns of a log; what it holds is what was given, and every tick counts."""
+def test_window_from_columns_survives_round_trip(key):
+    """The columns are those of a log; the window contains the given values, and every tick counts."""
     flight = random_field_flight(linear_drag, key, n=30)
     columns = [np.asarray(a) for a in (flight.t, flight.x.p, flight.x.R, flight.x.v, flight.u.c, flight.u.omega)]
     window = Window.of(*columns)
@@ -116,12 +118,12 @@ def test_a_window_of_columns_and_back(key):
 
 @pytest.mark.parametrize("age", [0.0, 0.01, 0.04])
 @pytest.mark.parametrize("delay", [0, 1])
-def test_a_row_whose_command_lies_beyond_a_gap_does_not_count(age, delay):
-    """A tick is missing: whatever counts is true, and what does not reach over the gap counts."""
+def test_row_whose_command_is_beyond_gap_is_excluded(age, delay):
+    """One tick is missing: all valid rows are exact, and rows that do not cross the gap are valid."""
     n, whole, draw = 40, math.ceil(age / DT), np.random.default_rng(0)
     c = 9.81 + 2.0 * draw.normal(size=n)
     v = np.cumsum(DT * (np.append(np.full(delay, 9.81), c)[:n] - 9.81))
-    # States of the beginning of each tick, as far back as they are old; between two of them thrust is constant.
+    # States before the beginning of each tick by their age; the thrust is constant between two of them.
     t, zero = DT * np.arange(n), np.zeros((n, 3))
     observation = np.interp(t - age, t, np.concatenate([[0.0], v[:-1]]))
     setup = Window.of(t, zero, np.tile(np.eye(3), (n, 1, 1)), observation[:, None] * np.array([0.0, 0.0, 1.0]), c, zero)
@@ -138,7 +140,7 @@ FINE, PUSH = 4, (0.5, -0.2, 0.3)
 
 @jax.jit
 def fly_finely(key, delay):
-    """Commands of 40 ticks, and states of every quarter of a tick under ``PUSH``."""
+    """Return commands of 40 ticks, and states at every quarter of a tick under ``PUSH``."""
     k_c, k_w = jax.random.split(key)
     u = jax.vmap(Command)(9.81 + jax.random.normal(k_c, (40,)), 0.5 * jax.random.normal(k_w, (40, 3)))
     model = PointMass(DT / FINE)
@@ -152,8 +154,8 @@ def fly_finely(key, delay):
 
 @pytest.mark.parametrize("age", [0.0, 0.005, 0.01, 0.02, 0.03])
 @pytest.mark.parametrize("delay", [0, 1])
-def test_a_late_measurement_is_paired_with_the_command_that_acted_then(age, delay, key):
-    """Of states that are 0 to 30 ms old, at a tick of 20 ms: the targets are those of the world, to a few per cent."""
+def test_late_measurement_is_paired_with_its_acting_command(age, delay, key):
+    """For states that are 0 to 30 ms old at a tick of 20 ms, the targets agree with the world within a few per cent."""
     u, x = fly_finely(key, delay)
     observation = np.maximum(FINE * np.arange(40) - round(age / DT * FINE), 0)
     states = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[observation]), x)

@@ -1,4 +1,4 @@
-"""Published numbers: the Agilicious simulator's other models, damping, speed controllers, weights."""
+"""Golden numbers of the Agilicious simulator's other models, damping, speed controllers, and weights."""
 
 import json
 from pathlib import Path
@@ -26,7 +26,7 @@ from retrim.physics.propeller import BladeForces, Inflow
 from retrim.physics.substep import rigid_body
 
 BEM, SIMPLE = (json.loads((Path(__file__).parent / f"{name}.json").read_text()) for name in ("bem", "simple_models"))
-SLOW = (0, 1, 2, 6)  # without body rates, up to 3 m/s: there the flapping, which is left out, is not seen
+SLOW = (0, 1, 2, 6)  # without body rates, up to 3 m/s: the omitted flapping has no visible effect there
 
 
 @pytest.fixture(params=range(6))
@@ -47,7 +47,7 @@ def state(case):
 
 
 def plants():
-    """The kingfisher with the arms of the golden file, without drag: by blade elements and by coefficients."""
+    """Return the kingfisher with the arms of the golden file, without drag: by blade elements and by coefficients."""
     vehicle = replace_fields(
         kingfisher(), arm=jnp.abs(jnp.array(SIMPLE["arms"][0][:2])), torque_ratio=jnp.array(SIMPLE["kappa"])
     )
@@ -57,8 +57,8 @@ def plants():
     return bem, replace_fields(LinearDragQuadrotor.of(vehicle, 0.02, thrust_error=0.0), drag=jnp.zeros(3))
 
 
-def test_quadratic_rotors_and_a_step(case):
-    """Position is the mean of both Euler steps; the published attitude is renormalised in its own way."""
+def test_quadratic_rotors_and_step(case):
+    """Position is the mean of both Euler steps; the published attitude is renormalised differently."""
     _, rotors = plants()
     vehicle, s = rotors.vehicle, state(case)
     force, torque = rotors.wrench(s, s.motors, vehicle.thrust_coefficient * s.motors**2, jnp.zeros(3))
@@ -116,7 +116,7 @@ def test_acceleration_of_blade_elements(index):
 # The small quadrotor's numbers, like its propeller, are a proposal.
 @pytest.mark.parametrize(("make", "edgewise", "axial"), [(kingfisher, 0.24, 0.37), (small, 0.33, 0.45)])
 def test_damping(make, edgewise, axial):
-    """Of the rotors alone, at hover [1/s]: at 3 m/s edgewise, and climbing."""
+    """Damping of the rotors only, at hover [1/s]: at 3 m/s edgewise, and climbing."""
     model = BemQuadrotor.of(make(), 0.02, thrust_error=0.0)
     model = replace_fields(model, vehicle=replace_fields(model.vehicle, drag_area=1e-12 * jnp.ones(3)))
     motors = jnp.sqrt(model.vehicle.mass * 9.81 / (4.0 * model.loop.thrust_map)) * jnp.ones(4)

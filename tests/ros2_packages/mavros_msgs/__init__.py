@@ -1,1 +1,1 @@
-"""Stand-in for the package of mavros's messages."""
+"""Stand-in for the package of MAVROS messages."""

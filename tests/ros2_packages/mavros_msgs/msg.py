@@ -1,4 +1,4 @@
-"""Messages of mavros; RETRIM_OTHER_HASH makes them those of another version."""
+"""MAVROS messages; RETRIM_OTHER_HASH gives them the hashes of a different version."""
 
 import os
 

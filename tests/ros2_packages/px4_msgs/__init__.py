@@ -1,1 +1,1 @@
-"""Stand-in for the package of PX4's messages."""
+"""Stand-in for the package of PX4 messages."""

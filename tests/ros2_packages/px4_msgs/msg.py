@@ -1,4 +1,4 @@
-"""Messages of PX4, in the release that RETRIM_PX4_MSGS names."""
+"""PX4 messages of the release in RETRIM_PX4_MSGS."""
 
 import os
 
