@@ -47,7 +47,7 @@ def model(run: Run, reporter: Reporter) -> None:
         )
         for row in table
     )
-    title = "The blade-element plant beside published figures"
+    title = "The blade-element plant compared with published figures"
     document = Document(run, "model", title, "Made by `retrim reproduce model`.", [0], reporter)
     document.add(
         TableSection(("quantity", "here", "published", "deviation", "source"), lines, picture=picture_path), table
