@@ -123,5 +123,5 @@ def test_residual_models_conform():
         def spread(self, state, x: State, u: Command):
             return state
 
-    with pytest.raises(AssertionError, match="a constant acceleration is learnt"):
+    with pytest.raises(AssertionError, match="a constant acceleration is learned"):
         testing.check_residual(IgnoresRows())

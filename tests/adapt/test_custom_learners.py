@@ -140,7 +140,7 @@ def test_unsuitable_names_are_refused():
         setup_of(learner="math:pi")
     with pytest.raises(ConfigError, match="optimiser 'math:pi' is a float, not an AbstractPolicyOptimiser"):
         setup_of(optimiser="math:pi")
-    with pytest.raises(ConfigError, match=r"learner 'nothing' gives a int, expected a retrim\.OnlineLearner"):
+    with pytest.raises(ConfigError, match=r"learner 'nothing' returns int, expected a retrim\.OnlineLearner"):
         setup_of(learner="nothing")
 
 

@@ -144,21 +144,21 @@ def test_live_refuses_invalid_options(folder):
         (("--policy-age", "-1"), "--policy-age -1 s must be positive"),
         (("--page", "--no-page"), "--page and --no-page: choose one"),
         (("--page", "--page-port", "0"), "--page-port 0 must be between 1 and 65535"),
-        (("--fault", "gaps"), "--fault gaps: a live flight has a clock of its own; fly it by `retrim fly`"),
+        (("--fault", "gaps"), "--fault gaps: a live flight has its own clock; use `retrim fly`"),
         (("--fault", "lat"), "'lat'"),
         (("--page", "--page-host", "192.0.2.1"), "no free port from 8080 on at '192.0.2.1'"),
         (
             ("--learners", "somewhere"),
-            "'somewhere' is no address of a bus; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT",
+            "'somewhere' is not an address of a bus; expected zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT",
         ),
         (("--learners", "zenoh:192.0.2.1:7447"), "learners beyond this machine need a shared key: --key FILE"),
         (("--learners", "zenoh:127.0.0.1:7447", "--key", "none"), "--key 'none': the key cannot be read"),
         (("--key", "p/policy.safetensors"), "--key 'p/policy.safetensors': a key has"),
         (("--record", "flight.bag"), "--record flight.bag: the name must end with .mcap"),
-        (("--record", "nowhere/flight.mcap"), "nothing can be written in nowhere"),
+        (("--record", "nowhere/flight.mcap"), "files cannot be written to nowhere"),
     ):
         assert text in retrim("live", "--policy", "p", *words, "--out", "lx", cwd=folder, code=1)
-    assert "'somewhere' is no address of a bus" in retrim("learn", "somewhere", cwd=folder, code=1)
+    assert "'somewhere' is not an address of a bus" in retrim("learn", "somewhere", cwd=folder, code=1)
     assert "zenoh:192.0.2.1:7447: learners beyond" in retrim("learn", "zenoh:192.0.2.1:7447", cwd=folder, code=1)
     assert "no rosmaster at 'http://127.0.0.1:1'" in retrim("learn", "ros:127.0.0.1:1", cwd=folder, code=1)
 

@@ -53,7 +53,7 @@ def test_fly_star_warns(folder):
 
 def test_family_requires_reference_option(folder):
     out = retrim("fly", "--policy", "t", "--out", "never", cwd=folder, code=1)
-    assert "trained on circle+figure8: say which to fly, as --reference circle" in out
+    assert "trained on circle+figure8: choose one, as in --reference circle" in out
     assert not (folder / "never").exists()
 
 

@@ -26,16 +26,20 @@ def keypoint_setups():
         (
             "retrim",
             "base-i",
-            "method 'base-i' shifts the measured position; a policy that sees keypoints is shown none",
+            "method 'base-i' shifts the measured position; a policy that observes keypoints receives none",
         ),
         ("ideal", "base-i", "method 'base-i' shifts the measured position"),
-        ("retrim", "raptor", "method 'raptor' needs the measured state; a policy that sees keypoints is shown none"),
+        (
+            "retrim",
+            "raptor",
+            "method 'raptor' needs the measured state; a policy that observes keypoints receives none",
+        ),
         (
             "ideal",
             "indi",
             r"method 'indi' needs the state, and preset 'vision/ideal' shows keypoints.*occlusion = true",
         ),
-        ("retrim", "datt", "method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains"),
+        ("retrim", "datt", "method 'datt' has its own network: `retrim reproduce hover --methods datt` trains"),
     ],
 )
 def test_methods_that_need_more_than_keypoints_are_refused(keypoint_setups, name, method, message, key):

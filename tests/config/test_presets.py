@@ -54,7 +54,7 @@ def test_100_hz_preset_has_same_times():
     [
         ({"track": {"reference": "circle"}}, r"a table \[track\] needs task = 'track', not 'hover'"),
         ({"vision": {}}, r"a table \[vision\] needs task = 'vision', not 'hover'"),
-        ({"options": {"a": 1}}, r"a table \[options\] is for a task of one's own, not for 'hover'"),
+        ({"options": {"a": 1}}, r"a table \[options\] is for a custom task, not for 'hover'"),
         ({"dt": 0.0205}, r"dt = 0\.0205 s must be a whole number of milliseconds"),
         ({"dt": 0.001}, r"dt: Input should be greater than or equal to 0\.002"),
         ({"plant_delay_ticks": 5, "adapt": {"window": 14}}, r"adapt\.window = 14 is too short for plant_delay_ticks"),

@@ -57,8 +57,8 @@ def test_file_in_family(lap):
         ("{}x.csv:once", r"x\.csv: No such file"),
         ("circel", "no reference 'circel'; .*circle.* or a CSV file"),
         ("math:cos", "reference math:cos: "),
-        ("math:pi", "reference 'math:pi' is a float, not a function that gives a Reference"),
-        ("builtins:dict", "is a dict, not a function that gives a Reference"),
+        ("math:pi", "reference 'math:pi' is a float, not a function that returns a Reference"),
+        ("builtins:dict", "is a dict, not a function that returns a Reference"),
     ],
 )
 def test_invalid_references_are_refused(name, message, lap):

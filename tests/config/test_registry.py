@@ -135,9 +135,9 @@ def test_name_is_registered_once():
     things = Registry("thing", example="module:name")
     assert things.register("one", abs) is abs
     assert things.find("one") is things["one"] is abs
-    with pytest.raises(ConfigError, match="there is a thing 'one' already"):
+    with pytest.raises(ConfigError, match="thing 'one' is already registered"):
         things.register("one", max)
-    with pytest.raises(ConfigError, match="there is a thing 'one' already"):
+    with pytest.raises(ConfigError, match="thing 'one' is already registered"):
         things.register_place("one", "builtins:max")
     assert things.find("one") is abs
     assert list(things) == ["one"]
@@ -227,7 +227,7 @@ def test_module_that_cannot_be_imported_is_refused(mine, tmp_path, text, message
     "name", ["mine:", ":thing", "a+b:thing", "mine:thing.part", "a.:b", "../mine:thing", "mine :a"]
 )
 def test_invalid_python_names_are_refused(name):
-    with pytest.raises(ConfigError, match="a Python name is as module:name"):
+    with pytest.raises(ConfigError, match="a Python name has the form module:name"):
         VEHICLES.find(name)
 
 
@@ -251,7 +251,7 @@ def test_custom_task(mine):
     [
         ("NUMBER", "is a int, not a function"),
         ("no_task", "needs a height"),
-        ("no_residual", "gives a int, expected a retrim.AbstractTask"),
+        ("no_residual", "returns int, expected a retrim.AbstractTask"),
     ],
 )
 def test_invalid_custom_task_is_refused(mine, name, message):
@@ -281,17 +281,17 @@ def test_size_refused_by_custom_disturbance(mine):
 def test_invalid_custom_plant_is_refused(mine):
     with pytest.raises(ConfigError, match="is a int, not a function of a PlantRequest"):
         Scenario(plant=f"{mine}:NUMBER")
-    with pytest.raises(ConfigError, match=r"gives a int, expected a retrim\.Plant"):
+    with pytest.raises(ConfigError, match=r"returns int, expected a retrim\.Plant"):
         Scenario(plant=f"{mine}:no_residual").make()
 
 
 def test_invalid_custom_disturbance_is_refused(mine):
-    with pytest.raises(ConfigError, match=rf"disturbance '{mine}:no_disturbance=2' gives a float, expected a retrim"):
+    with pytest.raises(ConfigError, match=rf"disturbance '{mine}:no_disturbance=2' returns float, expected a retrim"):
         disturbance(f"{mine}:no_disturbance=2")
 
 
 def test_invalid_custom_vehicle_is_refused(mine):
-    with pytest.raises(ConfigError, match=r"gives a str, expected a retrim\.Vehicle"):
+    with pytest.raises(ConfigError, match=r"returns str, expected a retrim\.Vehicle"):
         Scenario(vehicle=f"{mine}:no_vehicle").make()
     with pytest.raises(ConfigError, match="vehicle"):
         Setup.from_preset(changed(tiny_preset(), vehicle=f"{mine}:NUMBER"))
@@ -303,7 +303,7 @@ def test_custom_residual(mine):
     assert setup.learner.residual_model.steps == 2
     state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
     assert isinstance(state.residual, eqx.Module)
-    with pytest.raises(ConfigError, match="gives a int without init, fit and predict"):
+    with pytest.raises(ConfigError, match="returns int without init, fit and predict"):
         Setup.from_preset(changed(tiny_preset(), adapt={"residual": f"{mine}:no_residual"}))
 
 
@@ -312,7 +312,7 @@ def test_custom_reference(mine):
     np.testing.assert_allclose(result(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     setup = Setup.from_preset(changed(load("track/paper"), pretrain={"hidden_sizes": (8,)}), f"{mine}:reference")
     np.testing.assert_allclose(setup.flight_task.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
-    with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows none"):
+    with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows no reference"):
         Setup.from_preset(tiny_preset(), "circle")
     with pytest.raises(ConfigError, match=rf"reference '{mine}:no_vehicle' is a str, not a function that gives"):
         make_reference(f"{mine}:no_vehicle")

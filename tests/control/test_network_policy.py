@@ -86,7 +86,7 @@ def test_unsuitable_networks_are_refused():
             make_policy(request_for("three"))
         with pytest.raises(ConfigError, match="network 'square' cannot be called with an observation of 15 numbers"):
             make_policy(request_for("square"))
-        with pytest.raises(ConfigError, match=r"gives a int, expected a callable equinox\.Module"):
+        with pytest.raises(ConfigError, match=r"returns int, expected a callable equinox\.Module"):
             make_policy(request_for("none"))
     finally:
         for name in setup:

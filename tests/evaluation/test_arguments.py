@@ -32,7 +32,7 @@ def test_preset_is_that_of_task_with_overrides(tmp_path):
     track_preset = training_preset("track", reference="circle")
     assert track_preset == changed(load("track/retrim"), track={"reference": "circle"})
     assert training_preset("hover", vehicle=str(SEVEN_INCH)).vehicle.mass == pytest.approx(1.2)
-    with pytest.raises(ConfigError, match="--reference circle: a hover policy follows none"):
+    with pytest.raises(ConfigError, match="--reference circle: a hover policy follows no reference"):
         training_preset("hover", reference="circle")
     with pytest.raises(ConfigError, match="'track/paper' is for track"):
         training_preset("hover", "track/paper")
@@ -46,9 +46,9 @@ def test_reference_must_suit_policy():
     assert [reference_of_flight(blind, name) for name in (None, "circle")] == ["circle", "circle"]
     assert reference_of_flight(family, "circle") == "circle"
     for preset, name, text in (
-        (load("hover/fast"), "circle", "a hover policy follows none"),
+        (load("hover/fast"), "circle", "a hover policy follows no reference"),
         (family, None, "say which to fly"),
-        (blind, "star", "does not see its reference, and was trained on circle"),
+        (blind, "star", "does not observe its reference, and was trained on circle"),
     ):
         with pytest.raises(ConfigError, match=text):
             reference_of_flight(preset, name)
@@ -98,7 +98,7 @@ def test_residual_can_change_except_in_resumed_flight(key):
     setup = Setup.from_preset(brief_preset())
     state = setup.learner.init(setup.new_policy(key), key)
     assert with_residual(preset, None, state) is preset
-    with pytest.raises(ConfigError, match="goes on with its own residual"):
+    with pytest.raises(ConfigError, match="keeps its own residual"):
         with_residual(preset, "regression", state)
 
 
@@ -121,7 +121,7 @@ def test_weights_come_from_policy_or_earlier_flight(tmp_path, key):
         load_inputs(None, None)
     with pytest.raises(ConfigError, match="give either --policy FILE or --resume FILE"):
         load_inputs(tmp_path, tmp_path)
-    with pytest.raises(ConfigError, match="--resume holds its own"):
+    with pytest.raises(ConfigError, match="--resume contains its own"):
         load_inputs(None, tmp_path, tmp_path)
 
 

@@ -108,7 +108,7 @@ def test_incomplete_table_is_not_written(here, tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
     words = "--presets", "hover/fast", "--methods", "base", "--seeds", "0", "--starts", "4", "--seconds", "1"
     text = retrim("reproduce", "hover", *words, "--on", here, "--out", "h", cwd=tmp_path, code=1)
-    assert "flights failed elsewhere, the first by OSError: the disk is full" in text
+    assert "flights failed in other processes, the first with OSError: the disk is full" in text
 
 
 def test_failed_training_does_not_affect_others(here, tmp_path, monkeypatch):
@@ -138,7 +138,7 @@ def test_failed_flight_keeps_others_and_sets_exit_code(here, tmp_path, monkeypat
     monkeypatch.setattr("retrim.evaluation.batches.lanes", lambda: 1)
     (tmp_path / "study.toml").write_text(SWEEP.format(starts=1).replace('"full"', '"indi"'))
     text = retrim("sweep", "study.toml", "--on", here, "--out", "s", cwd=tmp_path, code=1)
-    assert "2 flights failed elsewhere, the first by OSError: gone; the same command flies them" in text
+    assert "2 flights failed in other processes, the first with OSError: gone; the same command flies them" in text
     base, indi = rows(tmp_path / "s")
     assert "failures" not in base
     assert (indi["n"], indi["failures"], indi["mean"]) == (2, ["OSError: gone"] * 2, None)
@@ -176,17 +176,17 @@ def test_missing_scheduler_is_reported():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with pytest.raises(ConfigError, match=f"127.0.0.1:{port}: no scheduler answers there"):
+    with pytest.raises(ConfigError, match=f"127.0.0.1:{port}: no scheduler responds there"):
         Cluster(f"tcp://127.0.0.1:{port}")
 
 
 def test_different_versions_are_refused_before_first_job(here, monkeypatch):
-    with pytest.raises(ConfigError, match=r"a worker has other versions: jax 0\.1, here"):
+    with pytest.raises(ConfigError, match=r"a worker has different versions: jax 0\.1, here"):
         cluster.check_alike({**cluster.ours(), "jax": "0.1"}, "a worker")
     with pytest.raises(ConfigError, match="who sent this job"):
         cluster.call({**cluster.ours(), "retrim": "9"}, int, (), {})
     monkeypatch.setattr(Cluster, "_check", lambda self: cluster.check_alike({}, "worker w"))
-    with pytest.raises(ConfigError, match="worker w has other versions"):
+    with pytest.raises(ConfigError, match="worker w has different versions"):
         Cluster(here)
 
 

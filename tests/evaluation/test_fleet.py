@@ -264,7 +264,7 @@ def test_failing_plant_ends_fleet(fleet, monkeypatch):
         ({"scenarios": []}, "nothing to fly"),
         ({"methods": ()}, "nothing to fly"),
         ({"methods": ("best",)}, "no method 'best'"),
-        ({"scenarios": [Scenario(reference="circle")]}, "a hover policy follows none"),
+        ({"scenarios": [Scenario(reference="circle")]}, "a hover policy follows no reference"),
         ({"seed": 2**32}, "seed 4294967296: must be 0 to"),
     ],
 )

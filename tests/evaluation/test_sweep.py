@@ -222,7 +222,7 @@ def test_failed_remote_flights_are_recorded_and_repeated(tmp_path, monkeypatch):
         fleet, {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs}, flight_rows, run, reporter
     )
     assert (run.failed, run.exit_code) == (True, 1)
-    assert text == ["1 flights failed elsewhere, the first by OSError: gone; the same command flies them"]
+    assert text == ["1 flights failed in other processes, the first with OSError: gone; the same command flies them"]
     rows = [json.loads(line) for line in fly_once(tmp_path)]
     assert [(row["start"], row["failed"], row["preset"], row["vehicle"]) for row in rows] == [
         (0, None, preset.name, "small"), (1, "OSError: gone", preset.name, "small")

@@ -86,7 +86,7 @@ def test_a_file_that_computes_something_else_is_refused(policy_file, tmp_path):
         arrays = dict(file)
     arrays["w1"] = arrays["w1"] * 1.01
     np.savez(tmp_path / "spoilt.npz", **arrays)
-    with pytest.raises(ValueError, match="test vectors are missed by"):
+    with pytest.raises(ValueError, match="results deviate from the test vectors by"):
         Runner(tmp_path / "spoilt.npz")
 
 
@@ -178,7 +178,7 @@ def test_a_delta_travels_alone(policy, setup, policy_file, tmp_path):
     assert np.abs(Runner(tmp_path / "p.npz").command(rows) - expected).max() > 0.1
     export(policy_file, "npz", tmp_path / "merged.npz", tmp_path / "delta.safetensors", Silent())
     np.testing.assert_allclose(Runner(tmp_path / "merged.npz").command(rows), expected, atol=5e-4)
-    with pytest.raises(ValueError, match="made for another policy"):
+    with pytest.raises(ValueError, match="made for a different policy"):
         Runner(tmp_path / "merged.npz", tmp_path / "d.npz")
 
 
@@ -202,7 +202,7 @@ def test_a_runner_of_somebody_else_is_left_alone(policy_file, tmp_path):
     export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     export(policy_file, "npz", tmp_path / "q.npz", None, Silent())
     (tmp_path / "runner.py").write_text("print('mine')\n")
-    with pytest.raises(ConfigError, match=r"runner\.py is there already") as error:
+    with pytest.raises(ConfigError, match=r"runner\.py already exists") as error:
         export(policy_file, "npz", tmp_path / "r.npz", None, Silent())
     assert "\n" not in str(error.value)
     assert (tmp_path / "runner.py").read_text() == "print('mine')\n"

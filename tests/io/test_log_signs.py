@@ -177,7 +177,7 @@ def test_alternative_and_capitalised_names(tmp_path):
         ({"frames__body": '"ENU"'}, "no three axes"),
         ({"frames__world": '"NEU"'}, "must both be right-handed, or both left"),
         ({"attitude__body": '"FRU"'}, "must both be right-handed, or both left"),
-        ({"landed__fields": '["state==on"]'}, "'on' is no number; a flag is a field, or field==number"),
+        ({"landed__fields": '["state==on"]'}, "'on' is not a number; a flag is a field, or field==number"),
         ({"thrust__full": "65535.0"}, 'full goes with unit = "share"'),
     ],
 )

@@ -323,10 +323,10 @@ DAMAGED_FILES = {
     "empty": (lambda text: "", "it is empty"),
     "header only": (lambda text: text.splitlines()[0] + "\n", "a header and no sample"),
     "no header": (lambda text: "\n".join(text.splitlines()[1:]), "first line must name the columns"),
-    "a word": (lambda text: cut_line(text, 7, "0.1,oops" + ",0" * 13), "line 8, column 'px': 'oops' is no number"),
+    "a word": (lambda text: cut_line(text, 7, "0.1,oops" + ",0" * 13), "line 8, column 'px': 'oops' is not a number"),
     "a short line": (lambda text: cut_line(text, 7, "0.1,0,0"), "line 8: 3 cells, but the header has 15"),
     "twice a column": (lambda text: text.replace("px,py", "px,px"), "two columns are named 'px'"),
-    "an open list": (lambda text: cut_line(text, 3, "0.1,[1" + ",0" * 13), "is no number"),
+    "an open list": (lambda text: cut_line(text, 3, "0.1,[1" + ",0" * 13), "is not a number"),
     "blanks only": (lambda text: "\n \n\n", "."),
 }
 
@@ -390,7 +390,7 @@ def test_wrong_maps_are_refused(change, text, tmp_path):
 
 def test_other_files_are_refused(tmp_path):
     for name, data, text in (
-        ("log.xyz", b"1", "no log that is known"),
+        ("log.xyz", b"1", "unknown kind of log"),
         ("log.npz", b"PK junk", "not a whole NPZ"),
         ("log.csv", bytes(range(256)), "not a text file|no field|header"),
         ("log.ulg", b"ULog junk", "ULog"),

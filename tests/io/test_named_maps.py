@@ -73,7 +73,9 @@ def test_namespace_and_version_in_topic_names(tmp_path):
     ]
     assert_is_flight(read_flight_log(bag2(tmp_path / "fmu", PX4_ODOMETRY, messages)))
     two = messages + [("/uav4" + topic[5:], *rest) for topic, *rest in messages]
-    with pytest.raises(LogError, match=r"fits several topics: /uav3/fmu/out/vehicle_odometry_v1, /uav4/.*; name one"):
+    with pytest.raises(
+        LogError, match=r"matches several topics: /uav3/fmu/out/vehicle_odometry_v1, /uav4/.*; name one"
+    ):
         read_flight_log(bag2(tmp_path / "two", PX4_ODOMETRY, two))
 
 

@@ -102,7 +102,7 @@ def test_unwritable_recording_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"must end with \.mcap or \.rrd"):
         check_recording(tmp_path / "flight.bag")
     pytest.importorskip("rosbags")
-    with pytest.raises(ConfigError, match="nothing can be written in"):
+    with pytest.raises(ConfigError, match="files cannot be written to"):
         check_recording(tmp_path / "nowhere" / "flight.mcap")
     check_recording(None)
     check_recording(tmp_path / "flight.mcap")

@@ -147,7 +147,7 @@ def test_with_another_key_or_none_nothing_takes_off_and_both_ends_say_why(
 @pytest.mark.parametrize(
     ("addresses", "why"),
     [
-        (["zenoh:h:1", "zenoh:h:1"], "address zenoh:h:1 is there twice"),
+        (["zenoh:h:1", "zenoh:h:1"], "address zenoh:h:1 is listed twice"),
         (["ros:h:1/a", "ros:g:1/b"], "vehicles at several rosmasters"),
         (["zenoh:127.0.0.1:1", "zenoh:10.0.0.5:1"], "zenoh:10.0.0.5:1: learners beyond this machine need a shared key"),
     ],

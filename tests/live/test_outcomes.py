@@ -152,7 +152,7 @@ def test_a_folder_that_is_gone_is_made_again_with_all_that_was_flown_and_learnt(
     loss = (lambda: shutil.rmtree(out)) if how == "removed" else (lambda: out.rename(f"{out}-elsewhere"))
     code, text = fly_once(folder, out.name, lambda process: loss(), seed)
     assert code == 0, text
-    assert f"log: {out.name}/flight.csv: No such file or directory; the log is written anew" in text
+    assert f"log: {out.name}/flight.csv: No such file or directory; the log is written again" in text
     result = results(out)
     assert (result["ended"], result["faults"]) == ("landed", [])
     assert len(whole(out / "flight.csv")) > 50 * SECONDS - 25
@@ -201,7 +201,7 @@ def test_a_full_disk_loses_nothing(folder, small_disk, seed):
     code, text = fly_once(folder, small_disk.name, lambda process: fill(small_disk), seed)
     assert code == 1, text
     place = elsewhere(text, "the learner state", full)
-    assert f"retrim: {small_disk.name}/flight.csv: {full}; the log goes on in {place}/flight.csv" in text
+    assert f"retrim: {small_disk.name}/flight.csv: {full}; the log continues in {place}/flight.csv" in text
     result = results(elsewhere(text, "results.json", full))
     assert result["ended"] == "landed"
     assert len(result["faults"]) >= 4

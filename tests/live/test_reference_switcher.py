@@ -200,7 +200,7 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(setups, tmp_path):
     )  # fmt: skip
     assert result.computed_from <= time.monotonic() - supervisor.epoch
     assert poll_requests(follows, supervisor, lambda: len(follows.pieces) > 1, 1) == [
-        "reference: it goes over to figure8", "asked: reference star",
+        "reference: transition tofigure8", "asked: reference star",
     ]  # fmt: skip
     assert follows.name == last_note(bus, "followed")["name"] == "figure8"
     at, table = follows.pieces[-1]

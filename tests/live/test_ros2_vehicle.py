@@ -190,7 +190,7 @@ def test_a_vehicle_that_is_killed_ends_the_flight_and_its_successor_is_left_alon
         process.send_signal(signal.SIGKILL)
         text = output_of(flight, fails=True)
     _, rows = find(tmp_path)
-    assert "plant lost: no state has come for 1.5 s; who else flies the vehicle has it back" in text
+    assert "plant lost: no state has come for 1.5 s; the other pilot has control again" in text
     assert rows[-1, 1] < 12.0
     with vehicle("cyclonedds", "mavros") as (_, address):  # which is found although the killed one is still listed
         text = output_of(fly(policy, address, tmp_path / "again", seconds=5))

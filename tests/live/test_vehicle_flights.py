@@ -132,7 +132,7 @@ def test_an_interrupt_on_the_ground_leaves_it_there(alone):
 
 def test_a_fleet_of_vehicles_is_refused():
     preset = load("hover/retrim")
-    with pytest.raises(ConfigError, match="flown by itself, by `retrim live`"):
+    with pytest.raises(ConfigError, match="use `retrim live`"):
         Fleet(preset, {0: None}, [Scenario(plant="mavlink")])
 
 

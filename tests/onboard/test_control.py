@@ -240,7 +240,7 @@ def test_policy_age_is_that_of_active_policy():
     flight.step(120)
     assert flight.status["given_up"] == [1]
     assert flight.loop.mode != Mode.POLICY  # the active policy is as old as the flight
-    assert "the policy was learnt" in flight.status["reason"]
+    assert "the policy was learned" in flight.status["reason"]
     late = Flight(holding())
     late.step(10)
     message = Parameters("policy", 1, late.loop.plan.controller.base, 1e9, {"gains": np.ones(2)}, 0)

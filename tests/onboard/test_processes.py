@@ -341,7 +341,7 @@ def test_log_on_full_disk_continues_in_first_temporary_folder_with_space(tmp_pat
     assert recorder.step() == 15
     np.testing.assert_array_equal(read_log(path)[:, 0], np.arange(10))  # no incomplete lines
     np.testing.assert_array_equal(read_log(log_path(path, spare))[:, 0], np.arange(25))
-    assert recorder.notice == f"{path}: No space left on device; the log goes on in {tmp_path}/spare/flight.csv"
+    assert recorder.notice == f"{path}: No space left on device; the log continues in {tmp_path}/spare/flight.csv"
 
 
 def test_lifeline_reports_immediately():

@@ -254,7 +254,7 @@ def test_resumable_command_has_fixed_folder():
     assert len(folders) == 2 * len(quick.GO_ON) - 1  # the command for all tables has one folder for quick runs
     assert str(quick.folder_of(tables.everything)) == "runs/reproduce-all"
     assert quick.folder_of(tables.design) is None
-    assert "runs/reproduce-hover, where the command goes on by default" in quick.help_of(tables.hover)
+    assert "runs/reproduce-hover, where the command resumes by default" in quick.help_of(tables.hover)
 
 
 def test_quick_options_of_every_table_exist():

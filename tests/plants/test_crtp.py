@@ -81,10 +81,10 @@ def test_large_block_is_appended_to():
 @pytest.mark.parametrize(
     ("what", "why"),
     [
-        (lambda: crtp.unpack(b""), "0 bytes are no packet"),
-        (lambda: crtp.unpack(bytes(32)), "32 bytes are no packet"),
-        (lambda: crtp.state_of(bytes(21)), "21 bytes are no state"),
-        (lambda: crtp.status_of(bytes(9)), "9 bytes are no status"),
+        (lambda: crtp.unpack(b""), "0 bytes are not a packet"),
+        (lambda: crtp.unpack(bytes(32)), "32 bytes are not a packet"),
+        (lambda: crtp.state_of(bytes(21)), "21 bytes are not a state"),
+        (lambda: crtp.status_of(bytes(9)), "9 bytes are not a status"),
         (lambda: crtp.status_of(struct.pack("<fHf", np.nan, 0, 4.0)), "not finite"),
         (lambda: crtp.attitude_of(0x3FFFFFFF), "largest element is not"),
     ],

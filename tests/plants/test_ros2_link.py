@@ -342,7 +342,9 @@ def test_available_vehicle_is_connected(connects, periodic, talker):
 
 
 def test_missing_vehicle_is_reported(connects):
-    with pytest.raises(PlantError, match=r"no state came on /mavros/local_position/odom or /mavros/.*pose in 0\.4 s"):
+    with pytest.raises(
+        PlantError, match=r"no state arrived on /mavros/local_position/odom or /mavros/.*pose in 0\.4 s"
+    ):
         connects("mavros")
 
 
@@ -372,7 +374,7 @@ def test_connection_to_firmware_of_other_release_is_refused(connects, periodic, 
 
 def test_setpoints_without_subscriber_are_refused(connects, periodic):
     periodic(vehicle)
-    with pytest.raises(PlantError, match="no node listens to /fmu/in/vehicle_rates_setpoint, /fmu/in/offboard"):
+    with pytest.raises(PlantError, match="no node subscribes to /fmu/in/vehicle_rates_setpoint, /fmu/in/offboard"):
         connects("px4")
 
 

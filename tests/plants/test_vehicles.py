@@ -110,7 +110,7 @@ def test_port_in_use_is_reported():
     pytest.importorskip("pymavlink")
     plant, other = link(PORT + 2), mavlink.open_endpoint(f"udp:127.0.0.1:{PORT + 2}")
     try:
-        with pytest.raises(PlantError, match="cannot be listened on"):
+        with pytest.raises(PlantError, match="cannot be opened"):
             plant.connect()
     finally:
         other.close()
@@ -144,7 +144,7 @@ def test_plant_in_lockstep_is_not_a_vehicle(plant):
 @pytest.mark.parametrize(
     ("calls", "why"),
     [
-        ({"disturbance": "large"}, "a vehicle, whose world nobody can disturb by name"),
+        ({"disturbance": "large"}, "a vehicle, which cannot be disturbed by name"),
         ({"sensors": "rough"}, "sensors 'rough' need bem, simple or second-order"),
         ({"thrust_error": 0.1}, "its own thrust map"),
         ({"delay": 0.05}, "its own command delay"),
@@ -170,7 +170,7 @@ def test_wrong_rosmaster_is_refused_before_flight(address):
 
 
 def test_crazyflie_on_serial_line_is_refused():
-    with pytest.raises(ConfigError, match="a Crazyflie is reached by udp:HOST:PORT"):
+    with pytest.raises(ConfigError, match="a Crazyflie needs udp:HOST:PORT"):
         Scenario(plant="crazyflie:serial:/dev/ttyACM0:921600")
 
 

@@ -97,7 +97,7 @@ def test_too_short_log_is_refused_with_remedy(log):
     [
         ({"buffer": 0.0}, "--buffer 0"),
         ({"delay": 2.0}, "--delay 2"),
-        ({"adapt": "full"}, "--adapt and --policy go together"),
+        ({"adapt": "full"}, "--adapt and --policy need each other"),
         ({"adapt": "base"}, "must be full, lora or none"),
         ({"updates": 0}, "--updates 0"),
     ],

@@ -126,5 +126,5 @@ def test_ros_variables_configure_cyclone(monkeypatch):
     assert 'name="lo"' not in configuration()
     assert '<Peer address="10.0.0.7"/><Peer address="quad1.local"/>' in configuration()
     monkeypatch.setenv("ROS_STATIC_PEERS", '"/><x')
-    with pytest.raises(ConfigError, match="is no address of a machine"):
+    with pytest.raises(ConfigError, match="is not an address of a machine"):
         configuration()

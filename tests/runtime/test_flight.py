@@ -246,7 +246,7 @@ def test_stop_token_ends_flight_and_stops_plant():
             stop.set()
         return Command.hover()
 
-    with pytest.raises(FlightStopped, match="given up"):
+    with pytest.raises(FlightStopped, match="aborted"):
         fly(plant, FunctionPilot(until_the_third), START, ticks=50, observers=[witness], stop=stop)
     assert plant.stops == 1
     assert len(plant.commands) == 3

@@ -401,7 +401,7 @@ EXPECTED = r"t \[s\], x, y, z \[m\] and, if wanted, yaw \[rad\]"
         ("# t x y z q\n0 0 0 1 0\n", "line 1: column 'q' is not known"),
         ("t,x,y\n0,0,0\n", rf"line 1: no column z; {EXPECTED}"),
         ("x,y\n0,0\n", "line 1: no column t, z"),
-        ("t,time,x,y,z\n0,0,0,0,1\n", "line 1: column 't' is there twice"),
+        ("t,time,x,y,z\n0,0,0,0,1\n", "line 1: column 't' appears twice"),
         ("t [ms],x,y,z\n0,0,0,1\n", r"line 1: column 't \[ms\]': t is expected in s, not in ms"),
         ("t,x [cm],y,z\n0,0,0,1\n", "x is expected in m, not in cm"),
         ("t,x,y,z,yaw (deg)\n0,0,0,1,0\n", "yaw is expected in rad, not in deg"),
@@ -425,7 +425,7 @@ EXPECTED = r"t \[s\], x, y, z \[m\] and, if wanted, yaw \[rad\]"
         ("0,0,0,1\n1,1200,0,1\n", "line 2: x = 1200 m is beyond 1000 m; are the positions in m"),
         ("0,0,0,1\n1,0,0,1e300\n", r"line 2: z = 1e\+300 m is beyond 1000 m"),
         ("0,0,0,1,0\n1,0,0,1,90\n", "line 2: yaw = 90 looks like degrees; radians between -2 pi and 2 pi"),
-        ("# start\n0,0,0,1\n0.02,3,0,1\n", "line 3: 3 m in 0.02 s after the point before, 150 m/s; are the"),
+        ("# start\n0,0,0,1\n0.02,3,0,1\n", "line 3: 3 m in 0.02 s after the previous point, 150 m/s; are the"),
         # points
         ("t,x,y,z\n0,0,0,1\n", "1 points; a trajectory needs at least two"),
         ("", "0 points"),

@@ -76,5 +76,5 @@ def test_foreign_folders_remain(tmp_path):
 def test_removed_bus_cannot_be_joined(tmp_path):
     bus = SharedMemoryBus.create({"sample": 4096})
     bus.remove()
-    with pytest.raises(MessageError, match="no bus there"):
+    with pytest.raises(MessageError, match="there is no bus"):
         SharedMemoryBus(bus.folder)

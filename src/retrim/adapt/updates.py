@@ -154,7 +154,7 @@ def _field(name: str, value: Any, kind: Any) -> Any:
     if kind is float:
         # A policy may replace one whose cost was not finite.
         if type(value) not in (int, float) or not (math.isfinite(value) or name == "incumbent_cost"):
-            raise ValueError(f"{name} = {value!r} is no finite number")
+            raise ValueError(f"{name} = {value!r} is not a finite number")
         return float(value)
     if kind is Counts:
         if type(value) is not list or len(value) != len(REASONS) or any(type(n) is not int or n < 0 for n in value):

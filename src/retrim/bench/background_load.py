@@ -43,12 +43,12 @@ def policies() -> dict[str, Any]:
         jax.block_until_ready(jax.tree.leaves(one()))
         compile_s = time.perf_counter() - began
         if flight.stdin is None or flight.stdout is None or not flight.stdout.readline():
-            raise OSError("the flight beside did not begin")
+            raise OSError("the parallel flight did not begin")
         row = time_runs(compile_s, one, POLICIES)
         flight.stdin.close()
         line = flight.stdout.readline()
     if not line:
-        raise OSError("the flight beside did not go on")
+        raise OSError("the parallel flight did not continue")
     report = json.loads(line)
     rate = f"{1.0 / row['run_s']:.0f} policies a second; {report['late']} of {report['ticks']} ticks beside ended late"
     remarks = f"{rate}, a tick took {1000 * report['tick_s']:.1f} ms"

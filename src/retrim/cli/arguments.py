@@ -45,7 +45,7 @@ def load_inputs(
         raise ConfigError("give either --policy FILE or --resume FILE; `retrim pretrain hover --out h` makes h")
     if resume is not None:
         if delta is not None:
-            raise ConfigError("--delta goes with --policy; --resume holds its own")
+            raise ConfigError("--delta needs --policy; --resume contains its own")
         state, preset = load_learner_state(resume, trust=trust)
         return state.policy.policy.merged(), preset, state
     assert policy is not None
@@ -132,7 +132,7 @@ def with_residual(preset: Preset, residual: str | None, state: LearnerState | No
     if residual is None:
         return preset
     if state is not None:
-        raise ConfigError(f"--residual {residual}: a resumed flight goes on with its own residual")
+        raise ConfigError(f"--residual {residual}: a resumed flight keeps its own residual")
     return changed(preset, adapt={"residual": residual})
 
 
@@ -148,14 +148,14 @@ def reference_of_flight(preset: Preset, name: str | None) -> str | None:
     """
     if preset.track is None:
         if name is not None:
-            raise ConfigError(f"--reference {name}: a {preset.task} policy follows none")
+            raise ConfigError(f"--reference {name}: a {preset.task} policy follows no reference")
         return None
     training_reference = preset.track.reference
     if name is None and "+" in training_reference:
-        raise ConfigError(f"the policy was trained on {training_reference}: say which to fly, as --reference circle")
+        raise ConfigError(f"the policy was trained on {training_reference}: choose one, as in --reference circle")
     if name is not None and name != training_reference and preset.track.observation == "blind":
         raise ConfigError(
-            f"--reference {name}: this policy does not see its reference, and was trained on {training_reference}"
+            f"--reference {name}: this policy does not observe its reference, and was trained on {training_reference}"
         )
     return name or training_reference
 
@@ -217,7 +217,7 @@ def training_preset(
         base = overlaid(base, config, trust=trust)
     if reference is not None:
         if not entry.has_reference:
-            raise ConfigError(f"--reference {reference}: a {task} policy follows none")
+            raise ConfigError(f"--reference {reference}: a {task} policy follows no reference")
         base = changed(base, track={**_table(base.track), "reference": reference})
     base = changed(base, pretrain={name: value for name, value in pretrain.items() if value is not None})
     if residual is not None:

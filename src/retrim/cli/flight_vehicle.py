@@ -22,9 +22,9 @@ def check_vehicle_file(path: Path | None) -> None:
     if path is None:
         return
     if path.suffix != ".toml":
-        raise ConfigError(f"--save-vehicle {path}: a vehicle file must end in .toml")
+        raise ConfigError(f"--save-vehicle {path}: the name of a vehicle file must end with .toml")
     if not path.absolute().parent.is_dir():
-        raise ConfigError(f"--save-vehicle {path}: folder {path.absolute().parent} does not exist; make it first")
+        raise ConfigError(f"--save-vehicle {path}: folder {path.absolute().parent} does not exist; create it first")
 
 
 def save_flight_vehicle(flight: Flight, setup: Setup, path: Path | None) -> tuple[list[Path], int]:

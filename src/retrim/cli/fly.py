@@ -69,7 +69,7 @@ def fly(
         check_vehicle_file(save_vehicle)
         if flight.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
-                raise ConfigError("a vehicle is flown live: without --delta, --config, --starts and --latency")
+                raise ConfigError("a vehicle flies live, without --delta, --config, --starts and --latency")
             from .live import live  # imported here, because other flights do not need it
 
             return live(

@@ -109,7 +109,7 @@ def live(
         if weights is None:
             weights, losses = train(Setup.from_preset(base), seed, reporter=RichReporter(), stop=stop)
             if run.interrupted:
-                console.print(f"interrupted while pretraining, after {len(losses)} steps; nothing has flown")
+                console.print(f"interrupted while pretraining, after {len(losses)} steps; the flight did not start")
                 return INTERRUPTED
         memory, state = recall_flight(flight.memory, setup, scenario, weights, state, adapt, seed, RichReporter().say)
         request = LiveRequest(

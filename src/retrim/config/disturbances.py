@@ -48,7 +48,7 @@ def disturbance(names: str, seed: int = 0) -> Disturbance:
         except (TypeError, ValueError) as error:
             raise ConfigError(f"disturbance {part!r}: {error}") from error
         if not callable(result):
-            raise ConfigError(f"disturbance {part!r} gives a {type(result).__name__}, expected a retrim.Disturbance")
+            raise ConfigError(f"disturbance {part!r} returns {type(result).__name__}, expected a retrim.Disturbance")
         parts.append(result)
     return parts[0] if len(parts) == 1 else SumOfDisturbances(tuple(parts))
 

@@ -116,7 +116,7 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
     family = make_family(preset)
     if family is None:
         raise ConfigError(
-            f"preset {preset.name!r} is for one vehicle, and its policy has no use for an identified one: use a preset "
+            f"preset {preset.name!r} is for one vehicle, and its policy does not use an identified one: use a preset "
             "with a table [family], such as hover/any"
         )
     prior = prior_belief(preset, family)

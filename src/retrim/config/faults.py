@@ -49,7 +49,7 @@ def measurement_fault(name: str) -> AbstractMeasurementFault | None:
     except (TypeError, ValueError) as error:
         raise error if isinstance(error, ConfigError) else ConfigError(f"fault {name!r}: {error}") from error
     if fault is not None and not isinstance(fault, AbstractMeasurementFault):
-        raise ConfigError(f"fault {name!r} gives a {type(fault).__name__}, expected an AbstractMeasurementFault")
+        raise ConfigError(f"fault {name!r} returns {type(fault).__name__}, expected an AbstractMeasurementFault")
     return fault
 
 

@@ -166,7 +166,7 @@ def adapted_flight(
     """Return the controller of an adapting policy, with the policy's observation and in the preset's frame.
 
     In the frame of effective gravity, a monitor reverts learned parameters that make the flight worse. If the preset
-    says so, the reference of a flight in laps is shifted against the error that repeats.
+    specifies this, the reference of a flight in laps is shifted against the repeating error.
 
     Args:
         preset: Preset of the policy.

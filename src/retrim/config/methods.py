@@ -76,8 +76,8 @@ class MethodRequest:
         if not observation.measures_state:
             method = name or type(controller).__name__
             raise ConfigError(
-                f"method {method!r} needs the state, and preset {self.setup.preset.name!r} shows keypoints, from which "
-                "only a pose filter gives one: set [vision] occlusion = true"
+                f"method {method!r} needs the state, and preset {self.setup.preset.name!r} observes keypoints, "
+                "from which only a pose filter gives one: set [vision] occlusion = true"
             )
         return controller
 
@@ -156,7 +156,9 @@ def _base(request: MethodRequest) -> Pilot:
 
 def _integral(request: MethodRequest) -> Pilot:
     if not request.setup.env.task.observation.measures_state:
-        raise ConfigError("method 'base-i' shifts the measured position; a policy that sees keypoints is shown none")
+        raise ConfigError(
+            "method 'base-i' shifts the measured position; a policy that observes keypoints receives none"
+        )
     integral = IntegralAction(
         request.controller(), request.setup.flight_task, gain=jnp.array(0.8), limit=jnp.array(2.0)
     )

@@ -56,7 +56,7 @@ def make_policy(request: NetworkRequest) -> AbstractPolicy:
     if isinstance(network, AbstractPolicy):
         return network
     if not (isinstance(network, eqx.Module) and callable(network)):
-        raise ConfigError(f"network {name!r} gives a {type(network).__name__}, expected a callable equinox.Module")
+        raise ConfigError(f"network {name!r} returns {type(network).__name__}, expected a callable equinox.Module")
     observation = jax.ShapeDtypeStruct((request.size,), jnp.zeros(()).dtype)
     try:
         shape = jnp.shape(eqx.filter_eval_shape(network, observation))

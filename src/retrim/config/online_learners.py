@@ -69,7 +69,7 @@ def make_learner(request: LearnerRequest) -> OnlineLearner:
     name = request.preset.adapt.learner
     learner = LEARNERS.find(name)(request)
     if not isinstance(learner, OnlineLearner):
-        raise ConfigError(f"learner {name!r} gives a {type(learner).__name__}, expected a retrim.OnlineLearner")
+        raise ConfigError(f"learner {name!r} returns {type(learner).__name__}, expected a retrim.OnlineLearner")
     return learner
 
 

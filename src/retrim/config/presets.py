@@ -235,9 +235,11 @@ class Preset:
                     f"{self.family.delay[1]:g} s, that is {math.ceil(self.family.delay[1] / self.dt - 1e-6)} ticks"
                 )
         if self.adapt.trim == "rest" and self.adapt.frame == "world":
-            raise ValueError("adapt.trim = 'rest' needs adapt.frame = 'gravity': a push is part of hover there only")
+            raise ValueError(
+                "adapt.trim = 'rest' needs adapt.frame = 'gravity': only in that frame is a push part of hover"
+            )
         if self.options and self.task in BUILT_IN_TASKS:
-            raise ValueError(f"a table [options] is for a task of one's own, not for {self.task!r}")
+            raise ValueError(f"a table [options] is for a custom task, not for {self.task!r}")
         if abs(1000 * self.dt - round(1000 * self.dt)) > 1e-6:
             raise ValueError(f"dt = {self.dt} s must be a whole number of milliseconds")
         if self.adapt.window < self.plant_delay_ticks + 12:

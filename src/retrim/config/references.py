@@ -24,7 +24,7 @@ from .registry import Registry
 REFERENCES: Registry[Callable[[], Reference]] = Registry(
     "reference",
     example="a CSV file of t, x, y, z, as my.csv or my.csv:once, or module:name",
-    expected="a function that gives a Reference",
+    expected="a function that returns a Reference",
 )
 for _name, _make in BUILT_IN.items():
     REFERENCES.register(_name, _make)
@@ -117,7 +117,9 @@ def _one_reference(name: str) -> Reference:
     except (TypeError, ValueError) as error:
         raise error if isinstance(error, ConfigError) else ConfigError(f"reference {name}: {error}") from error
     if not isinstance(reference, Reference):
-        raise ConfigError(f"reference {name!r} is a {type(reference).__name__}, not a function that gives a Reference")
+        raise ConfigError(
+            f"reference {name!r} is a {type(reference).__name__}, not a function that returns a Reference"
+        )
     return reference
 
 
@@ -127,5 +129,5 @@ def _speed(name: str, text: str) -> float:
     except ValueError:
         speed = math.nan
     if not 0.1 <= speed <= FASTEST:
-        raise ConfigError(f"reference {name!r}: {text!r} is no top speed of 0.1 to {FASTEST:g} m/s, and not max")
+        raise ConfigError(f"reference {name!r}: {text!r} is not a top speed of 0.1 to {FASTEST:g} m/s, and not max")
     return speed

@@ -109,7 +109,7 @@ class Registry(Mapping[str, T], Generic[T]):
         if not name or any(sign in name for sign in ":+= \t\n"):
             raise ConfigError(f"{self._kind} name {name!r} must not be empty nor contain ':', '+', '=' or spaces")
         if name in self:
-            raise ConfigError(f"there is a {self._kind} {name!r} already")
+            raise ConfigError(f"{self._kind} {name!r} is already registered")
 
     def _checked(self, name: str, thing: Any) -> T:
         if not self._accepts(thing):
@@ -120,7 +120,7 @@ class Registry(Mapping[str, T], Generic[T]):
     def _import(self, name: str) -> Any:
         module, _, attribute = name.partition(":")
         if not (all(part.isidentifier() for part in module.split(".")) and attribute.isidentifier()):
-            raise ConfigError(f"no {self._kind} {excerpt(name)}; a Python name is as module:name")
+            raise ConfigError(f"no {self._kind} {excerpt(name)}; a Python name has the form module:name")
         here = str(Path.cwd())
         if here not in sys.path:
             sys.path.append(here)

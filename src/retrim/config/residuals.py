@@ -46,7 +46,7 @@ def make_residual(request: ResidualRequest) -> ResidualModel:
     result = RESIDUALS.find(name)
     model = result if isinstance(result, ResidualModel) and not isinstance(result, type) else result(request)
     if not isinstance(model, ResidualModel):
-        raise ConfigError(f"residual {name!r} gives a {type(model).__name__} without init, fit and predict")
+        raise ConfigError(f"residual {name!r} returns {type(model).__name__} without init, fit and predict")
     return model
 
 
@@ -76,7 +76,7 @@ def _make_layered(request: ResidualRequest) -> ResidualModel:
     p, least = request.preset, BLOCK * request.preset.dt
     if p.adapt.fit_every < least:
         raise ConfigError(
-            f"adapt.residual = 'layered' is judged by the {BLOCK} newest ticks, which it must not have seen: "
+            f"adapt.residual = 'layered' is evaluated on the {BLOCK} newest ticks, outside its fits: "
             f"adapt.fit_every = {p.adapt.fit_every:g} s must be at least {least:g} s"
         )
     return LayeredModel(_regression(request), _ensemble(request, SMALL))

@@ -53,7 +53,7 @@ class Scenario:
             entry.check_address(find_plant(self.plant)[1])
         if entry.is_vehicle and not entry.has_world and self.disturbance != "none":
             raise ConfigError(
-                f"plant {self.plant!r} is a vehicle, whose world nobody can disturb by name: disturbance "
+                f"plant {self.plant!r} is a vehicle, which cannot be disturbed by name: disturbance "
                 f"{self.disturbance!r} must be none"
             )
         if has_state and not entry.has_disturbance_state:
@@ -78,7 +78,7 @@ class Scenario:
             )
         if self.delay != DELAY and not entry.has_delay:
             raise ConfigError(
-                f"plant {self.plant!r} has its own command delay; another one needs bem, simple or second-order"
+                f"plant {self.plant!r} has its own command delay; a different one needs bem, simple or second-order"
             )
         if not 0.0 <= self.delay <= LONGEST_DELAY:
             raise ConfigError(f"delay {self.delay} s must be 0 to {LONGEST_DELAY:g} s")
@@ -160,5 +160,5 @@ class Scenario:
                 f"plant {self.plant!r} with sensors {self.sensors!r} at dt = {dt:g} s: {error}"
             ) from error
         if not isinstance(plant, Plant):
-            raise ConfigError(f"plant {self.plant!r} gives a {type(plant).__name__}, expected a retrim.Plant")
+            raise ConfigError(f"plant {self.plant!r} returns {type(plant).__name__}, expected a retrim.Plant")
         return plant

@@ -100,7 +100,7 @@ class Setup:
         preset = load(preset) if isinstance(preset, str) else preset
         preset, entry = with_delay(preset), find_task(preset.task)
         if reference is not None and not entry.has_reference:
-            raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows none")
+            raise ConfigError(f"reference {reference!r}: a {preset.task} policy follows no reference")
         NETWORKS.find(preset.pretrain.network)
         vehicle = make_vehicle(preset.vehicle)
         table = preset.track or TrackTable()

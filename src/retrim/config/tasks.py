@@ -143,7 +143,7 @@ def make_task(request: TaskRequest) -> AbstractTask:
     name = request.preset.task
     task = find_task(name).make(request)
     if not isinstance(task, AbstractTask):
-        raise ConfigError(f"task {name!r} gives a {type(task).__name__}, expected a retrim.AbstractTask")
+        raise ConfigError(f"task {name!r} returns {type(task).__name__}, expected a retrim.AbstractTask")
     return task
 
 

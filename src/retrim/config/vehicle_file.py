@@ -71,8 +71,8 @@ class VehicleSpec:
         weight, thrust = self.mass * STANDARD_GRAVITY, self.thrust_max
         if thrust <= 1.2 * weight:
             raise ValueError(
-                f"thrust_max = {thrust} N must exceed 1.2 times the weight of {weight:.2f} N, or nothing is "
-                f"left to steer with{likely(self._thrust_units(), *ENOUGH)}"
+                f"thrust_max = {thrust} N must exceed 1.2 times the weight of {weight:.2f} N, or no "
+                f"thrust is left for control{likely(self._thrust_units(), *ENOUGH)}"
             )
         if thrust < ENOUGH[0] * weight:
             raise ValueError(
@@ -103,7 +103,7 @@ class VehicleSpec:
         if a < 0.01 * self.mass * reach**2:
             raise ValueError(
                 f"inertia = {self.inertia} kg m^2 is too small for {self.mass} kg with rotors {reach:.3g} m from the "
-                f"centre, which have {0.2 * self.mass * reach**2:.2g} or so; is it in kg m^2, and arm in m?"
+                f"centre, which have about {0.2 * self.mass * reach**2:.2g}; is it in kg m^2, and arm in m?"
             )
         apart = 2.0 * min(self.arm) / INCH
         if self.propeller_diameter is not None and not 0.3 * apart <= self.propeller_diameter <= 1.3 * apart:
@@ -115,7 +115,7 @@ class VehicleSpec:
         if self.drag_area is not None and max(self.drag_area) > 20.0 * usual:
             raise ValueError(
                 f"drag_area = {self.drag_area} m^2 is too large for rotors {reach:.3g} m from the centre, which have "
-                f"{usual:.2g} or so; is it in cm^2?"
+                f"about {usual:.2g}; is it in cm^2?"
             )
         return self
 

@@ -58,7 +58,7 @@ def make_vehicle(vehicle: str | VehicleSpec | Vehicle) -> Vehicle:
         ) from error
     if not isinstance(built_vehicle, Vehicle):
         raise ConfigError(
-            f"vehicle {name_of(vehicle)!r} gives a {type(built_vehicle).__name__}, expected a retrim.Vehicle"
+            f"vehicle {name_of(vehicle)!r} returns {type(built_vehicle).__name__}, expected a retrim.Vehicle"
         )
     return built_vehicle
 

@@ -145,7 +145,7 @@ class AbstractController(eqx.Module, Generic[M]):
         Raises:
             FrameError: The controller does not support other frames.
         """
-        raise FrameError(f"{type(self).__name__} cannot be flown in another frame")
+        raise FrameError(f"{type(self).__name__} cannot be flown in a different frame")
 
 
 class PolicyController(AbstractController[tuple[Any, Command]]):

@@ -61,7 +61,7 @@ class Excitation(eqx.Module):
         if min(delay_margin, lag_margin, gain_margin) <= 0.0:
             raise ValueError(
                 f"Excitation: margins must be positive, got {delay_margin}, {lag_margin}, {gain_margin}; "
-                "set longest = 0 to switch it off"
+                "set longest = 0 to disable it"
             )
         pulse = jnp.array([0.12, 0.08, 0.08, 0.10])
         margins = (jnp.array(delay_margin), jnp.array(lag_margin), jnp.array(gain_margin))

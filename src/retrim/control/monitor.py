@@ -188,7 +188,7 @@ class Monitor(AbstractController[MonitorState]):
         dt, d_hat = self.frame.observer.nominal.dt, s.flight.observer.d_hat
         d = s.d + (dt / MEAN_TAU) * (d_hat - s.d)
         known = self._known_force(s, x)
-        # A small part of a large known force, which comes and goes on the path, is not a swing of its own.
+        # A small part of a large known force, which comes and goes on the path, is not a separate swing.
         swings = s.swings.after(d_hat / (1.0 + known / STANDARD_GRAVITY), dt)
         twin = self._step(s, t, x, jnp.minimum(known / STIFFNESS, ALLOWANCE))
         over = twin.ticks >= round(INTERVAL / dt)

@@ -16,7 +16,7 @@ from .latency import ahead
 
 
 class Underway(eqx.Module):
-    """Commands under way to a vehicle, and the state of its actuators."""
+    """Commands in transit to a vehicle, and the state of its actuators."""
 
     before: ActuatorState
     """State of the actuators at the beginning of the tick that has just ended."""

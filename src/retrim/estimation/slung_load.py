@@ -8,7 +8,7 @@ the unit vector from the vehicle to the load, a the measured acceleration, g gra
 
     q'' = (g - a - q q . (g - a)) / l - |q'|^2 q,       pull = share q max(q . (g - a) + l |q'|^2, 0),
 
-where ``share`` is the mass of the load as a share of the vehicle's. A slack cable is taken for one without pull, whose
+where ``share`` is the mass of the load as a share of the vehicle's. A slack cable is treated as one without pull whose
 load moves on a sphere. When measurements contradict the filter for several ticks, as after a pick-up or a release, the
 uncertainty returns to that of the start.
 """
@@ -197,7 +197,7 @@ class LoadEstimate(eqx.Module):
         share = counts * (1.0 - jnp.exp(-dt / SURPRISE_TAU))
         surprise, since = self.surprise + share * (jnp.sum(squares) - self.surprise), self.since + dt
         changed = (surprise > SURPRISE) & (since > PATIENCE)
-        # After a change, the load may be another one; the other causes of missed acceleration remain.
+        # After a change, the load may be a different one; the other causes of missed acceleration remain.
         start = LoadEstimate.start(P.dtype)
         is_new = jnp.array(OF_LOAD) & changed
         P = jnp.where(is_new[:, None] | is_new[None], start.P, 0.5 * (P + P.T))

@@ -49,7 +49,7 @@ class Cluster(Executor):
             socket.create_connection((place["host"], int(place["port"])), ANSWERS_S).close()
             self._client = distributed.Client(address, timeout=BACK_S, set_as_default=False, name="retrim")
         except (OSError, TimeoutError, ValueError, TypeError) as error:
-            raise ConfigError(f"--on {address}: no scheduler answers there ({_line(error)})") from error
+            raise ConfigError(f"--on {address}: no scheduler responds there ({_line(error)})") from error
         try:
             self._check()
         except BaseException:
@@ -113,7 +113,7 @@ class Cluster(Executor):
         try:
             self._client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError as error:
-            raise ConfigError(f"--on {self.address}: no worker came in {WORKERS_S:g} s") from error
+            raise ConfigError(f"--on {self.address}: no worker connected within {WORKERS_S:g} s") from error
         for worker, theirs in self._client.run(ours, on_error="return").items():
             if isinstance(theirs, BaseException):
                 raise ConfigError(f"worker {worker} does not have this retrim ({_line(theirs)})")
@@ -149,7 +149,7 @@ def check_alike(theirs: dict[str, str], who: str) -> None:
     """
     here = ours()
     if other := [f"{name} {theirs.get(name)}, here {here[name]}" for name in here if theirs.get(name) != here[name]]:
-        raise ConfigError(f"{who} has other versions: {'; '.join(other)}")
+        raise ConfigError(f"{who} has different versions: {'; '.join(other)}")
 
 
 def call(theirs: dict[str, str], fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

@@ -27,7 +27,7 @@ def likely_cause(log: Log, lateness: float) -> str | None:
 def _clock(log: Log, lateness: float) -> Iterator[str]:
     ticks = np.diff(log.t)
     if len(ticks) and np.all(ticks == 0.0):
-        yield "the plant's clock stands still: Measurement.t must grow with every tick"
+        yield "the plant's clock does not advance: Measurement.t must grow with every tick"
     elif len(ticks) and not 0.5 < np.median(ticks) / log.dt < 2.0:
         yield f"measurements are {np.median(ticks):.3g} s apart by the plant's clock, and its tick is {log.dt:g} s"
 
@@ -44,7 +44,7 @@ def _numbers(log: Log, lateness: float) -> Iterator[str]:
     off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max()
     if off > 0.05 or np.linalg.det(R).min() < 0.0:
         det = np.linalg.det(R).min()
-        yield f"the attitude is no rotation: R' R differs from 1 by {off:.2g}, and its determinant is {det:.2g}"
+        yield f"the attitude is not a rotation: R' R differs from 1 by {off:.2g}, and its determinant is {det:.2g}"
 
 
 def _motion(log: Log, lateness: float) -> Iterator[str]:

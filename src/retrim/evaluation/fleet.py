@@ -63,7 +63,7 @@ class Fleet:
             raise ConfigError(f"{len(scenarios)} scenarios by {len(methods)} methods: there is nothing to fly")
         check_flights(starts, seconds)
         if vehicles := sorted({s.plant for s in scenarios if s.entry.is_vehicle}):
-            raise ConfigError(f"plant {vehicles[0]!r} is a vehicle: it is flown by itself, by `retrim live`")
+            raise ConfigError(f"plant {vehicles[0]!r} is a vehicle: use `retrim live`")
         self.preset = preset
         self.policies: dict[int, Any] = dict(policies) if isinstance(policies, Mapping) else {0: policies}
         check_seeds(tuple(self.policies))

@@ -126,6 +126,8 @@ def fly_all(
             )
     if flights.failed:
         why = next(iter(flights.failed.values()))
-        raise JobError(f"{len(flights.failed)} of {len(fleet.specs)} flights failed elsewhere, the first by {why}")
+        raise JobError(
+            f"{len(flights.failed)} of {len(fleet.specs)} flights failed in other processes, the first with {why}"
+        )
     by_spec = earlier | {flight.spec: flight for flight in flights.flights}
     return replace(flights, flights=[by_spec[spec] for spec in fleet.specs if spec in by_spec])

@@ -164,7 +164,10 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], rows: "_FlightRows", run:
     if flights.failed:
         run.failed = True
         why = next(iter(flights.failed.values()))
-        reporter.say(f"{len(flights.failed)} flights failed elsewhere, the first by {why}; the same command flies them")
+        reporter.say(
+            f"{len(flights.failed)} flights failed in other processes, the first with {why}; "
+            "the same command flies them"
+        )
 
 
 class _FlightRows:

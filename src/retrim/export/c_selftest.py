@@ -1,7 +1,7 @@
 """Generate the self-test of an exported C header, which compares stored commands of the policy with computed ones.
 
 The test reads stored numbers through a volatile pointer, so that it examines the memory of the target and a compiler
-cannot compute the result in advance. It works on a memory of its own, and leaves the memory of a flight as it is.
+cannot compute the result in advance. It uses a separate memory, and leaves the memory of a flight unchanged.
 """
 
 import math

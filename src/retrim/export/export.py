@@ -82,7 +82,7 @@ def export(
         for each in paths:
             each.unlink(missing_ok=True)
         raise ConfigError(
-            f"{path}: {result.by} misses JAX by {result.worst:.1e} of the command range; nothing was kept"
+            f"{path}: {result.by} deviates from JAX by {result.worst:.1e} of the command range; the files were removed"
         )
     reporter.say(
         f"{result.by} and JAX: {result.worst:.1e} of the command range at most, on {len(rows)} observations; "

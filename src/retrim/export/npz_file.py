@@ -23,7 +23,7 @@ def write_npz(path: Path, policy: Portable) -> list[Path]:
     """
     runner, code = path.with_name(RUNNER), files(__package__).joinpath(RUNNER).read_bytes()
     if runner.exists() and (not runner.is_file() or runner.read_bytes() != code):
-        raise ConfigError(f"{runner} is there already, and is not the runner of this release: move it, or choose --out")
+        raise ConfigError(f"{runner} already exists, and is not the runner of this release: move it, or choose --out")
     about = {**policy.about, "layers": len(policy.layers), "observation": policy.observation}
     arrays = {f"w{i}": w for i, (w, _) in enumerate(policy.layers)} | {
         f"b{i}": b for i, (_, b) in enumerate(policy.layers)

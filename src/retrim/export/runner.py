@@ -41,7 +41,9 @@ class Runner:
         result = self.command(self._arrays["test_observations"])
         deviation = np.abs(result - self._arrays["test_commands"]) / (self._arrays["high"] - self._arrays["low"])
         if not deviation.max() <= TOLERANCE:
-            raise ValueError(f"{path}: its test vectors are missed by {deviation.max():.1e} of the command range")
+            raise ValueError(
+                f"{path}: its results deviate from the test vectors by {deviation.max():.1e} of the command range"
+            )
         if not self._survives_bad_numbers():
             raise ValueError(f"{path}: a number that is not finite changes more than the command of its tick")
         if delta is not None:
@@ -104,7 +106,7 @@ class Runner:
         """Return the observation of a state, after the last command of :meth:`step`."""
         observation = self.about["observation"]
         if observation is None:
-            raise ValueError("this policy does not see the state alone; call command() with its observation")
+            raise ValueError("this policy does not observe only the state; call command() with its observation")
         past = np.concatenate(
             [[self._last[0] / observation["gravity"] - 1.0], self._last[1:] / np.array(observation["rates_max"])]
         )
@@ -138,7 +140,7 @@ class Runner:
         about = json.loads(str(delta["about"]))
         if about["base"] != self.about["weights"]:
             raise ValueError(
-                f"{path}: made for another policy, {about['base'][:12]}..., not {self.about['weights'][:12]}..."
+                f"{path}: made for a different policy, {about['base'][:12]}..., not {self.about['weights'][:12]}..."
             )
         for i, (w, b) in enumerate(self._layers):
             self._layers[i] = (w + np.float32(about["scale"]) * (delta[f"up{i}"] @ delta[f"down{i}"]).T, b)

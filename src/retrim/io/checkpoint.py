@@ -57,7 +57,7 @@ def read_policy(
     data = read_bounded(file, "`retrim pretrain hover --out DIR` makes one")
     try:
         if wire.kind_of(data, source=str(file)) == "learnt":
-            raise CheckpointError(f"{file}: holds what a flight has learnt; go on from it with `retrim fly --resume`")
+            raise CheckpointError(f"{file}: holds a learner state; continue from it with `retrim fly --resume`")
         header = wire.describe(data, kind="policy", source=str(file))
         sizes, like = header.get("architecture", ""), None
         if sizes == NETWORK and network is not None:
@@ -138,7 +138,7 @@ def load_delta(path: str | Path, base: AbstractPolicy) -> LoraPolicy:
         if header.get("base") != fingerprint(base):
             base_name = header.get("base", "unnamed")[:12]
             raise CheckpointError(
-                f"{path}: made for another base policy, {base_name}..., not for {fingerprint(base)[:12]}..."
+                f"{path}: made for a different base policy, {base_name}..., not for {fingerprint(base)[:12]}..."
             )
         like = lora_like(base, header, source=str(path))
         delta, shift = wire.unpack(data, (like.delta, like.shift), kind="delta", source=str(path))

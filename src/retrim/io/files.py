@@ -85,7 +85,7 @@ def check_writable(folder: Path) -> None:
         probe.write_bytes(b"x" * 4096)
     except OSError as error:
         raise ConfigError(
-            f"{folder}: results cannot be written there ({error.strerror}); choose another --out"
+            f"{folder}: results cannot be written there ({error.strerror}); choose a different --out"
         ) from error
     finally:
         with contextlib.suppress(OSError):

@@ -30,7 +30,7 @@ def pretrain_encoder(
 ) -> tuple[Policy, Float[Array, " steps"]]:
     """Train the hidden layers of ``policy`` to predict [p, R, v]; the output layer is unchanged.
 
-    The optimiser is Adam with a cosine schedule from 1e-3. The layers are first redrawn at the usual scale (Glorot),
+    The optimiser is Adam with a cosine schedule from 1e-3. The layers are first reinitialised with Glorot scaling,
     since the weights of a fresh policy are small.
 
     Args:

@@ -82,6 +82,6 @@ def pretrain(
             if bad >= PATIENCE or (bad and steps == num_updates):
                 raise TrainingError(
                     f"training: the loss is not a number in steps {steps - bad + 1} to {steps} of {num_updates}, and "
-                    f"no policy is kept; look at the vehicle's limits, the reward and the learning rate"
+                    f"no policy is kept; check the vehicle's limits, the reward and the learning rate"
                 )
         yield state, losses

@@ -12,7 +12,7 @@ EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements; the 
 HUNG = f"hung: it said nothing for {SILENCE:g} s and was ended"
 WITHOUT = {
     "control": "the watchdog flies, holds and lands",
-    "plant": "nobody measures any more, and the flight is over",
+    "plant": "measurements have stopped, and the flight is over",
 }
 """Consequence for the flight if a process that cannot be restarted ends, by role."""
 WATCHDOG = "watchdog: the process that flew is gone or hangs, the watchdog flies the fallback"
@@ -46,11 +46,11 @@ class LiveEvents:
             if version > self._newest.get(half, 0):
                 self._newest[half] = version
                 self.swaps.append((at, half, version, age))
-                new.append(Event(at, half, f"version {version}, learnt from flight until {age:.2f} s before"))
+                new.append(Event(at, half, f"version {version}, learned from flight until {age:.2f} s before"))
         for version in control.get("given_up", []):
             if version not in self._withdrawals:
                 self._withdrawals.add(version)
-                new.append(Event(t, "guard", f"policy: version {version} is taken back, or comes from one that was"))
+                new.append(Event(t, "guard", f"policy: version {version} was rolled back, or comes from one that was"))
         changes = [(at, stage, cause) for at, stage, cause in control.get("stages", []) if at > self._last_stage]
         for at, stage, cause in changes:
             self._last_stage = at
@@ -76,7 +76,7 @@ class LiveEvents:
         self._knob_refusal = refusal
         if status.log_failed and not self._log_failed:
             self._log_failed = True
-            new.append(Event(t, "guard", f"log: the flight is no longer written down, {status.log_failed}"))
+            new.append(Event(t, "guard", f"log: the flight is no longer recorded, {status.log_failed}"))
         if status.log_moved != self._log_location:
             self._log_location = status.log_moved
             new.append(Event(t, "log", status.log_moved))
@@ -102,6 +102,6 @@ class LiveEvents:
             if again:
                 new.append(Event(status.t, "restarted", why))
             elif hangs:
-                new.append(Event(status.t, "guard", f"{why}; {WITHOUT.get(role, 'the flight goes on without it')}"))
+                new.append(Event(status.t, "guard", f"{why}; {WITHOUT.get(role, 'the flight continues without it')}"))
         self._hangs, self._restarts = dict(status.hangs), dict(status.restarts)
         return new

@@ -160,7 +160,7 @@ def _warm_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:
         for waiting, _ in supervisor.warm_up():
             advance(0.5, f"compiling; not ready: {waiting}")
             if run.interrupted:
-                reporter.say("interrupted before take-off; nothing has flown")
+                reporter.say("interrupted before take-off; the flight did not start")
                 return False
     for role, refusals in supervisor.refusals.items():
         for what in refusals:

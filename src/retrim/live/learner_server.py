@@ -249,9 +249,11 @@ def learn_for(
         Exception: The first failure, raised when the other flights are over.
     """
     if twice := [str(each) for i, each in enumerate(addresses) if each in addresses[:i]]:
-        raise ConfigError(f"address {twice[0]} is there twice; each vehicle has its own, or a key of its own")
+        raise ConfigError(f"address {twice[0]} is listed twice; each vehicle needs its own address or key")
     if len({(each.host, each.port) for each in addresses if each.kind == "ros"}) > 1:
-        raise ConfigError("vehicles at several rosmasters: a process of ROS 1 knows one; give them names at one master")
+        raise ConfigError(
+            "vehicles at several rosmasters: a process of ROS 1 supports one; give them names at one master"
+        )
     for each in addresses:
         each.check_shared()
     with ExitStack() as stack:

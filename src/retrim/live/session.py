@@ -118,16 +118,14 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         _check_remote(request)
     fault = measurement_fault(request.scenario.fault)
     if fault is not None and fault.interrupts:
-        raise ConfigError(
-            f"--fault {request.scenario.fault}: a live flight has a clock of its own; fly it by `retrim fly`"
-        )
+        raise ConfigError(f"--fault {request.scenario.fault}: a live flight has its own clock; use `retrim fly`")
     if window > MOST_TICKS:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
     start = request.folder / "start.safetensors"
     learns = find_method(request.method).learns is not None
     if find_method(request.method).on_board is not None:
         raise ConfigError(
-            f"method {request.method!r} commands the motors from on board; a live flight commands thrust and body rates"
+            f"method {request.method!r} commands the motors on board; a live flight commands thrust and body rates"
         )
     if learns:
         state = request.state or learner_state(request, request.policy, request.method)
@@ -190,7 +188,7 @@ def learners_at(text: str | None, say: Callable[[str], None], key: Path | None =
     if not address.loopback:
         networks = {"zenoh": address.host, "ros2": f"domain {address.port} of ROS 2"}
         where = networks.get(address.kind, "the network of its rosmaster")
-        say(f"warning: this machine listens on {where}; messages are signed, but anybody on the way can read them")
+        say(f"warning: this machine listens on {where}; messages are signed, but anyone on the network can read them")
     return address
 
 

@@ -104,11 +104,11 @@ class Supervisor:
         while waiting := self._not_ready():
             self._check_alive()
             if time.monotonic() - began > READY_S:
-                raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; nothing has flown")
+                raise PlantError(f"not ready after {READY_S:g} s: {', '.join(waiting)}; the flight did not start")
             yield ", ".join(waiting), time.monotonic() - began
             time.sleep(0.1)
         if failure := last_note(self.bus, "ready.recorder", "ready").get("failed"):
-            raise PlantError(f"the flight cannot be written down: {failure}")
+            raise PlantError(f"the log of the flight cannot be written: {failure}")
         for name in (name for name, role in ROLES.items() if role.priority):
             self.refusals[name] = last_note(self.bus, f"ready.{name}", "ready").get("refused", [])
         if last_note(self.bus, "ready.plant", "ready").get("stands"):

@@ -81,8 +81,8 @@ class ControlLoop:
         self._usual = float(np.median(took))
         if self._usual > ROOM * self.plan.dt:
             raise PlantError(
-                f"this controller takes {1e3 * self._usual:.0f} ms to decide, here and in NumPy, of a tick of "
-                f"{1e3 * self.plan.dt:.0f} ms, and {1e3 * ROOM * self.plan.dt:.1f} ms is the most"
+                f"a decision of this controller takes {1e3 * self._usual:.0f} ms here, in NumPy; in a tick of "
+                f"{1e3 * self.plan.dt:.0f} ms, at most {1e3 * ROOM * self.plan.dt:.1f} ms are allowed"
             )
 
     def tick(self, now: float, lateness: float = 0.0) -> Setpoint | None:
@@ -169,7 +169,7 @@ class ControlLoop:
             wrong = wrong or f"the newest measurement is {age:.3f} s old"
         wrong = wrong or limits.find_violation(sample.state) or ""
         if t - self.intake.data_time > limits.policy_age:
-            wrong = wrong or f"the policy was learnt {t - self.intake.data_time:.1f} s ago"
+            wrong = wrong or f"the policy was learned {t - self.intake.data_time:.1f} s ago"
         if not wrong and not new and len(self._command):
             return self._command
         if not wrong:

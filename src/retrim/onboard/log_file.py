@@ -55,7 +55,7 @@ class LogFile:
         """
         there, mine = os.stat(self.path), os.fstat(self._file)
         if (there.st_ino, there.st_dev) != (mine.st_ino, mine.st_dev):
-            raise FileNotFoundError(None, "another file has taken its place", str(self.path))
+            raise FileNotFoundError(None, "a different file has replaced it", str(self.path))
         try:
             left = memoryview(lines)
             while left:

@@ -211,7 +211,7 @@ class Parameters:
         kind = f"parameters of {half}"
         header = describe(data, kind=kind, source=half)
         if header.get("base") != base:
-            raise MessageError(f"{half}: parameters for another controller, {header.get('base', 'unnamed')!r}")
+            raise MessageError(f"{half}: parameters for a different controller, {header.get('base', 'unnamed')!r}")
         version, data_text = header.get("version", ""), header.get("computed_from", "")
         try:
             number, data_time, parent = int(version[:20]), float(data_text[:40]), int(header.get("parent", "")[:20])

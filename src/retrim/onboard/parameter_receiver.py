@@ -107,7 +107,7 @@ class ParameterReceiver:
         self.newest[parameters.half] = parameters.version
         if parameters.half == "policy" and {parameters.parent, parameters.version} & set(self.withdrawals):
             self.withdrawals.append(parameters.version)
-            self.refuse("trained from a policy that was taken back")
+            self.refuse("trained from a policy that was rolled back")
             return
         self.pilot.swap(parameters)
         if parameters.half == REFERENCE:

@@ -160,7 +160,7 @@ class LivePilot:
         self._policies = {v: leaves for v, leaves in self._policies.items() if v >= version}
 
     def back(self) -> list[int]:
-        """Roll back to the last proven policy; return the versions that were given up."""
+        """Roll back to the last proven policy; return the abandoned versions."""
         version = min(self._policies)
         withdrawals = sorted(v for v in self._policies if v > version)
         self._policies = {version: self._policies[version]}

@@ -117,7 +117,7 @@ class Recorder:
                     raise
                 self.close()
                 self._file = log_file
-                where = "is written anew" if path == self._paths[0] else f"goes on in {path}"
+                where = "is written again" if path == self._paths[0] else f"continues in {path}"
                 self.notice = f"{reason}; the log {where}"
                 break
         else:

@@ -114,7 +114,7 @@ class CommandQueue(eqx.Module):
 
 
 class PathState(eqx.Module):
-    """Commands under way, and the state of the actuators."""
+    """Commands in transit, and the state of the actuators."""
 
     queue: CommandQueue
     actuators: ActuatorState

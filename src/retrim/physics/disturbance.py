@@ -3,7 +3,7 @@
 This module contains pushes; see also the modules ``wind`` and ``faults``. Disturbances belong to the plant; the nominal
 model does not contain them. Their random numbers are drawn at construction, so a disturbance is repeatable.
 
-A disturbance may have a state of its own, such as that of a load on a cable (:class:`StatefulDisturbance`). The plant
+A disturbance may have its own state, such as that of a load on a cable (:class:`StatefulDisturbance`). The plant
 advances this state together with the vehicle, in the same substeps.
 """
 
@@ -32,7 +32,7 @@ class Disturbance(Protocol):
 
 @runtime_checkable
 class StatefulDisturbance(Disturbance, Protocol):
-    """Protocol of a disturbance with a state of its own. A call without it gives the effects of its state of rest."""
+    """Protocol of a disturbance with its own state. A call without it gives the effects of its state of rest."""
 
     def init(self, x: State, /) -> Any:
         """Return the state of the disturbance at the start of a flight in the state ``x``: a pytree of arrays."""
@@ -89,7 +89,7 @@ def parts_of(disturbance: Disturbance) -> tuple[Disturbance, ...]:
 
 
 def stateful_parts(disturbance: Disturbance) -> tuple[StatefulDisturbance, ...]:
-    """Return the parts of a disturbance that have a state of their own."""
+    """Return the parts of a disturbance that have their own state."""
     return tuple(part for part in parts_of(disturbance) if isinstance(part, StatefulDisturbance))
 
 
@@ -215,7 +215,9 @@ class RandomWalk(eqx.Module):
     def of(cls, rate: float, bound: float, *, key: Key[Array, ""], every: float = 0.1, n: int = 1200) -> "RandomWalk":
         """Draw a walk from zero with a standard deviation of ``rate`` [m/s^2] after one second, far from the bounds."""
         if not (bound > 0 and rate >= 0 and every > 0 and n >= 2):
-            raise ValueError(f"RandomWalk: rate = {rate}, bound = {bound}, every = {every}, n = {n} cannot be")
+            raise ValueError(
+                f"RandomWalk: rate = {rate}, bound = {bound}, every = {every}, n = {n} are not all possible"
+            )
         path = jnp.cumsum(rate * every**0.5 * random.normal(key, (n, 3)), axis=0)
         path = path - path[:1]
         return cls(bound - jnp.abs((path + bound) % (4.0 * bound) - 2.0 * bound), jnp.array(every))

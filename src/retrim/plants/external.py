@@ -79,7 +79,7 @@ class ExternalPlant(Plant, abc.ABC):
         times = self._ticks * self.dt + self._instants
         effects = jax.tree.map(np.asarray, effects_at(times, self._x, self._disturbance))
         if np.any(effects.moment != 0.0):
-            raise PlantError(f"{name}: cannot carry a load off its centre; the plants bem and simple can")
+            raise PlantError(f"{name}: cannot carry an off-centre load; the plants bem and simple can")
         after = self._advance(self._last_command, effects)
         dtype = self._x.p.dtype
         acceleration = (after.v - self._v) / self.dt  # in double precision: a difference in single has few digits
@@ -109,5 +109,5 @@ def whole_steps(dt: float, step: float) -> int:
     """Return the number of simulator steps in a tick; raise ``ValueError`` if it is not a whole number (times in s)."""
     steps = round(dt / step)
     if steps < 1 or abs(dt / step - steps) > 1e-6:
-        raise ValueError(f"a tick of {dt} s is no multiple of the simulator's step, {step} s")
+        raise ValueError(f"a tick of {dt} s is not a multiple of the simulator's step, {step} s")
     return steps

@@ -73,7 +73,8 @@ class Simulation(eqx.Module):
         check_delay(self.delay, self.longest_delay, "Simulation")
         if self.sensors is not None and round(self.model.dt / SUBSTEP) % self.sensors.period:
             raise ValueError(
-                f"SimPlant: a tick of {self.model.dt} s is no multiple of the {self.sensors.period} ms of SensorModel"
+                f"SimPlant: a tick of {self.model.dt} s is not a multiple of "
+                f"the {self.sensors.period} ms of SensorModel"
             )
 
     @property

@@ -92,7 +92,7 @@ def _fit(rows: Targets, setup: Setup, state: Any) -> Any:
         if bool(all_finite(new)):
             state, last_fit = new, last_fit + 1
     if not last_fit:
-        raise LogError(f"the log has no {a.window * dt:g} s of flight in one piece, which the learner's window takes")
+        raise LogError(f"the log has no {a.window * dt:g} s of flight in one piece, which the learner's window needs")
     return state
 
 

@@ -85,7 +85,7 @@ class Replay:
         if self.adapt != "none" and find_method(self.adapt).learns is None:
             raise ConfigError(f"--adapt {self.adapt}: must be {', '.join(learning_methods())} or none")
         if (self.adapt == "none") != (self.policy is None):
-            raise ConfigError("--adapt and --policy go together; `retrim pretrain hover --out h` makes a policy")
+            raise ConfigError("--adapt and --policy need each other; `retrim pretrain hover --out h` makes a policy")
         if self.flight is not None and self.flight < 1:
             raise ConfigError(f"--flight {self.flight}: flights are numbered from 1")
         if not 1 <= self.updates <= 10_000:

@@ -148,7 +148,7 @@ def configuration() -> str:
     peers += [peer.strip() for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer.strip()]
     for peer in peers:
         if not all(sign.isalnum() or sign in "-.:[]" for sign in peer):
-            raise ConfigError(f"ROS_STATIC_PEERS: {peer[:40]!r} is no address of a machine")
+            raise ConfigError(f"ROS_STATIC_PEERS: {peer[:40]!r} is not an address of a machine")
     if local:
         interfaces = '<NetworkInterface name="lo" multicast="true"/>'
     else:  # otherwise it would take any interface, which need not be the one that leads to the peers

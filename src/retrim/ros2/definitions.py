@@ -1,6 +1,6 @@
 """Fields of the messages that are exchanged, by the release in which they took this form.
 
-ROS 2 nodes recognise a type by the hash of its fields (RIHS01), and PX4 by a hash of its own. Neither covers comments
+ROS 2 nodes recognise a type by the hash of its fields (RIHS01), and PX4 by its own hash. Neither covers comments
 or constants. The messages of nav_msgs, geometry_msgs and std_msgs come from rosbags.
 """
 

@@ -1,4 +1,4 @@
-"""Memory between flights: the map of earlier flights of the same vehicle, in a folder that stands for a place.
+"""Memory between flights: the map of earlier flights of the same vehicle, in one folder per place.
 
 A file contains only the state of the residual model, which is data. The policy of the next flight is the one that its
 command names, since a policy that was adapted to other conditions may be worse than the pretrained one.
@@ -152,7 +152,7 @@ def recall_flight(
     if folder is None:
         return None, state
     if state is not None:
-        raise ConfigError("--memory and --resume: choose one, since each has a residual model of its own")
+        raise ConfigError("--memory and --resume: choose one, since each has its own residual model")
     memory = FlightMemory(folder, scenario.vehicle_name(setup.preset.vehicle))
     state = memory.state(setup, policy, method, seed)
     try:

@@ -55,7 +55,7 @@ class Batch:
         """
         while self._tick_count < tick:
             if self._stop is not None and self._stop.is_set():
-                raise FlightStopped("the flights were given up")
+                raise FlightStopped("the flights were aborted")
             if self._flights is None:
                 sims, first = _launch(self._on_the_ground, self._starts)
                 self._flights = _begin(self.controllers, sims, first)

@@ -222,7 +222,7 @@ def fly(
         _tell(everyone, measurement, Command.hover(), [])
         while round((measurement.t - start) / plant.dt) < ticks and not is_over:
             if stop is not None and stop.is_set():
-                raise FlightStopped("the flight was given up")
+                raise FlightStopped("the flight was aborted")
             u = pilot.act(measurement)
             measurement, accepted_command = plant.step(u)
             if accepted_command is not u:

@@ -90,5 +90,5 @@ def _alike(trees: Sequence[Any]) -> bool:
 def _plan(pilot: AdaptivePilot) -> Plan:
     plan = Plan.of(pilot)
     if plan is None:
-        raise ValueError("fly_together: a pilot that learns by the clock flies alone")
+        raise ValueError("fly_together: a pilot with measured latency flies alone")
     return plan

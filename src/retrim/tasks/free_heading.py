@@ -1,4 +1,4 @@
-"""A reference without a heading of its own: the vehicle turns about its thrust axis as little as possible.
+"""A reference without its own heading: the vehicle turns about its thrust axis as little as possible.
 
 At a large tilt, a constant heading needs fast turns about the thrust axis, where the rotors have little torque. Here,
 the body x axis is transported in parallel along the path of the thrust axis. On a lap, a constant rate about the thrust

@@ -78,7 +78,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
         Raises:
             FrameError: The observation does not support other frames.
         """
-        raise FrameError(f"{type(self).__name__} cannot be turned into another frame")
+        raise FrameError(f"{type(self).__name__} cannot be transformed into a different frame")
 
     @property
     def previews_residual(self) -> bool:

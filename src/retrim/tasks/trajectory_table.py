@@ -153,7 +153,7 @@ def _header(words: list[str], *, comment: bool) -> list[str] | None:
                 f"read"
             )
         if names.count(name) > 1:
-            raise ConfigError(f"column {name!r} is there twice; {EXPECTED} are expected")
+            raise ConfigError(f"column {name!r} appears twice; {EXPECTED} are expected")
         unit = part[2] if part else None
         if unit is not None and unit.lower() not in UNITS[name]:
             raise ConfigError(f"column {word!r}: {name} is expected in {UNITS[name][0]}, not in {unit}")
@@ -210,6 +210,6 @@ def _check_times(table: np.ndarray, numbers: list[int], file: Path) -> None:
     k = int(np.argmax(speeds))
     if speeds[k] > FASTEST:
         raise ConfigError(
-            f"{file}, line {numbers[k + 1]}: {speeds[k] * steps[k]:.3g} m in {steps[k]:.3g} s after the point before, "
-            f"{speeds[k]:.3g} m/s; are the positions in m and the times in s?"
+            f"{file}, line {numbers[k + 1]}: {speeds[k] * steps[k]:.3g} m in {steps[k]:.3g} s after the "
+            f"previous point, {speeds[k]:.3g} m/s; are the positions in m and the times in s?"
         )

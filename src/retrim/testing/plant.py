@@ -30,7 +30,7 @@ def check_plant(make: Callable[[], Plant], *, x0: State | None = None, settle_s:
     ticks = max(2, round(settle_s / plant.dt))
 
     first = plant.reset(start)
-    close(first.true_state.p, start.p, 1e-4, "reset puts it where it is told")
+    close(first.true_state.p, start.p, 1e-4, "reset sets the given state")
     for k in range(1, 4):
         measurement, accepted_command = plant.step(Command.hover())
         close(measurement.t - first.t, k * plant.dt, 1e-6, "a tick takes dt by the plant's clock")

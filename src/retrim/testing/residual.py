@@ -41,7 +41,7 @@ def check_residual(model: ResidualModel, *, fits: int = 5, tolerance: float = 0.
     require(shapes(fitted_state) == shapes(state), "a fit keeps the shapes of the state")
     require(jnp.shape(rms) == () and bool(jnp.isfinite(rms)), "the error of a fit is a finite number")
     size = float(jnp.linalg.norm(push))
-    close(model.predict(fitted_state, at, command), push, tolerance * size, "a constant acceleration is learnt")
+    close(model.predict(fitted_state, at, command), push, tolerance * size, "a constant acceleration is learned")
     if hasattr(model, "spread"):
         spread = model.spread(fitted_state, at, command)
         require(spread.shape == (3,) and bool((spread >= 0).all()), "the spread is three numbers, none negative")

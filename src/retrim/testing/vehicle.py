@@ -39,7 +39,7 @@ def check_vehicle(
     for early, call in (("read", plant.read), ("step", lambda: plant.step(Command.hover()))):
         _check_refusal(call, f"{early} before reset is refused with PlantError")
     plant.stop()
-    _check_refusal(lambda: plant.connect(lambda: False), "a flight that is given up ends in PlantError")
+    _check_refusal(lambda: plant.connect(lambda: False), "an aborted flight ends in PlantError")
     plant.stop()
 
     start = State(jnp.array(place), so3.exp(jnp.array([0.0, 0.0, HEADING])), jnp.zeros(3))
@@ -52,9 +52,9 @@ def check_vehicle(
 
 def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s: float) -> None:
     require(first.t == 0.0, "a flight begins at the hand-over")
-    close(first.x.p, start.p, 0.4, "reset flies it to the place it is told")
+    close(first.x.p, start.p, 0.4, "reset flies to the given position")
     away = heading_of(np.asarray(first.x.R)) - HEADING
-    close(np.sin(away), 0.0, 0.15, "reset turns it to the heading it is told")
+    close(np.sin(away), 0.0, 0.15, "reset turns to the given heading")
     close(first.x.R @ first.x.R.T, np.eye(3), 1e-3, "the attitude is a rotation, body to world")
 
     limits = Limits(np.full(3, -1e3), np.full(3, 1e3), plant.low, plant.high)

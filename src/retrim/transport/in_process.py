@@ -42,4 +42,6 @@ def check_fits(topic: str, data: bytes, capacities: Mapping[str, int]) -> None:
     """Raise :class:`MessageError` if there is no such topic, or the message is too long for it."""
     check_topic(topic, capacities)
     if len(data) > capacities[topic]:
-        raise MessageError(f"topic {topic!r}: a message of {len(data)} bytes, room for {capacities[topic]}")
+        raise MessageError(
+            f"topic {topic!r}: a message of {len(data)} bytes exceeds the capacity of {capacities[topic]}"
+        )

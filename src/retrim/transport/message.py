@@ -90,7 +90,7 @@ def unpack_arrays(data: bytes, expected: Mapping[str, ArrayLike], *, kind: str, 
     try:
         tensors = load(data)
     except (SafetensorError, KeyError, ValueError) as error:
-        raise MessageError(f"{source}: a tensor of a type that is not used here ({error})") from error
+        raise MessageError(f"{source}: a tensor of an unsupported type ({error})") from error
     result: dict[str, np.ndarray] = {}
     for name in sorted(expected.keys() | tensors.keys()):
         if name not in tensors:

@@ -53,8 +53,8 @@ class Address:
         result = ADDRESS.fullmatch(text)
         if not result or result["kind"] not in KINDS or not 1 <= int(result["port"]) <= 65_535:
             raise ConfigError(
-                f"{text!r} is no address of a bus; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT, with /KEY for "
-                "one of several vehicles there"
+                f"{text!r} is not an address of a bus; expected zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT, "
+                "with /KEY for one of several vehicles there"
             )
         return cls(result["kind"], result["host"], int(result["port"]), result["key"] or "", shared)
 
@@ -115,6 +115,6 @@ def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
         ConfigError: There is no address, an address is invalid, or the key cannot be read.
     """
     if not texts:
-        raise ConfigError("no address; one is zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT")
+        raise ConfigError("no address; expected zenoh:HOST:PORT, ros2:DOMAIN or ros:HOST:PORT")
     shared = read_key(key)
     return [Address.of(text, shared) for text in texts]

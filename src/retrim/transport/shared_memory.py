@@ -49,7 +49,7 @@ class SharedMemoryBus(Bus):
                 self._maps[topic] = memory, memoryview(memory)[:HEADER].cast("Q")
         except (OSError, ValueError) as error:
             self.close()
-            raise MessageError(f"{folder}: no bus there ({error})") from error
+            raise MessageError(f"{folder}: there is no bus ({error})") from error
 
     @classmethod
     def create(cls, capacities: Mapping[str, int]) -> "SharedMemoryBus":

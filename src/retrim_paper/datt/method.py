@@ -33,7 +33,7 @@ def datt_of(setup: Setup, net: DattNet) -> DattController:
 
 def _pilot(request: MethodRequest) -> Pilot:
     if not isinstance(request.policy, DattNet):
-        raise ConfigError("method 'datt' flies a network of its own: `retrim reproduce hover --methods datt` trains it")
+        raise ConfigError("method 'datt' has its own network: `retrim reproduce hover --methods datt` trains it")
     return ControllerPilot(request.by_state(datt_of(request.setup, request.policy), "datt"))
 
 

@@ -77,9 +77,7 @@ class DattProblem(eqx.Module):
         speed = jnp.sqrt(jnp.sum(x.v * x.v) + 1e-12)
         reward = -(jnp.minimum(away, 5.0) + 0.5 * jnp.abs(heading) + 0.1 * jnp.minimum(speed, 1.0))
         is_lost = away > 5.0
-        reward = jnp.where(
-            is_lost, reward / (1.0 - discount(self.dt)), reward
-        )  # as if the vehicle stayed there for ever
+        reward = jnp.where(is_lost, reward / (1.0 - discount(self.dt)), reward)  # as if the vehicle stayed there
         return after, Outcome(reward, is_lost, after.tick >= ticks_of(self.dt))
 
 

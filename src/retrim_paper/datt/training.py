@@ -118,7 +118,7 @@ def _train(
     codec = tree_codec(state, "ppo")
     if (stored := store.get(key, codec)) is not None:
         state = stored
-        reporter.say(f"{title}: goes on after {int(state.made)} of {updates} updates")
+        reporter.say(f"{title}: continues after{int(state.made)} of {updates} updates")
     with run.interruptible(), reporter.progress(f"{title}, {steps:,} steps") as advance:
         last_write = time.monotonic()
         for after, figures in ppo(problem, state, settings, steps=steps):

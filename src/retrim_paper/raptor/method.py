@@ -22,7 +22,7 @@ def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
         PlantError: The package with the RAPTOR network is not installed.
     """
     if not isinstance(plant, SimPlant) or not isinstance(plant.simulation.model, BemQuadrotor):
-        raise ConfigError("method 'raptor' commands motors, which plant 'bem' alone has: fly it there")
+        raise ConfigError("method 'raptor' commands motors, which plant 'bem' has: fly it there")
     if plant.simulation.sensors is not None:
         raise ConfigError(
             "method 'raptor' reads the state on board, without noise or delay: fly it with sensors 'ideal'"
@@ -34,7 +34,7 @@ def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
 
 def _pilot(request: MethodRequest) -> Pilot:
     if not request.setup.env.task.observation.measures_state:
-        raise ConfigError("method 'raptor' needs the measured state; a policy that sees keypoints is shown none")
+        raise ConfigError("method 'raptor' needs the measured state; a policy that observes keypoints receives none")
     return ControllerPilot(HoverController())
 
 

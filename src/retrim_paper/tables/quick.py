@@ -61,7 +61,7 @@ def help_of(make: Callable[..., None]) -> str:
         text += (
             "\n    quick: One training seed, two starts, short flights, and less of all else that no option asks for."
         )
-    where = "a new one under runs/" if (folder := folder_of(make)) is None else f"{folder}, where the command goes on"
+    where = "a new one under runs/" if (folder := folder_of(make)) is None else f"{folder}, where the command resumes"
     return f"{text}\n    out: Folder of what is made; {where} by default."
 
 

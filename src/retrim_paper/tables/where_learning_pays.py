@@ -146,7 +146,7 @@ def _mm(metres: float) -> str:
 
 
 def decide(medians: dict[str, float], losses: dict[str, int]) -> str:
-    """Return the verdict of a row.
+    """Return the verdict for a row.
 
     Args:
         medians: Median score of each column [m]; infinite if most flights were lost.

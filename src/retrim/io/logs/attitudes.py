@@ -32,7 +32,7 @@ def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarra
         if np.abs(angles).max() > 2.0 * np.pi + OFF:
             raise LogError(
                 f"{path}: attitude: angles reach {np.abs(values).max():.4g} {spec.unit}; "
-                + ("are they in deg?" if spec.unit == "rad" else "no attitude is beyond a turn")
+                + ("are they in deg?" if spec.unit == "rad" else "no attitude exceeds a turn")
             )
         rotation = Rotation.from_euler("ZYX", angles[:, ::-1])
         good = np.ones(len(values), dtype=bool)
@@ -41,7 +41,7 @@ def attitudes(values: np.ndarray, spec: Attitude, path: Path) -> tuple[np.ndarra
         off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
         good = _mostly(off < OFF, path, "matrices", "orthogonal")
         if np.median(np.linalg.det(R)) < 0.0:
-            raise LogError(f"{path}: attitude: the matrices are mirrors, no rotations: an axis has the wrong sign")
+            raise LogError(f"{path}: attitude: the matrices are reflections, not rotations: an axis has the wrong sign")
         rotation = Rotation.from_matrix(np.where(good[:, None, None], R, np.eye(3)))
     else:
         norm = np.linalg.norm(values, axis=1)

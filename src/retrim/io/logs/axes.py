@@ -35,5 +35,5 @@ def left_handed(name: str) -> bool:
 def _check(name: str, letters: dict[str, tuple[int, int, int]], words: str) -> str:
     rows = [letters.get(letter, (0, 0, 0)) for letter in name]
     if len(name) != 3 or abs(np.linalg.det(np.array(rows, dtype=float))) != 1.0:
-        raise ValueError(f"{name[:20]!r} are no three axes; they must be three of {words}")
+        raise ValueError(f"{name[:20]!r} are not three axes; they must be three of {words}")
     return name

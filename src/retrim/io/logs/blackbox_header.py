@@ -92,7 +92,7 @@ def read_header(path: Path, data: bytes, begin: int) -> BlackboxHeader:
         at = end + 1
     kinds = {kind for kind in "IPSGH" if f"Field {kind} encoding" in values}
     if not {"I", "P"} <= kinds or "Field I name" not in values:
-        raise LogError(f"{path}: the header of the Blackbox log is torn: it does not describe its frames")
+        raise LogError(f"{path}: the header of the Blackbox log is incomplete: it does not describe its frames")
     names = tuple(values["Field I name"].split(","))
     layouts = {kind: _layout(path, values, kind) for kind in sorted(kinds)}
     signed = tuple(part == "1" for part in values.get("Field I signed", "").split(","))
@@ -111,5 +111,7 @@ def _layout(path: Path, values: dict[str, str], kind: str) -> FrameLayout:
         encodings, predictors = (), (0,)
     known = all(code in ENCODINGS for code in encodings) and all(code in PREDICTORS for code in predictors)
     if not known or len(encodings) != len(predictors) or len(encodings) > FIELDS:
-        raise LogError(f"{path}: the header of the Blackbox log is damaged: it describes no {kind} frame that is known")
+        raise LogError(
+            f"{path}: the header of the Blackbox log is damaged: it describes no {kind} frame that is supported"
+        )
     return FrameLayout(encodings, predictors)

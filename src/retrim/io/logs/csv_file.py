@@ -131,7 +131,7 @@ def _numbers(cell: str, where: str) -> list[float]:
     try:
         return [float(x) for x in np.ravel(json.loads(text))] if text.startswith("[") else [float(text)]
     except (ValueError, TypeError, RecursionError) as error:
-        raise LogError(f"{where}: {text[:40]!r} is no number") from error
+        raise LogError(f"{where}: {text[:40]!r} is not a number") from error
 
 
 def _array(path: Path, name: str, rows: list[list[float]]) -> np.ndarray:

@@ -21,7 +21,7 @@ def check_flag(name: str) -> str:
         try:
             float(number)
         except ValueError as error:
-            raise ValueError(f"{number[:20]!r} is no number; a flag is a field, or field==number") from error
+            raise ValueError(f"{number[:20]!r} is not a number; a flag is a field, or field==number") from error
     return name
 
 

@@ -40,7 +40,7 @@ def _flat(path: Path, name: str, arrays: NpzMembers) -> np.ndarray:
         raise missing_field(path, base, list(arrays))
     array = arrays[base]
     if array.ndim == 0 or len(array) == 0 or array.dtype.kind not in "fiu":
-        raise LogError(f"{path}: {base!r} is no array of numbers over time")
+        raise LogError(f"{path}: {base!r} is not an array of numbers over time")
     columns = array.reshape(len(array), -1).astype(float)
     if not part:
         return columns

@@ -51,7 +51,7 @@ def check_plausible(
         if score < REFUSED[name]:
             raise LogError(
                 f"{path}: {EXPLAINED[name]} ({100 * score:.0f} % agreement), and no other unit, frame or sign of the "
-                f"map mends it"
+                f"map corrects it"
             )
     return scores, tuple(
         f"{CLAIMS[name].format(max(0, round(100 * score)))}, {100 * DOUBTFUL[name]:.0f} % are expected"
@@ -101,6 +101,6 @@ EXPLAINED = {
     "motion": "positions do not move as velocities say",
     "lift": "the vehicle does not accelerate along its thrust axis",
     "thrust": "accelerations are not those of the commanded thrust",
-    "turning": "the vehicle does not turn as it is told",
+    "turning": "the vehicle does not turn as commanded",
     "gyroscope": "the vehicle does not turn as its measured rates say",
 }

@@ -177,7 +177,7 @@ def _check_file(path: Path, suffix: str) -> None:
         raise LogError(f"{path}: {suffix} is not read; {CONVERTERS[suffix]}, to be read with --map map.toml")
     if suffix not in READERS and suffix not in WITH_FLIGHTS:
         raise LogError(
-            f"{path}: no log that is known; there are {', '.join([*READERS, *WITH_FLIGHTS])}, and folders of ROS 2"
+            f"{path}: unknown kind of log; there are {', '.join([*READERS, *WITH_FLIGHTS])}, and folders of ROS 2"
         )
     if not path.is_file():
         raise LogError(f"{path}: not a regular file")
@@ -190,5 +190,5 @@ def _check_file(path: Path, suffix: str) -> None:
 def _usual(path: Path) -> tuple[str, ...]:
     usual = USUAL.get("" if path.is_dir() else path.suffix.lower())
     if usual is None:
-        raise LogError(f"{path}: say what is where in it, as --map map.toml; maps by name: {', '.join(names())}")
+        raise LogError(f"{path}: describe its fields with --map map.toml; maps by name: {', '.join(names())}")
     return usual

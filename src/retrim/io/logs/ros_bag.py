@@ -43,7 +43,7 @@ def read_bag(
     except LogError:
         raise
     except Exception as error:  # the parsers raise various errors for bytes that are not a bag
-        hint = "; `mcap recover` mends a file whose recorder was killed" if path.suffix == ".mcap" else ""
+        hint = "; `mcap recover` repairs a file whose recorder was killed" if path.suffix == ".mcap" else ""
         raise LogError(f"{path}: cannot be read as a bag ({type(error).__name__}: {str(error)[:200]}){hint}") from error
 
 
@@ -103,7 +103,7 @@ def _place(path: Path, name: str, topics: Sequence[str]) -> Place:
     if not fit:
         raise missing_field(path, topic, topics)
     if len(fit) > 1:
-        raise LogError(f"{path}: {topic!r} fits several topics: {', '.join(fit[:5])}; name one in the map")
+        raise LogError(f"{path}: {topic!r} matches several topics: {', '.join(fit[:5])}; name one in the map")
     return Place(fit[0], inner)
 
 
@@ -132,7 +132,7 @@ def _numbers(path: Path, place: Place, message: Any) -> list[float]:
     name = f"{place.topic}.{place.inner}"
     match = re.fullmatch(r"([\w.]+)(?:\[(\d+)\])?", place.inner, re.ASCII)
     if match is None:
-        raise LogError(f"{path}: field {name!r} is no path in a message, as pose.position or data[0]")
+        raise LogError(f"{path}: field {name!r} is not a path in a message, as pose.position or data[0]")
     inner, element = match.groups()
     try:
         value = attrgetter(inner)(message)

@@ -33,7 +33,7 @@ def normalise_thrust(
             )
         full = float(np.sum(share * along) / np.sum(share**2))
         if full <= 0.0:
-            raise LogError(f"{path}: the more thrust, the less acceleration along its axis; is it the right field?")
+            raise LogError(f"{path}: more thrust gives less acceleration along its axis; is it the right field?")
         hover = number_of(spec, STANDARD_GRAVITY / full)
         number = f"{hover:.3f}" if spec.full == 1.0 else f"{hover:.5g}"
         return full * ticks.thrust, full, [f"thrust map found from the flight: hover at {number}"]

@@ -43,7 +43,7 @@ def check_recording(path: Path | None) -> None:
     if path.is_dir():
         raise ConfigError(f"--record {path}: it is a folder")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ConfigError(f"--record {path}: nothing can be written in {path.parent}")
+        raise ConfigError(f"--record {path}: files cannot be written to {path.parent}")
 
 
 def can_record(path: Path) -> bool:

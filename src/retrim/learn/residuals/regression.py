@@ -194,7 +194,7 @@ class RegressionModel(eqx.Module):
 
 
 def features_of(x: State, u: Command) -> Float[Array, "3 10"]:
-    """Return the features Phi, world frame: the residual is Phi times the ten parameters."""
+    """Return the features Phi in the world frame; the residual is Phi times the ten parameters."""
     v_b = so3.act(x.R.T, x.v)
     push = jnp.eye(3, dtype=x.p.dtype)
     gain = x.R[:, 2:] * (u.c - STANDARD_GRAVITY)

@@ -1,6 +1,6 @@
 """A residual model for a vehicle with a load on a cable: another model, fitted to the remainder of the cable's pull.
 
-The pull is no function of state and command, since the load has a state of its own. In flight, the frame of the
+The pull is not a function of state and command, since the load has its own state. In flight, the frame of the
 effective gravity estimates the load in every tick and compensates its pull (:mod:`retrim.control.slung_load`). The
 residual model must then not contain the pull: a window of a swinging load otherwise looks like a different drag or
 thrust gain. Each fit therefore continues the same filter over the new rows of its window, and subtracts the pull.

@@ -98,7 +98,7 @@ def page_address(host: str, port: int, *, is_explicit: bool, say: Callable[[str]
     free_port(host, port)
     if host not in LOOPBACK:
         say(
-            f"warning: the page listens on {host}; anybody who has its printed address may turn the knobs and land "
+            f"warning: the page listens on {host}; anyone who has its printed address can turn the knobs and land "
             "the vehicle, and it travels unencrypted"
         )
     return host, port

@@ -1,4 +1,4 @@
-"""Change the reference in flight: the user selects a reference, and the vehicle goes over to it smoothly."""
+"""Change the reference in flight: the user selects a reference, and the vehicle changes to it smoothly."""
 
 from concurrent.futures import Executor, Future
 
@@ -73,7 +73,7 @@ class ReferenceSwitcher:
                 self.name, self._pending = name, None
                 self.pieces.append((at, table))
                 self._supervisor.bus.publish(REFERENCE_TOPIC, pack_note(REFERENCE_TOPIC, name=name))
-                new = [Event(at, "reference", f"it goes over to {name}")]
+                new = [Event(at, "reference", f"transition to{name}")]
             elif (t := self._now()) > at:  # control received it too late
                 self._pending = None
                 if self._attempts < ATTEMPTS:
@@ -109,7 +109,7 @@ class ReferenceSwitcher:
         outside = (places < limits.low) | (places > limits.high)
         if outside.any():
             place = places[int(np.argmax(outside.any(1)))].round(2).tolist()
-            raise ConfigError(f"it passes {place} m, outside the fence; a wider one is had with --fence")
+            raise ConfigError(f"it passes {place} m, outside the fence; --fence sets a wider one")
         return at, table
 
     def _now(self) -> float:

@@ -71,7 +71,7 @@ class IdentifierLoop:
         """
         family = make_family(preset)
         if family is None:
-            raise ConfigError(f"preset {preset.name!r} is for one vehicle, and none is identified")
+            raise ConfigError(f"preset {preset.name!r} is for one vehicle, which is not identified")
         self.bus, self._base, self._family = bus, base, family
         self._estimator, self._declared = PathEstimator.of(preset.dt), declared_vehicle(preset)
         self._state: EstimatorState | None = None

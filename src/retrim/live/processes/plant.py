@@ -100,7 +100,7 @@ def _fly(
         if setpoint is None:
             holds += 1  # like a vehicle, keep the last command
             if silent_ticks * plan.dt > ALONE and parent.has_ended():
-                return "nobody commands, and the supervisor is gone"
+                return "no commands arrive, and the supervisor is gone"
         elif setpoint.is_final:
             return setpoint.ending(float(sample.truth[2]))
         else:

@@ -34,7 +34,7 @@ def fly(plan: PlantPlan) -> None:
     try:
         with plan.scenario.make(plan.vehicle, dt=plan.dt, seed=plan.seed) as plant:
             if not isinstance(plant, VehiclePlant):
-                raise PlantError(f"plant {plan.scenario.plant!r} is no VehiclePlant")
+                raise PlantError(f"plant {plan.scenario.plant!r} is not a VehiclePlant")
             refusals = be_punctual(plan.priority, set(plan.cores))  # the threads of the link inherit the priority
             plant.connect(is_active)
             bus.publish("ready.plant", pack_note("ready", refused=refusals, stands=True))

@@ -56,7 +56,7 @@ class BetaflightPlant(VehiclePlant):
         if self._world is not None:
             return
         if not keep_on():
-            raise PlantError("the flight was given up before the hand-over")
+            raise PlantError("the flight was aborted before the hand-over")
         # before the world, since firmware that receives a state too early crashes
         self._firmware = Firmware(find_firmware(), self._steps)
         try:
@@ -131,7 +131,7 @@ def _make(request: PlantRequest) -> BetaflightPlant:
 
 def _check_address(address: str) -> None:
     if address:
-        raise ConfigError(f"plant 'betaflight' has no address, and {address!r} is one too many")
+        raise ConfigError(f"plant 'betaflight' has no address, and {address!r} was given")
 
 
 entry = PlantEntry(

@@ -65,7 +65,7 @@ def motors_of(packet: bytes) -> np.ndarray:
         MessageError: The bytes are not a motor packet.
     """
     if len(packet) != _MOTORS.size:
-        raise MessageError(f"{len(packet)} bytes are no packet of motors, which has {_MOTORS.size}")
+        raise MessageError(f"{len(packet)} bytes are not a packet of motors, which has {_MOTORS.size}")
     motors = np.array(_MOTORS.unpack(packet))
     if not (np.isfinite(motors).all() and (motors >= 0.0).all() and (motors <= 1.0).all()):
         raise MessageError(f"motors {motors.tolist()} are not all between 0 and 1")

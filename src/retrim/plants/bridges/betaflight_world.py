@@ -41,7 +41,7 @@ class MotorListener:
             self._socket.bind((HOST, port))
         except OSError as error:
             self._socket.close()
-            raise PlantError(f"port {port}, on which motors are heard, is taken ({error.strerror})") from error
+            raise PlantError(f"port {port}, on which motors are received, is in use ({error.strerror})") from error
         self._socket.setblocking(False)
         self._board: Any = None
         self.port: int = self._socket.getsockname()[1]

@@ -124,9 +124,9 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             raise PlantError(f"the link has been silent for {LOST_S:g} s; a Crazyflie stops its motors then")
         for bit, what in WRONG.items():
             if self._is(bit):
-                raise PlantError(f"the Crazyflie says that it {what}{link.console_text()}")
+                raise PlantError(f"the Crazyflie reports that it {what}{link.console_text()}")
         if self._flies and not self._is(crtp.ARMED):
-            raise PlantError(f"the Crazyflie is not armed any more{link.console_text()}")
+            raise PlantError(f"the Crazyflie is no longer armed{link.console_text()}")
         return self.reading().at(now)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
@@ -198,8 +198,8 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.until(is_away, STILL_S, keep_on)
         if wanders > WANDERS:
             raise PlantError(
-                f"{self.address}: the Crazyflie stands, and its estimate wandered by {wanders:.2f} m in {STILL_S:g} s; "
-                f"is there a positioning system?"
+                f"{self.address}: the Crazyflie is at rest, and its estimate drifted by {wanders:.2f} m "
+                f"in {STILL_S:g} s; is there a positioning system?"
             )
 
 
@@ -221,7 +221,7 @@ def check_address(address: str) -> str:
         ConfigError: The text is not a UDP address.
     """
     if address_of(address or ADDRESS)[0] != "udp":
-        raise ConfigError(f"address {address!r}: a Crazyflie is reached by udp:HOST:PORT, as {ADDRESS}")
+        raise ConfigError(f"address {address!r}: a Crazyflie needs udp:HOST:PORT, as {ADDRESS}")
     return address or ADDRESS
 
 

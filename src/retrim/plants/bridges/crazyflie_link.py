@@ -81,7 +81,7 @@ class CrazyflieLink:
             The bytes after the repeated ones.
 
         Raises:
-            PlantError: The Crazyflie does not answer, or the flight was given up.
+            PlantError: The Crazyflie does not answer, or the flight was aborted.
         """
         self._request, self._answer = question._replace(body=question.body[:same]), None
         asking = insisting(lambda: self.send(question), lambda: self._answer is not None, AGAIN_S)
@@ -129,7 +129,9 @@ class CrazyflieLink:
                 result[name] = number
             if len(result) == len(names):
                 return result
-        raise PlantError(f"the Crazyflie logs no {', '.join(sorted(names - set(result)))}; its firmware is too old")
+        raise PlantError(
+            f"the Crazyflie does not log {', '.join(sorted(names - set(result)))}; its firmware is too old"
+        )
 
     def _chores(self, now: float) -> None:
         if now >= self._echo_due:
@@ -153,7 +155,7 @@ class CrazyflieLink:
         if port == crtp.LINK and channel == 0 and len(body) == 8:
             trip = now - struct.unpack("<d", body)[0]
             if not 0.0 <= trip < 1.0:
-                raise MessageError("an echo of nothing that was said")
+                raise MessageError("an echo of an unknown request")
             self._trips.append(trip)
         elif port == crtp.LOG and channel == crtp.DATA:
             self._read_log(body, now)
@@ -173,14 +175,14 @@ class CrazyflieLink:
         block, ms, values = body[0], int.from_bytes(body[1:4], "little"), body[4:]
         on = (ms - self._remote_ms + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
         if self.reading is not None and not -LATE_S < 1e-3 * on < now - self._log_time + EARLY_S:
-            raise MessageError("a log of another time")
+            raise MessageError("a log with an implausible time")
         if block == STATES:
             self._take_state(crtp.state_of(values), self._remote_ms + on, now)
         elif block == STATUSES:
             self.status = crtp.status_of(values)
             self.thrusts.append(self.status.thrust)
         else:
-            raise MessageError("a block of a log that nobody asked for")
+            raise MessageError("a block of a log that was not requested")
 
     def _take_state(self, x: crtp.StateRow, ms: int, now: float) -> None:
         """Process a state, or refuse it if it is implausibly far from a recent state."""

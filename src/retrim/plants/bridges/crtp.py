@@ -56,7 +56,7 @@ def unpack(data: bytes) -> Packet:
         MessageError: The datagram is empty or too long.
     """
     if not 0 < len(data) <= LONGEST:
-        raise MessageError(f"{len(data)} bytes are no packet, which has 1 to {LONGEST}")
+        raise MessageError(f"{len(data)} bytes are not a packet, which has 1 to {LONGEST}")
     return Packet(data[0] >> 4, data[0] & 3, data[1:])
 
 
@@ -72,46 +72,46 @@ def rates_setpoint(thrust: int, omega: np.ndarray) -> Packet:
 
 
 def take_off(height: float, yaw: float, duration: float) -> Packet:
-    """Return the order to take off to a height [m] and heading [rad] in a given time [s]."""
+    """Return the command packet to take off to a height [m] and heading [rad] in a given time [s]."""
     return Packet(HIGH_LEVEL, 0, struct.pack("<BBff?f", TAKE_OFF, 0, height, yaw, False, duration))
 
 
 def go_to(p: np.ndarray, yaw: float, duration: float, version: int) -> Packet:
-    """Return the order to go to a position [m] and heading [rad] in a given time [s]."""
+    """Return the command packet to go to a position [m] and heading [rad] in a given time [s]."""
     head = (GO_TO_LINEAR, 0, 0, 0) if version >= NEW_GO_TO else (GO_TO, 0, 0)
     return Packet(HIGH_LEVEL, 0, struct.pack(f"<{len(head)}B5f", *head, *map(float, p), yaw, duration))
 
 
 def land(height: float, duration: float) -> Packet:
-    """Return the order to land at a height [m] in a given time [s]."""
+    """Return the command packet to land at a height [m] in a given time [s]."""
     return Packet(HIGH_LEVEL, 0, struct.pack("<BBff?f", LAND, 0, height, 0.0, True, duration))
 
 
 def stop_planning() -> Packet:
-    """Return the order that ends the motions started by take_off, go_to and land; the motors then stop."""
+    """Return the command packet that ends the motions of take_off, go_to and land; the motors then stop."""
     return Packet(HIGH_LEVEL, 0, bytes([HL_STOP, 0]))
 
 
 def relax() -> Packet:
-    """Return the notice that setpoints end, so orders take effect again; without this notice, the motors stop."""
+    """Return the packet that ends setpoints, so that other commands take effect; without it, the motors stop."""
     return Packet(SETPOINT, 1, struct.pack("<BI", RELAX, 0))
 
 
 def arm(yes: bool, version: int) -> Packet:
-    """Return the order to arm or disarm."""
+    """Return the command packet to arm or disarm."""
     port, channel = (SUPERVISOR, 1) if version >= OWN_SUPERVISOR else (PLATFORM, 0)
     return Packet(port, channel, bytes([1, yes]))
 
 
 def new_block(number: int, variables: list[tuple[str, int]]) -> list[Packet]:
-    """Return the orders that create a log block from the types and numbers of its variables."""
+    """Return the command packets that create a log block from the types and numbers of its variables."""
     items = [struct.pack("<BH", LOG_TYPES[kind], item) for kind, item in variables]
     parts = [b"".join(items[k : k + LISTED]) for k in range(0, len(items), LISTED)]
     return [Packet(LOG, CONTROL, bytes([APPEND if k else CREATE, number]) + part) for k, part in enumerate(parts)]
 
 
 def start_block(number: int, period: float) -> Packet:
-    """Return the order to send a block once per period [s]."""
+    """Return the command packet to send a block once per period [s]."""
     return Packet(LOG, CONTROL, bytes([START, number, max(1, round(1e3 * period / LOG_MS))]))
 
 
@@ -135,7 +135,7 @@ def state_of(values: bytes) -> StateRow:
         MessageError: The block has a wrong length, or its attitude is invalid.
     """
     if len(values) != _STATE.size:
-        raise MessageError(f"{len(values)} bytes are no state, which has {_STATE.size}")
+        raise MessageError(f"{len(values)} bytes are not a state, which has {_STATE.size}")
     *where, quat, roll, pitch, yaw = _STATE.unpack(values)
     place = 1e-3 * np.array(where, dtype=float)
     return StateRow(place[:3], attitude_of(quat), place[3:], 1e-3 * _PITCH_UP * np.array([roll, pitch, yaw]))
@@ -165,7 +165,7 @@ def status_of(values: bytes) -> Status:
         MessageError: The block has a wrong length, or its values are not finite.
     """
     if len(values) != _STATUS.size:
-        raise MessageError(f"{len(values)} bytes are no status, which has {_STATUS.size}")
+        raise MessageError(f"{len(values)} bytes are not a status, which has {_STATUS.size}")
     result = Status(*_STATUS.unpack(values))
     if not (math.isfinite(result.thrust) and math.isfinite(result.battery)):
         raise MessageError("a status that is not finite")

@@ -54,7 +54,7 @@ class UdpEndpoint:
             self._socket.bind((host, port))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            raise PlantError(f"udp:{host}:{port} cannot be listened on: {error}") from error
+            raise PlantError(f"udp:{host}:{port} cannot be opened: {error}") from error
         self._socket.setblocking(False)
 
     def fileno(self) -> int:

@@ -1,6 +1,6 @@
 """A process that commands a vehicle when the sender of its commands has ended or is silent.
 
-Some flight stacks hold the last command for ever. A guardian belongs in front of such a stack: it has the same
+Some flight stacks hold the last command indefinitely. A guardian belongs in front of such a stack: it has the same
 descriptor as the link, but its own session, so that SIGKILL of the link, of all processes of a flight or of their
 process group does not end it. It cannot help when its computer stops, or when the cable or the network is cut.
 

@@ -91,7 +91,7 @@ class ThrustScale:
         shares = np.array(commands) / self._range[1]
         if len(shares) < 5 or not 0.05 < np.median(shares) < 0.95:
             raise PlantError(
-                f"the thrust at hover is not known: the autopilot said {shares.round(2).tolist()} of its largest"
+                f"the thrust at hover is not known: the autopilot reported {shares.round(2).tolist()} of its largest"
             )
         self.hover = float(np.mean(np.array(commands)))
 

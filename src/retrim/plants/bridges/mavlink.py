@@ -50,10 +50,11 @@ class MavlinkPlant(OffboardPlant[MavlinkLink]):
         link = self._link
         if not self.until(lambda: link.system is not None, LISTENS_S, keep_on):
             raise PlantError(
-                f"{self.address}: no autopilot was heard there in {LISTENS_S:g} s; is it on, and does it send there?"
+                f"{self.address}: no autopilot was heard there in {LISTENS_S:g} s; "
+                "is it on, and does it send to this address?"
             )
         if link.autopilot != PX4:
-            raise PlantError(f"{self.address}: autopilot {link.autopilot} answers; only PX4 ({PX4}) is known")
+            raise PlantError(f"{self.address}: autopilot {link.autopilot} responds; only PX4 ({PX4}) is supported")
         for message, rate in STREAMS.items():
             link.stream(message, max(rate, 2.0 / self.dt) if message == "ODOMETRY" else rate)
         for message in UNUSED:

@@ -71,8 +71,8 @@ class MspPlant(PilotedPlant[MspLink]):
     throttle there scales the thrust. From the switch on, a position controller holds the vehicle until the flight
     begins. The pilot has the vehicle back as soon as the switch is off.
 
-    The board holds the last command for ever. A guardian process therefore levels the vehicle and lets it sink if this
-    process ends or is silent.
+    The board holds the last command indefinitely. A guardian process therefore levels the vehicle and lets it sink if
+    this process ends or is silent.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class MspPlant(PilotedPlant[MspLink]):
             return link.has_mode(msp.OVERRIDE)
 
         if not self.until(is_ours, GO_S, keep_on):
-            raise PlantError(f"{self.address}: nobody has switched MSP OVERRIDE on in {GO_S:g} s")
+            raise PlantError(f"{self.address}: MSP OVERRIDE was not switched on within {GO_S:g} s")
         self._engage()
         link.forget_commands()
 

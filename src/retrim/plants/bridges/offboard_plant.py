@@ -120,7 +120,7 @@ class OffboardPlant(LinkedPlant[L], abc.ABC):
         link.pump(0.0)
         now, x, truth = time.monotonic(), self.reading(), link.truth
         if now - link.last_message > LOST_S:
-            raise PlantError(f"the link has been silent for {LOST_S:g} s; the autopilot does what its failsafe says")
+            raise PlantError(f"the link has been silent for {LOST_S:g} s; the autopilot follows its failsafe")
         if self._is_engaged and not (self._offboard() and link.armed):
             raise PlantError(f"the autopilot has left offboard mode, for mode {link.mode}{self._status_text()}")
         fresh_truth = None if truth is None or now - truth.stamp > LOST_S else truth.at(now)

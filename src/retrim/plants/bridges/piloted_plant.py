@@ -80,7 +80,7 @@ class PilotedPlant(LinkedPlant[L]):
         if not self.until(ready, GO_S, keep_on):
             x = self.reading()
             raise PlantError(
-                f"{self.address}: nobody has flown the vehicle to {place.round(2).tolist()} m"
+                f"{self.address}: the vehicle was not flown to {place.round(2).tolist()} m"
                 f"{'' if yaw is None else f', heading {math.degrees(yaw):.0f} deg'}, in {GO_S:g} s; it is at "
                 f"{x.p.round(2).tolist()} m, {math.degrees(heading_of(x.R)):.0f} deg"
             )
@@ -98,7 +98,7 @@ class PilotedPlant(LinkedPlant[L]):
         """Return the newest state."""
         now, link = time.monotonic(), self.link
         if now - link.last_message > LOST_S:
-            raise PlantError(f"no state has come for {LOST_S:g} s; who else flies the vehicle has it back")
+            raise PlantError(f"no state has come for {LOST_S:g} s; the other pilot has control again")
         return self.reading().at(now)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:

@@ -17,18 +17,18 @@ def wait_until(done: KeepOn, patience: float, keep_on: KeepOn, wait: Callable[[f
     Args:
         done: Returns whether the condition holds.
         patience: Longest time to wait [s].
-        keep_on: Called repeatedly; the wait is given up when it returns False.
+        keep_on: Called repeatedly; the wait is aborted when it returns False.
         wait: Keeps the link alive until an instant on the monotonic clock [s].
 
     Raises:
-        PlantError: ``keep_on`` returned False, so the flight was given up.
+        PlantError: ``keep_on`` returned False, so the flight was aborted.
     """
     until = time.monotonic() + patience
     while time.monotonic() < until:
         if done():
             return True
         if not keep_on():
-            raise PlantError("the flight was given up before the hand-over")
+            raise PlantError("the flight was aborted before the hand-over")
         wait(time.monotonic() + NAP_S)
     return False
 

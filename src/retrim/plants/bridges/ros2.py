@@ -67,13 +67,13 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
 
     if not until(is_clear, WAIT_S, keep_on):
         remarks = "".join(f"; ignored: {note}" for note in link.notes)
-        raise PlantError(f"{where}: no state came on {' or '.join(link.states)} in {WAIT_S:g} s{remarks}")
+        raise PlantError(f"{where}: no state arrived on {' or '.join(link.states)} in {WAIT_S:g} s{remarks}")
     looked = 0.0
     until(lambda: is_clear() and not link.topics_without_listener(), LISTENER_S, keep_on)
     if (
         silent := link.topics_without_listener()
     ) and link.node.backend != "zenoh":  # PX4's zenoh module does not announce itself.
-        raise PlantError(f"{where}: no node listens to {', '.join(silent)}")
+        raise PlantError(f"{where}: no node subscribes to {', '.join(silent)}")
     if not until(lambda: not link.topics_with_several_publishers(), CROWD_S, keep_on):
         topics = ", ".join(link.topics_with_several_publishers())
         raise PlantError(f"{where}: several nodes publish {topics}; end all but one")

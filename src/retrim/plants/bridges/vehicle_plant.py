@@ -53,7 +53,7 @@ class VehiclePlant(Plant, abc.ABC):
         """Connect, and wait until the vehicle can be armed; return immediately if this is already possible.
 
         Args:
-            keep_on: Called repeatedly; the wait is given up when it returns False.
+            keep_on: Called repeatedly; the wait is aborted when it returns False.
 
         Raises:
             PlantError: The vehicle cannot be armed; the error contains the reason that the vehicle reported.
@@ -66,7 +66,7 @@ class VehiclePlant(Plant, abc.ABC):
         Args:
             p: Hover position, world [m]; None for the current position, or one metre above the ground.
             yaw: Heading at hover [rad]; None for the current heading.
-            keep_on: Called repeatedly; the wait is given up when it returns False.
+            keep_on: Called repeatedly; the wait is aborted when it returns False.
 
         Raises:
             PlantError: The vehicle does not arm, or does not reach the position.
@@ -112,7 +112,7 @@ class VehiclePlant(Plant, abc.ABC):
         """Keep the link alive for at most ``patience`` [s] until a condition holds; return whether this happened.
 
         Raises:
-            PlantError: ``keep_on`` returned False, so the flight was given up.
+            PlantError: ``keep_on`` returned False, so the flight was aborted.
         """
         return wait_until(done, patience, keep_on, self.wait)
 
