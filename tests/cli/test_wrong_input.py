@@ -160,7 +160,7 @@ WRONG = [
     (("fly", "--policy", "notes.safetensors"), "notes.safetensors: not a whole safetensors file"),
     (
         ("fly", "--policy", "learner_state.safetensors"),
-        "learner_state.safetensors: holds a learner state; go on from it",
+        "learner_state.safetensors: holds a learner state; continue from it",
     ),
     (("fly", "--resume", "p/policy.safetensors"), "holds a 'policy', expected a 'learnt'"),
     (("fly", "--resume", "missing"), "missing: no such file; `retrim fly --out DIR` makes a learner_state.safetensors"),

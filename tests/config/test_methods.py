@@ -37,7 +37,7 @@ def keypoint_setups():
         (
             "ideal",
             "indi",
-            r"method 'indi' needs the state, and preset 'vision/ideal' shows keypoints.*occlusion = true",
+            r"method 'indi' needs the state, and preset 'vision/ideal' observes keypoints.*occlusion = true",
         ),
         ("retrim", "datt", "method 'datt' has its own network: `retrim reproduce hover --methods datt` trains"),
     ],

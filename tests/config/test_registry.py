@@ -314,7 +314,7 @@ def test_custom_reference(mine):
     np.testing.assert_allclose(setup.flight_task.reference(jnp.array(2.0)).p, [0.0, 0.0, 1.2], atol=1e-6)
     with pytest.raises(ConfigError, match=r"reference 'circle': a hover policy follows no reference"):
         Setup.from_preset(tiny_preset(), "circle")
-    with pytest.raises(ConfigError, match=rf"reference '{mine}:no_vehicle' is a str, not a function that gives"):
+    with pytest.raises(ConfigError, match=rf"reference '{mine}:no_vehicle' is a str, not a function that returns"):
         make_reference(f"{mine}:no_vehicle")
     with pytest.raises(ConfigError, match=rf"reference {mine}:no_task: "):
         make_reference(f"{mine}:no_task")

@@ -144,7 +144,7 @@ IMPOSSIBLE = [
     ({"arm": "[105, 120]"}, r"arm = \(105\.0, 120\.0\) must be at most 2 m; is it in mm\? write \[0\.105, 0\.12\]"),
     ({"arm": "[10.5, 12]"}, r"arm = \(10\.5, 12\.0\) must be at most 2 m; is it in cm\? write \[0\.105, 0\.12\]"),
     ({"arm": "[1.05, 1.2]"}, r"inertia = .* is too small for 1\.2 kg with rotors 1\.59 m from the centre.* arm in m\?"),
-    ({"inertia": "[8e-6, 9e-6, 15e-6]"}, r"inertia = .* is too small .* which have 0\.0061 or so; is it in kg m\^2"),
+    ({"inertia": "[8e-6, 9e-6, 15e-6]"}, r"inertia = .* is too small .* which have about 0\.0061; is it in kg m\^2"),
     ({"inertia": "[8.0, 9.0, 15.0]"}, r"inertia = .* is too large"),  # g m^2
     (
         {"rates_max": "[700, 700, 300]"},

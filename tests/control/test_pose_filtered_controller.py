@@ -93,6 +93,6 @@ def test_controller_without_filter_is_refused():
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset("vision/ideal")
     with pytest.raises(
-        ConfigError, match="'GeometricController' needs the state, and preset 'vision/ideal' shows keypoints"
+        ConfigError, match="'GeometricController' needs the state, and preset 'vision/ideal' observes keypoints"
     ):
         MethodRequest(setup, None).by_state(BASELINES["geometric"].controller(baseline_request(setup)))

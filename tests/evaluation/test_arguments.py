@@ -47,7 +47,7 @@ def test_reference_must_suit_policy():
     assert reference_of_flight(family, "circle") == "circle"
     for preset, name, text in (
         (load("hover/fast"), "circle", "a hover policy follows no reference"),
-        (family, None, "say which to fly"),
+        (family, None, "choose one, as in"),
         (blind, "star", "does not observe its reference, and was trained on circle"),
     ):
         with pytest.raises(ConfigError, match=text):

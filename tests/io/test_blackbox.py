@@ -174,7 +174,7 @@ def test_unreadable_log_is_refused_with_one_line(kind, tmp_path):
 def test_rates_in_unknown_unit_are_refused(tmp_path):
     text = files("retrim.io.logs") / "maps" / "betaflight.toml"
     (tmp_path / "map.toml").write_text(text.read_text().replace('"setpoint[2]"]\nunit = "deg/s"', '"setpoint[2]"]'))
-    with pytest.raises(LogError, match=r'does not turn as it is told .*; with rates.unit = "deg/s" it would'):
+    with pytest.raises(LogError, match=r'does not turn as commanded .*; with rates.unit = "deg/s" it would'):
         read(tmp_path, LOG, log_map=read_map(tmp_path / "map.toml"))
 
 

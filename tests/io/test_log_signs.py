@@ -172,9 +172,9 @@ def test_alternative_and_capitalised_names(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"frames__world": '"ENN"'}, "no three axes"),
-        ({"frames__world": '"FLU"'}, "no three axes"),
-        ({"frames__body": '"ENU"'}, "no three axes"),
+        ({"frames__world": '"ENN"'}, "not three axes"),
+        ({"frames__world": '"FLU"'}, "not three axes"),
+        ({"frames__body": '"ENU"'}, "not three axes"),
         ({"frames__world": '"NEU"'}, "must both be right-handed, or both left"),
         ({"attitude__body": '"FRU"'}, "must both be right-handed, or both left"),
         ({"landed__fields": '["state==on"]'}, "'on' is not a number; a flag is a field, or field==number"),

@@ -289,7 +289,7 @@ DAMAGED_TABLES = {
     "velocity in km/h": (scale(3.6, "vx", "vy", "vz"), 'velocity.unit = "km/h" they would'),
     "position in mm": (scale(1000.0, "px", "py", "pz"), "position.*units"),
     "rates in deg/s": (scale(57.3, "wx", "wy", "wz"), 'rates.unit = "deg/s" they would'),
-    "rates against": (negate("wx", "wy", "wz"), "does not turn as it is told"),
+    "rates against": (negate("wx", "wy", "wz"), "does not turn as commanded"),
     "thrust downwards": (negate("c"), 'thrust is never above zero.*positive = "down"'),
     "thrust in g": (scale(1 / 9.80665, "c"), 'thrust.unit = "g" they would'),
     "thrust of nothing": (scale(0.0, "c"), "thrust is 0 throughout; thrust.fields must name"),
@@ -411,7 +411,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(LogError, match="no such file"):
         read_flight_log(tmp_path / "nowhere.csv")
     (tmp_path / "log.txt").write_text("t\n1\n")
-    with pytest.raises(LogError, match=r"say what is where.* maps by name: ardupilot, "):
+    with pytest.raises(LogError, match=r"describe its fields.* maps by name: ardupilot, "):
         read_flight_log(tmp_path / "log.txt")
     for name, text in (("a.LOG", "mavlogdump.py"), ("a.tlog", "mavlogdump.py"), ("a.px4log", "sdlog2_dump.py")):
         (tmp_path / name).write_bytes(b"1")

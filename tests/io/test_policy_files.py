@@ -192,7 +192,7 @@ def test_policy_is_not_a_learner_state(tmp_path, setup, states):
     with pytest.raises(CheckpointError, match="holds a 'policy', expected a 'learnt'"):
         load_learner_state(path)
     save_learner_state(path, states["full"], setup.preset)
-    with pytest.raises(CheckpointError, match="holds a learner state; go on from it"):
+    with pytest.raises(CheckpointError, match="holds a learner state; continue from it"):
         load_policy(path)
     with pytest.raises(CheckpointError, match=r"nothing: no such file; `retrim fly --out DIR`"):
         load_learner_state(tmp_path / "nothing")

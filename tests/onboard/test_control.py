@@ -491,7 +491,7 @@ def test_too_slow_controller_does_not_take_off(monkeypatch, slow):
     flight.loop.warm_up()
     part = getattr(flight.loop.pilot, slow)
     monkeypatch.setattr(flight.loop.pilot, slow, lambda *argument: time.sleep((SHARE - PHASE) * DT) or part(*argument))
-    with pytest.raises(PlantError, match=r"takes \d+ ms to decide, here and in NumPy, of a tick of 20 ms"):
+    with pytest.raises(PlantError, match=r"takes \d+ ms here, in NumPy; in a tick of 20 ms"):
         flight.loop.warm_up()
 
 

@@ -317,7 +317,7 @@ def test_vision_methods_depend_on_preset(tmp_path):
     text = retrim("reproduce", "vision", "--methods", "base", "datt", cwd=tmp_path, code=1)
     assert "--methods datt: it is trained by a measured state" in text
     text = retrim("reproduce", "vision", "--presets", "vision/paper", "--methods", "indi", cwd=tmp_path, code=1)
-    assert "method 'indi' needs the state, and preset 'vision/paper' shows keypoints" in text
+    assert "method 'indi' needs the state, and preset 'vision/paper' observes keypoints" in text
 
 
 def test_retraining_continues_over_chunks_and_discards_first(monkeypatch):

@@ -88,7 +88,7 @@ def test_flies_as_method_without_rate_commands(policies):
 
 
 @pytest.mark.parametrize(
-    ("scenario", "text"), [(Scenario(plant="simple"), "plant 'bem' alone"), (Scenario(sensors="rough"), "'ideal'")]
+    ("scenario", "text"), [(Scenario(plant="simple"), "only plant 'bem'"), (Scenario(sensors="rough"), "'ideal'")]
 )
 def test_unsupported_scenario_is_refused_before_flight(scenario, text, policies):
     with pytest.raises(ConfigError, match=text):

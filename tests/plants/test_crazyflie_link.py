@@ -158,7 +158,7 @@ def test_logs_are_requested_by_number(wire, link):
         (lambda data: None, "does not answer on port 13 in 0.3 s"),
         (
             firmware_responder([*crtp.STATE_LOG, "pm.vbat"]),
-            "logs no stabilizer.thrust, supervisor.info; its firmware is too old",
+            "does not log stabilizer.thrust, supervisor.info; its firmware is too old",
         ),
         (firmware_responder([*crtp.STATE_LOG, *crtp.STATUS_LOG], refuses=12), "refuses a block of its log: error 12"),
     ],

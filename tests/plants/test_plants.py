@@ -347,7 +347,7 @@ def test_missing_ros_2_packages_are_reported_before_training(installed, monkeypa
 
 def test_missing_firmware_is_reported_before_training(monkeypatch):
     monkeypatch.setenv("RETRIM_BETAFLIGHT", "/nowhere")
-    with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere: no program"):
+    with pytest.raises(PlantError, match="RETRIM_BETAFLIGHT=/nowhere: not a program"):
         FlightArguments(plant="betaflight").scenario(load("hover/retrim"))
 
 
@@ -406,5 +406,5 @@ def test_mujoco_drag_is_that_of_vehicle():
 @pytest.mark.parametrize(("name", "cls"), [("mujoco", MujocoPlant), ("crazyflow", CrazyflowPlant)])
 def test_tick_must_be_whole_steps(name, cls):
     pytest.importorskip(name)
-    with pytest.raises(ValueError, match="no multiple of the simulator's step"):
+    with pytest.raises(ValueError, match="not a multiple of the simulator's step"):
         cls(*([small()] if cls is MujocoPlant else []), Constant(jnp.zeros(3)), dt=0.003)

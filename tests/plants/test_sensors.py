@@ -142,7 +142,7 @@ def test_invalid_times_are_refused():
     zero = jnp.array(0.0)
     with pytest.raises(ValueError, match="period = 0 ms"):
         SensorModel(zero, zero, zero, zero, 0, 0)
-    with pytest.raises(ValueError, match="no multiple of the 10 ms of SensorModel"):
+    with pytest.raises(ValueError, match="not a multiple of the 10 ms of SensorModel"):
         plant(SensorModel.of(), dt=0.025)
 
 

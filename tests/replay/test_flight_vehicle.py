@@ -60,7 +60,8 @@ def test_too_short_flight_is_refused_in_one_line(sample_flight, tmp_path, capsys
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("found.txt", "must end in .toml"), ("nowhere/found.toml", "does not exist; create it first")]
+    ("name", "message"),
+    [("found.txt", "must end with .toml"), ("nowhere/found.toml", "does not exist; create it first")],
 )
 def test_unwritable_file_is_refused_before_flight(tmp_path, name, message):
     with pytest.raises(ConfigError, match=message):

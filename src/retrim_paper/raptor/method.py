@@ -22,7 +22,7 @@ def add_raptor(setup: Setup, plant: Plant) -> SimPlant:
         PlantError: The package with the RAPTOR network is not installed.
     """
     if not isinstance(plant, SimPlant) or not isinstance(plant.simulation.model, BemQuadrotor):
-        raise ConfigError("method 'raptor' commands motors, which plant 'bem' has: fly it there")
+        raise ConfigError("method 'raptor' commands motors, which only plant 'bem' accepts: fly it there")
     if plant.simulation.sensors is not None:
         raise ConfigError(
             "method 'raptor' reads the state on board, without noise or delay: fly it with sensors 'ideal'"
