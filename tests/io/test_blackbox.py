@@ -132,17 +132,17 @@ def slow():
 REFUSED = {
     "empty": (lambda: b"", "it is empty"),
     "garbage": (lambda: bytes(range(256)) * 40, "no flight begins in it"),
-    "a header that is torn": (lambda: LOG[:120], "does not describe its frames"),
-    "a header and nothing else": (lambda: LOG[: LOG.index(b"resolution:0\n") + 13], "a header and no sample"),
+    "an incomplete header": (lambda: LOG[:120], "does not describe its frames"),
+    "only a header": (lambda: LOG[: LOG.index(b"resolution:0\n") + 13], "a header and no sample"),
     "a few milliseconds": (lambda: blackbox(brief(0.3)), "of flight are left, at least 1 s"),
     "lists that do not match": (lambda: LOG.replace(b"signed:0,0,", b"signed:0,0,0,", 1), "fields do not match"),
-    "a code that nobody knows": (lambda: LOG.replace(b"I encoding:1,1,0", b"I encoding:1,1,77", 1), "no I frame"),
+    "an unknown encoding": (lambda: LOG.replace(b"I encoding:1,1,0", b"I encoding:1,1,77", 1), "no I frame"),
     "huge lists": (
         lambda: LOG.replace(b"Field I name:", b"Field I name:" + b"a," * 40_000, 1), "torn|do not match|is damaged"
     ),
-    "another firmware": (without(**{"Firmware revision": "INAV 7.1.0"}), "written by INAV 7.1.0, not by Betaflight"),
+    "a different firmware": (without(**{"Firmware revision": "INAV 7.1.0"}), "written by INAV 7.1.0, not by Betaflight"),
     "no gyroscope": (without("gyro"), "the log has no gyroADC; `set blackbox_disable_gyro = OFF` logs it"),
-    "a gyroscope that stands": (
+    "a constant gyroscope": (
         lambda: blackbox(BodyFlight(FLIGHT.t, FLIGHT.command, 0.0 * FLIGHT.rates, FLIGHT.motors, FLIGHT.force)),
         "the gyroscope measures nothing",
     ),

@@ -146,7 +146,7 @@ def slow():
 REFUSED = {
     "empty": (lambda: b"", "it is empty"),
     "garbage": (lambda: bytes(range(256)) * 40, "no message describes the others"),
-    "descriptions alone": (formats, "no field"),
+    "descriptions only": (formats, "no field"),
     "short": (lambda: dataflash(flight_messages(fly_once(0.5, dt=0.01))), "at least 1 s are needed"),
     "no rates": (
         lambda: dataflash(flight_messages(FLIGHT, without=("RATE", "XKF1")), without=("RATE", "XKF1")),

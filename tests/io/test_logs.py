@@ -264,8 +264,8 @@ def frd(table):
 
 DAMAGED_TABLES = {
     "no column": (lambda table: {n: x for n, x in table.items() if n != "pz"}, "no field 'pz'; there are t, px"),
-    "nothing finite": (modify("vx", with_nan), "velocity has no finite sample"),
-    "time stands still": (modify("t", lambda t: 0 * t), "all at one time"),
+    "no finite sample": (modify("vx", with_nan), "velocity has no finite sample"),
+    "constant time": (modify("t", lambda t: 0 * t), "all at one time"),
     "time goes back": (modify("t", back), "goes back 1 times.*several flights"),
     "time in ms": (scale(1000.0, "t"), "every 20 s.*is time in ms"),
     "time too fine": (scale(1e-6, "t"), "is time in ms, us or ns"),
@@ -292,9 +292,9 @@ DAMAGED_TABLES = {
     "rates against": (negate("wx", "wy", "wz"), "does not turn as commanded"),
     "thrust downwards": (negate("c"), 'thrust is never above zero.*positive = "down"'),
     "thrust in g": (scale(1 / 9.80665, "c"), 'thrust.unit = "g" they would'),
-    "thrust of nothing": (scale(0.0, "c"), "thrust is 0 throughout; thrust.fields must name"),
+    "zero thrust": (scale(0.0, "c"), "thrust is 0 throughout; thrust.fields must name"),
     "position does not change": (at_rest, "position"),
-    "positions of another time": (other_time, "position"),
+    "shifted positions": (other_time, "position"),
 }
 
 
@@ -325,7 +325,7 @@ DAMAGED_FILES = {
     "no header": (lambda text: "\n".join(text.splitlines()[1:]), "first line must name the columns"),
     "a word": (lambda text: cut_line(text, 7, "0.1,oops" + ",0" * 13), "line 8, column 'px': 'oops' is not a number"),
     "a short line": (lambda text: cut_line(text, 7, "0.1,0,0"), "line 8: 3 cells, but the header has 15"),
-    "twice a column": (lambda text: text.replace("px,py", "px,px"), "two columns are named 'px'"),
+    "a duplicate column": (lambda text: text.replace("px,py", "px,px"), "two columns are named 'px'"),
     "an open list": (lambda text: cut_line(text, 3, "0.1,[1" + ",0" * 13), "is not a number"),
     "blanks only": (lambda text: "\n \n\n", "."),
 }
