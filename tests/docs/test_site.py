@@ -90,7 +90,7 @@ def test_options_have_default_and_meaning():
 
 
 @pytest.mark.parametrize("page", sorted((DOCS / "how-to").glob("[!i]*.md")), ids=lambda page: page.stem)
-def test_each_page_names_what_it_was_tested_on(page):
-    """The hook of the site shows badges from the first line of the page's head."""
+def test_each_page_states_its_test_environment(page):
+    """The hook of the site shows badges from the first line of the front matter."""
     head = page.read_text().split("\n", 2)[1]
     assert re.fullmatch(r"tested: \[(simulation|firmware|vehicle)(, (firmware|vehicle))*\]", head)

@@ -47,7 +47,7 @@ if ends == "released":
 
 
 class Stack:
-    """A flight stack that holds its last command for ever, and a link to it in a process of its own."""
+    """A flight stack that holds its last command indefinitely, and a link to it in a separate process."""
 
     def __init__(self, kind, ends=""):
         self.kind, self.frames = kind, []
@@ -78,7 +78,7 @@ class Stack:
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             if select.select([self._mine], [], [], left)[0]:
-                with contextlib.suppress(OSError):  # a line, when its last holder has closed it
+                with contextlib.suppress(OSError):  # a serial line whose last holder has closed it
                     data = os.read(self._mine.fileno(), 4096)
                     now = time.monotonic()
                     self.frames += [(now, *values) for values in FRAME.iter_unpack(data)]
@@ -93,11 +93,11 @@ class Stack:
         self._mine.close()
 
     def commands(self, since, tilt):
-        """Arrivals of the commands with a tilt, from an instant on."""
+        """Return the arrivals of the commands with a tilt, from an instant on."""
         return [at for at, _, each in self.frames if each == tilt and at > since]
 
     def speed(self, since, until):
-        """Horizontal speed that a vehicle has gained between two instants, with the last command held [m/s]."""
+        """Return the horizontal speed gained between two instants with the last command held [m/s]."""
         frames = [frame for frame in self.frames if frame[0] <= since][-1:]
         frames += [frame for frame in self.frames if since < frame[0] <= until]
         times = np.array([since, *(frame[0] for frame in frames[1:]), until])
@@ -116,7 +116,7 @@ def of(*kinds, ends=""):
 
 
 @of("udp", "tcp", "serial")
-def test_a_vehicle_whose_link_is_killed_with_its_group_does_not_fly_away(stack):
+def test_guardian_levels_vehicle_after_link_is_killed(stack):
     stack.listen(0.8)
     assert stack.commands(0.0, 0.2)
     assert not stack.commands(0.0, 0.0)  # the guardian is silent while the link commands
@@ -132,7 +132,7 @@ def test_a_vehicle_whose_link_is_killed_with_its_group_does_not_fly_away(stack):
 
 
 @of("udp")
-def test_a_link_that_is_silent_is_replaced_until_it_commands_again(stack):
+def test_silent_link_is_replaced_until_it_commands_again(stack):
     stack.listen(0.6)
     stack.link.send_signal(signal.SIGSTOP)
     stopped = time.monotonic()
@@ -151,19 +151,19 @@ def test_a_link_that_is_silent_is_replaced_until_it_commands_again(stack):
     ("stack", "safe"), [(("udp", "released"), False), (("udp", "before it commands"), False), (("udp", "exit"), True)],
     indirect=["stack"], ids=["released", "before it commands", "exit"],
 )  # fmt: skip
-def test_only_a_link_that_has_commanded_and_does_not_release_it_is_replaced(stack, safe):
+def test_only_active_unreleased_link_is_replaced(stack, safe):
     stack.listen(1.0 + LATE_S)
     assert stack.link.wait(5.0) == 0
     assert bool(stack.commands(0.0, 0.0)) == safe
 
 
-def test_it_starts_no_phase_of_no_time():
+def test_invalid_phases_and_times_are_refused():
     for phases, timeout in (((), 0.25), ((Phase((b"x",), 0.0, 1.0),), 0.25), (COMMANDS.phases, float("nan"))):
         with pytest.raises(ConfigError, match="expected phases and times"):
             SafeCommands(phases, timeout)
 
 
-def test_a_guardian_that_has_ended_stops_no_link():
+def test_ended_guardian_does_not_stop_link():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
         guard = Guardian(COMMANDS, line.fileno(), ("127.0.0.1", 9))
         guard.process.kill()

@@ -27,7 +27,7 @@ ORDER = bytes([0, 1, 3, 2, 4, 5, 6, 7])  # AETR: throttle on the third receiver 
 
 
 def vehicle():
-    """The constants are weakly typed, and take the type of what they are combined with."""
+    """Return the vehicle with weakly typed constants, which take the type of their operands."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), small())
 
 
@@ -60,7 +60,7 @@ def status(*modes, faults=0):
 
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=4), st.binary(max_size=12), st.data())
-def test_packets_are_found_in_any_pieces_of_a_stream(messages, noise, data):
+def test_packets_are_found_in_stream_split_anywhere(messages, noise, data):
     noise = noise.replace(b"$", b"?")
     stream = b"".join(noise + msp.encode(code, payload, msp.ANSWER) for code, payload in messages)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=5)))
@@ -71,7 +71,7 @@ def test_packets_are_found_in_any_pieces_of_a_stream(messages, noise, data):
 
 
 @given(st.integers(3, 9), st.integers(1, 255))
-def test_a_damaged_packet_is_left_out_and_the_next_one_is_read(place, bits):
+def test_damaged_packet_is_skipped_and_next_one_is_read(place, bits):
     first = bytearray(msp.encode(105, b"abcd", msp.ANSWER))
     first[place] ^= bits
     parser = msp.Parser()
@@ -79,12 +79,12 @@ def test_a_damaged_packet_is_left_out_and_the_next_one_is_read(place, bits):
     assert [p.payload for p in parser.feed(msp.encode(1, b"ok", msp.ANSWER))][-1:] == [b"ok"]
 
 
-def test_a_refusal_is_not_an_answer():
+def test_refusal_is_not_an_answer():
     (packet,) = msp.Parser().feed(msp.encode(77, b"", msp.REFUSAL))
     assert packet.refused
 
 
-def test_modes_have_the_order_of_the_boxes():
+def test_modes_are_in_order_of_boxes():
     assert msp.Status.of(status(0, 50, faults=3), BOXES) == (frozenset({0, 50}), 3)
     wide = bytes(6) + bytes(4) + bytes(5) + b"\x01" + b"\x02" + b"\x1d" + bytes(4)
     boxes = tuple(range(100, 140))
@@ -97,13 +97,13 @@ def test_modes_have_the_order_of_the_boxes():
 
 
 @given(st.floats(-1.0, 1.0), st.floats(0.5, 5.0), st.floats(0.0, 10.0), st.floats(0.0, 1.0))
-def test_the_stick_of_a_rate_gives_this_rate(stick, centre, more, expo):
+def test_stick_of_rate_gives_this_rate(stick, centre, more, expo):
     curve = (centre, centre + more, expo)
     assert rate_of(stick_of(rate_of(stick, *curve), *curve), *curve) == pytest.approx(rate_of(stick, *curve), abs=0.02)
     assert rate_of(-stick, *curve) == -rate_of(stick, *curve)
 
 
-def test_sticks_stand_where_the_receiver_map_puts_them():
+def test_sticks_follow_receiver_map():
     board = Board.of(answers())
     assert board.version == "BTFL 4.5.1"
     assert board.idle == pytest.approx(0.055)
@@ -116,7 +116,7 @@ def test_sticks_stand_where_the_receiver_map_puts_them():
     assert 1700 < board.channels(0.0, np.zeros(3), level=True)[6] <= 2000
 
 
-def test_a_level_channel_is_not_a_switch_of_another_mode():
+def test_channel_of_angle_mode_is_not_that_of_other_mode():
     shared = bytes([0, 0, 32, 48, 50, 1, 32, 48, 1, 1, 0, 16])
     assert Board.of(answers(MODE_RANGES=shared)).level_channel is None
 
@@ -134,12 +134,12 @@ def test_a_level_channel_is_not_a_switch_of_another_mode():
         ({"RX_MAP": bytes(8)}, r"the receiver's map is \[0, 0, 0, 0\]"),
     ],
 )
-def test_unsuitable_settings_are_refused_with_the_command_that_changes_them(other, text):
+def test_unsuitable_settings_are_refused_with_remedy(other, text):
     with pytest.raises(PlantError, match=text):
         Board.of(answers(**other))
 
 
-def test_the_thrust_curve_goes_through_the_hover():
+def test_thrust_curve_passes_through_hover():
     curve = ThrustCurve(vehicle(), 0.055)
     with pytest.raises(PlantError, match="before the vehicle hovers"):
         curve.throttle(9.8)
@@ -163,18 +163,18 @@ def test_the_thrust_curve_goes_through_the_hover():
         "tcp:h:1,pose=cyclonedds@x:1:/a",
     ],
 )  # fmt: skip
-def test_other_addresses_are_refused_before_anything_is_trained(text):
+def test_invalid_addresses_are_refused_before_training(text):
     with pytest.raises(ConfigError, match="expected"):
         Scenario(plant=f"msp:{text}" if text else "msp")
 
 
-def test_an_address_has_a_port_and_a_topic():
+def test_address_has_port_and_topic():
     port, states = msp_address_of("serial:/dev/ttyAMA0:115200,odometry=zenoh@10.0.0.7:7447:/vio/odom")
     assert port == "serial:/dev/ttyAMA0:115200"
     assert (states.backend, states.router, states.odometry, states.pose) == ("zenoh", "10.0.0.7:7447", "/vio/odom", "")
 
 
-def test_a_connection_that_nobody_accepts_is_one_line():
+def test_refused_connection_gives_one_line():
     with pytest.raises(PlantError, match=r"tcp:127\.0\.0\.1:9 cannot be connected to"):
         TcpEndpoint("127.0.0.1", 9)
     with pytest.raises(ConfigError, match="expected udp:HOST:PORT"):
@@ -199,7 +199,7 @@ def test_bytes_pass_in_both_directions():
 
 
 class FakeBoard:
-    """A board: it answers requests at once, and follows the override if its switch is on and its mask permits."""
+    """A board that answers requests immediately, and follows the override if its switch is on and its mask permits."""
 
     def __init__(self, *, follows=True, **other):
         self.rows, self.follows, self.modes = answers(**other), follows, {msp.ARM}
@@ -242,7 +242,7 @@ def requests(data):
 
 
 class FakeStates(SimpleNamespace):
-    """Motion capture of a vehicle that stands in the air."""
+    """Motion capture of a vehicle at rest in the air."""
 
     def __init__(self, p=(0.0, 0.0, 1.0)):
         super().__init__(p=np.array(p), notes=[], is_seen=True, rate=100.0)
@@ -261,7 +261,7 @@ class FakeStates(SimpleNamespace):
 
 @pytest.fixture
 def make(monkeypatch):
-    """A function that returns a plant, its board and its states."""
+    """Return a function that builds a plant, its board and its states."""
     open_boards = []
 
     def build(**other):
@@ -302,14 +302,14 @@ def read_for(plant, seconds):
         plant.wait(time.monotonic() + 0.02)
 
 
-def test_before_the_hand_over_the_board_gets_the_pilot_s_own_sticks(make):
+def test_board_receives_pilot_sticks_before_hand_over(make):
     plant, board, _ = make()
     plant.connect()
     plant.wait(time.monotonic() + 0.2)
     assert board.sent[:4] == [1500, 1500, 1335, 1500]
 
 
-def test_hover_throttle_is_that_of_the_pilot_and_the_switch_hands_over(make):
+def test_hover_throttle_is_learned_from_pilot_and_switch_hands_over(make):
     plant, board, _ = make()
     hand_over(plant, board)
     assert plant.curve.hover == pytest.approx((1335 - 1050) / 950)
@@ -319,8 +319,8 @@ def test_hover_throttle_is_that_of_the_pilot_and_the_switch_hands_over(make):
     assert board.sent[0] > 1500
 
 
-def test_a_switch_that_is_on_too_early_is_waited_for(make):
-    """The board has no valid commands of ours before the pilot has hovered."""
+def test_switch_that_is_on_too_early_must_be_turned_off(make):
+    """The board has no valid commands before the pilot has hovered."""
     plant, board, _ = make()
     board.modes.add(msp.OVERRIDE)
     began = time.monotonic()
@@ -336,7 +336,7 @@ def test_a_switch_that_is_on_too_early_is_waited_for(make):
     assert plant.curve.hover == pytest.approx((1335 - 1050) / 950)
 
 
-def test_the_pilot_has_the_vehicle_as_soon_as_the_switch_is_off(make):
+def test_pilot_has_control_as_soon_as_switch_is_off(make):
     plant, board, _ = make()
     hand_over(plant, board)
     board.modes.discard(msp.OVERRIDE)
@@ -347,20 +347,20 @@ def test_the_pilot_has_the_vehicle_as_soon_as_the_switch_is_off(make):
     assert len(board.received) == sent
 
 
-def test_a_mask_that_leaves_the_sticks_to_the_pilot_is_found_at_the_hand_over(make):
+def test_unsuitable_mask_is_found_at_hand_over(make):
     plant, board, _ = make(follows=False)
     with pytest.raises(PlantError, match="set msp_override_channels_mask to 15"):
         hand_over(plant, board)
 
 
-def test_angle_mode_is_refused_at_the_hand_over(make):
+def test_angle_mode_is_refused_at_hand_over(make):
     plant, board, _ = make()
     board.modes.add(msp.ANGLE)
     with pytest.raises(PlantError, match="body rates need ACRO"):
         hand_over(plant, board)
 
 
-def test_a_board_that_becomes_silent_ends_the_flight(make):
+def test_silent_board_ends_flight(make):
     plant, board, _ = make()
     hand_over(plant, board)
     board.is_silent = True
@@ -368,7 +368,7 @@ def test_a_board_that_becomes_silent_ends_the_flight(make):
         read_for(plant, 1.2)
 
 
-def test_a_board_that_never_answers_is_one_line(make, monkeypatch):
+def test_board_without_answer_gives_one_line(make, monkeypatch):
     monkeypatch.setattr("retrim.plants.bridges.msp_link.ANSWERS_S", 0.3)
     plant, board, _ = make()
     board.is_silent = True
@@ -376,7 +376,7 @@ def test_a_board_that_never_answers_is_one_line(make, monkeypatch):
         plant.connect()
 
 
-def test_on_the_ground_the_motors_stop_and_in_the_air_the_guardian_takes_over(make):
+def test_motors_stop_on_ground_and_guardian_takes_over_in_air(make):
     plant, board, states = make()
     hand_over(plant, board)
     states.p = np.array([0.0, 0.0, 0.1])
@@ -395,7 +395,7 @@ def test_on_the_ground_the_motors_stop_and_in_the_air_the_guardian_takes_over(ma
     guardian.process.kill()
 
 
-def test_states_that_stop_end_the_flight(make):
+def test_missing_states_end_flight(make):
     plant, board, states = make()
     hand_over(plant, board)
     states.is_seen = False
@@ -403,7 +403,7 @@ def test_states_that_stop_end_the_flight(make):
         plant.read()
 
 
-def test_a_lost_answer_does_not_stop_the_requests(make):
+def test_lost_answer_does_not_stop_requests(make):
     plant, board, _ = make()
     plant.connect()
     lost = []
@@ -421,8 +421,8 @@ def test_a_lost_answer_does_not_stop_the_requests(make):
     assert plant.link.lag < 0.1
 
 
-def test_a_board_that_reads_late_ends_the_flight(make):
-    """Commands would wait in its buffer, and act later and later."""
+def test_late_board_ends_flight(make):
+    """Otherwise commands would wait in its buffer and act with a growing delay."""
     plant, board, _ = make()
     hand_over(plant, board, after=2.4)
     late, count = [], itertools.count()
@@ -445,7 +445,7 @@ def fly_for(plant, seconds):
         plant.wait(time.monotonic() + 0.02)
 
 
-def test_the_link_counts_damaged_packets():
+def test_link_counts_damaged_packets():
     board = FakeBoard()
     link = MspLink(board, FakeStates())
     data = bytearray(msp.encode(1, b"abc", msp.ANSWER))
