@@ -22,12 +22,12 @@ COLUMNS = (
     "remarks",
 )  # fmt: skip
 INTRO = """\
-Made by `retrim bench`. Each work runs in a process of its own, from an empty compile cache unless the work names
-another one; where one core is given, the process was kept on one. Times are medians. A unit is the time of this
-machine, on as many cores and in the same seconds, for 1,000 products of 10 rows with a matrix of 512 x 512 in a scan.
-Units compare machines where seconds do not. of the limit: the time of the products of an update at the rate of a unit,
-as a share of its time. Where there is an accelerator, the process of all cores uses it, and that of one core
-does not. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
+Made by `retrim bench`. Each benchmark runs in a separate process, from an empty compile cache unless the row names a
+different one; in the columns for one core, the process was restricted to one core. Times are medians. A unit is the
+time of this machine, on as many cores and in the same seconds, for 1,000 products of 10 rows with a matrix of 512 x 512
+in a scan. Units compare machines where seconds do not. of the limit: the time of the products of an update at the rate
+of a unit, as a share of its time. If there is an accelerator, the process for all cores uses it, and the process for
+one core does not. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
 
 
 def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) -> bool:

@@ -123,7 +123,7 @@ def direction(s: LoadState, x: State, ahead: float = 0.0) -> Float[Array, "3"]:
     Args:
         s: Load.
         x: Vehicle.
-        ahead: Time for which both move on with their velocities [s].
+        ahead: Time over which both are extrapolated with their velocities [s].
     """
     r = s.p - x.p + ahead * (s.v - x.v)
     return r / jnp.sqrt(jnp.sum(r * r) + 1e-12)

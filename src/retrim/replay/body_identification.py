@@ -2,7 +2,7 @@
 
 Measured body rates are compared with commanded ones, and the specific force along the thrust axis with the motor
 commands. Both follow after a delay, behind a lag; see :mod:`retrim.replay.response_fit`. The delay counts from the
-setpoint in the autopilot, so that the delay of a link to it is not in it.
+setpoint in the autopilot, so that it does not include the delay of a link.
 """
 
 from dataclasses import dataclass

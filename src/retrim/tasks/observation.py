@@ -82,7 +82,7 @@ class AbstractObservation(eqx.Module, Generic[M]):
 
     @property
     def previews_residual(self) -> bool:
-        """Whether a learned residual belongs into the observation; by default, the frame of flight contains it."""
+        """Whether a learned residual belongs to the observation; by default, the frame of flight contains it."""
         return False
 
     def with_residual(self, residual: Residual) -> "AbstractObservation[M]":

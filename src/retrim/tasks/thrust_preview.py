@@ -49,7 +49,7 @@ class ThrustPreview(AbstractObservation[Float[Array, "history 4"]]):
 
     @property
     def previews_residual(self) -> bool:
-        """Whether a learned residual belongs into the observation; true."""
+        """Whether a learned residual belongs to the observation; true."""
         return True
 
     def with_residual(self, residual: Residual) -> "ThrustPreview":

@@ -28,7 +28,7 @@ DISTURBANCES = {"hover": ("none", "large", "step", "gusts", "pickup"), "track": 
 REFERENCES: dict[str, tuple[str | None, ...]] = {"hover": (None,), "track": ("circle", "figure8")}
 INTRO = """\
 Made by `retrim reproduce ablation`. Mean error after 5 s of flight [m]: mean ± standard deviation over training seeds
-and starts; the error after a change of the world counts, and not only the error at the end. Small quadrotor on
+and starts; this includes the error after a change in conditions, and not only the final error. Small quadrotor on
 plant `bem`, ideal sensors. Learning is charged to flight time by fixed latencies. A setting of pretraining has its own
 policies."""
 

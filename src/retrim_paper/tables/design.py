@@ -62,7 +62,7 @@ def design(
         f"base policy under 2 m/s² along +x on plant `{PLANT}`; one residual network for each model, "
         f"{FIT_EPOCHS} epochs; {epochs} epochs of the policy, {ENVS} roll-outs each; then {starts} flights of "
         f"{SCORED_S:g} s without further learning, scored over their last 2 s. Times are medians over seeds and "
-        f"programs of {CHUNK} epochs, with their range; the ways take turns. Compiling: as the "
+        f"programs of {CHUNK} epochs, with their range; the variants alternate. Compiling: as the "
         "machine's compile cache had it, for the first seed. High fidelity: rotors, thrust map, "
         "drag and rate controller at 1 kHz; its gradient is its own, or that of the point mass."
     )

@@ -13,10 +13,10 @@ from .levels import Levels, fly_levels
 
 INTRO = """\
 Made by `retrim reproduce fast`. Mean distance from the present point of the reference [m], over the last 10 s: mean ±
-standard deviation over flights. In step: after the best constant shift in time. Cross-track: distance from the
-nearest point of the lap. `circle=8`: a top speed of 8 m/s, on a circle as large as the vehicle's acceleration needs;
-`star=1.5`: so fast through its corners, too, which no vehicle can fly. A file is a loop that training never saw;
-`race.csv` comes with the examples. The wind is steady. Learning is charged to flight time by the preset's
+standard deviation over flights. In step: after the best constant shift in time. Cross-track: distance from the nearest
+point of the lap. `circle=8`: a top speed of 8 m/s, on a circle as large as the vehicle's acceleration needs;
+`star=1.5`: this speed also through its corners, which no vehicle can fly. A file is a loop that was not part of
+training; `race.csv` comes with the examples. The wind is steady. Learning is charged to flight time by the preset's
 fixed latencies. The paper has no such table."""
 LEVELS = {"none": "no disturbance", "wind=4": "wind of 4 m/s", "large": "large, 2 m/s² per axis"}
 

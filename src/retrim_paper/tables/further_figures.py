@@ -32,9 +32,8 @@ def figures_table(rows: Sequence[dict[str, Any]], title: str, levels: Mapping[st
         if row["disturbance"] == level
     )
     about = (
-        "The interval is a bootstrap's over seeds and flights that did not crash; medians are over all flights, a "
-        "crash counting as infinite; "
-        "rates are root mean squares of the commands after 5 s."
+        "The interval is from a bootstrap over seeds and flights that did not crash; medians are over all flights, "
+        "where a crash counts as infinite; rates are root mean squares of the commands after 5 s."
     )
     return TableSection(("method", *columns), lines, f"{title}: {levels[level]}", about)
 

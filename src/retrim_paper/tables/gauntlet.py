@@ -36,16 +36,16 @@ FAULT_METHODS = ("base", "base-do", "geometric-i", "indi", "full", "lora")
 CORES = 2  # cores used by one condition; only its adapting flights, from a few starts, take long
 METRICS = {"steady": "[m]", "late": "[m]", "peak": "[m]", "recovery_5cm": "[s]", "recovery_2cm": "[s]"}
 INTRO = """\
-Made by `retrim gauntlet`. The preset's own vehicle on plant `bem`, with {sensors} sensors, unless the row names
-another one, at hover or on the reference that the row names. steady: mean error over the last 2 s of hover, or the last
-10 s of tracking; late: mean error after 5 s; peak: largest error after 5 s; recovery: time after a change of the world
-until the error stays below 5 or 2 cm (without a change: from the start, 1 m away). Means over flights, and the worst
-in brackets; a flight that crashed, or did not recover, is infinite (∞). Learning is charged to flight time by the
-preset's fixed latencies."""
+Made by `retrim gauntlet`. The preset's own vehicle on plant `bem`, with {sensors} sensors, unless the row names a
+different one, at hover or on the reference that the row names. steady: mean error over the last 2 s of hover, or the
+last 10 s of tracking; late: mean error after 5 s; peak: largest error after 5 s; recovery: time after a change in
+conditions until the error stays below 5 or 2 cm (without a change: from the start, 1 m away). Means over flights, and
+the worst in brackets; a flight that crashed, or did not recover, is infinite (∞). Learning is charged to flight time by
+the preset's fixed latencies."""
 
 FAULTS_INTRO = """\
 Made by `retrim gauntlet --faults`. The preset's own vehicle on plant `bem` with {sensors} sensors hovers under a push
-of 0.5 m/s^2 per axis and one fault, which the policy does not know: a fault of the measurements (the names are those of
+of 0.5 m/s^2 per axis and one fault, which is unknown to the policy: a fault of the measurements (the names are those of
 `--fault`), of the command delay, of the mass or of the thrust. steady: mean error over the last 2 s; late: mean error
 after 5 s; peak: largest error after 5 s, all of the true position; recovery: time from the start, 1 m away, until the
 error stays below 5 or 2 cm. Means over flights, and the worst in brackets; a flight that crashed, or did not recover,

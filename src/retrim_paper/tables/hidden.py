@@ -91,7 +91,7 @@ SCORINGS = {
         _hover_scores,
         "error 5 s after the push [m], worst flight",
         "error: mean from 5 to 6 s after the push. to 10 cm, to 2 cm: time after the push until the error stays below; "
-        "infinite where it never does. peak: largest error after the push.",
+        "infinite if it never does. peak: largest error after the push.",
     ),
     "track": Scoring(
         {"rmse_m": "RMSE [m]", "peak_m": "peak [m]"},

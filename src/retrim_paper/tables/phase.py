@@ -21,11 +21,11 @@ observation, with one policy for each reference and reading. Error over the last
 over flights, at the reference's own time; in step: after the best constant shift in time; cross-track: from the nearest
 point of the lap. In brackets the paper's figures, which are from its own plant. Readings:"""
 LIMITS = """\
-A blind policy has no information about the phase of its reference: its closed loop is an oscillator of its own, and no
+A blind policy has no information about the phase of its reference: its closed loop is an autonomous oscillator, and no
 command can correct a shift that it cannot observe, so that its error is about as large as the reference. A relative
 policy observes its error and corrects it, but it cannot know where on the reference it is: it reacts to a corner of the
 star after the corner, and a constant lag of the plant remains unless past commands show it. A policy with both observes
-where it is and where it should be, can learn one reference by heart and begins its turn before the corner."""
+where it is and where it should be, can memorise one reference, and begins its turn before the corner."""
 DELAY: dict[str, Any] = {"delay_ticks": 1, "command_history": 2}
 READINGS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "blind": ("o = [p, R, v], 15 numbers", "blind", {}),

@@ -84,7 +84,7 @@ def plants(
         f"everywhere. Steady-state error [m], over the last 2 s of {seconds:g} s: mean ± standard deviation over\n"
         f"{len(seeds)} training seeds x {starts} starts. `none` to `large`: 0, 0.5 and 2 m/s² per axis. Learning is\n"
         "charged to flight time by the preset's fixed latencies. On bem and simple the small quadrotor flies with\n"
-        f"3.5 % more thrust than commanded, unless the row names another one; {own}."
+        f"3.5 % more thrust than commanded, unless the row names a different one; {own}."
     )
     document = Document(run, "plants", "Hover in many scenarios, on every plant", intro, seeds, reporter)
     study = train_all(base, seeds, run, reporter)

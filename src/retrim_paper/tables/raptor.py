@@ -13,11 +13,10 @@ from .levels import Levels, fly_levels
 INTRO = """\
 Made by `retrim reproduce raptor`. RAPTOR is one network for quadrotors of 32 g to 2.4 kg that lift 1.5 to 5 times their
 weight; it commands the four motors at 100 Hz and adapts in its hidden state, without any training. Here it is on board
-of the blade-element plant instead of the rate controller: it reads the state itself, without delay, and its
-commands act at once, where all others command body rates at 50 Hz over 20 ms of delay. Error over the last 2 s of hover
-and the last 10 s of tracking [m]: mean ± standard deviation over flights. Policies that are trained know the vehicle's
-mass and limits; RAPTOR does not know the vehicle. Learning is charged to flight time by the preset's fixed
-latencies."""
+of the blade-element plant instead of the rate controller: it reads the state itself, without delay, and its commands
+act immediately; all other methods command body rates at 50 Hz with 20 ms of delay. Error over the last 2 s of hover and
+the last 10 s of tracking [m]: mean ± standard deviation over flights. Trained policies receive the vehicle's mass and
+limits; RAPTOR does not receive vehicle data. Learning is charged to flight time by the preset's fixed latencies."""
 DISTURBED = {
     "none": "no disturbance",
     "weak-rotor": "weak rotor",

@@ -12,11 +12,11 @@ from .levels import Levels, fly_levels
 
 INTRO = """\
 Made by `retrim reproduce transfer`. The real flights of the paper, on the blade-element plant: a load of 70 g below the
-small quadrotor (190 g become 260 g, +37 %, and another inertia), a fan that blows diagonally, and policies of the small
-quadrotor on the large one (600 g, other rotors, another rate controller's response). Error over the last 2 s of hover
-and the last 10 s of tracking [m]: mean ± standard deviation over flights. No method knows load, fan or vehicle; the
-thrust command is normalised by the mass that the flight controller knows. Learning is charged to flight time by the
-preset's fixed latencies. The paper gives no figures for these flights."""
+small quadrotor (190 g become 260 g, +37 %, and a different inertia), a fan that blows diagonally, and policies of the
+small quadrotor on the large one (600 g, different rotors, a different response of the rate controller). Error over the
+last 2 s of hover and the last 10 s of tracking [m]: mean ± standard deviation over flights. The load, the fan and the
+vehicle are unknown to all methods; the thrust command is normalised by the mass that the flight controller knows.
+Learning is charged to flight time by the preset's fixed latencies. The paper gives no figures for these flights."""
 ENTRANTS = ("base", "base-i", "base-do", "geometric-i", "indi", "l1-mpc", "full", "lora")
 """The base policy, and methods that compensate for a load or wind."""
 HOVER_LEVELS = {"none": "alone", "payload": "with a load", "fan": "in front of a fan", "payload+fan": "load and fan"}

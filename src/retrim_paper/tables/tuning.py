@@ -88,8 +88,8 @@ def tuning(
         f"Made by `retrim reproduce tuning --shown {shown}`. {candidates} candidates for each method (a third for "
         "MPPI), drawn evenly in the logarithm of each range, and the present settings, fly the small quadrotor on "
         f"plant `{plant}` by {VIEWS[shown]}, from {starts} starts (seed {seed}) under: {lines}. The score is the root "
-        f"mean square of the error after {SETTLING:g} s, the mean over flights [m], a crash counting {CRASH:g} m. No "
-        "table flies these conditions, starts or seeds."
+        f"mean square of the error after {SETTLING:g} s, the mean over flights [m], where a crash counts as "
+        f"{CRASH:g} m. No table flies these conditions, starts or seeds."
     )
     stem = "tuning" if shown == "state" else f"tuning_{shown}"
     document = Document(run, stem, "Settings of the baselines", intro, [], reporter)

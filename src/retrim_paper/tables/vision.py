@@ -29,8 +29,8 @@ INTRO = """\
 Made by `retrim reproduce vision`. Steady-state error [m], the mean over the last 2 s: mean ± standard deviation
 over flights. Small quadrotor; seven points on the ground, five frames, three past commands, no state. The
 residual is learned from the state, as in the paper. Learning is charged to flight time by the preset's fixed
-latencies. Controllers without a policy fly by the estimate of the pose filter, which sees the points that the
-policy sees; INDI also has an inertial unit, which the policy does not have. In brackets the paper's figures,
+latencies. Controllers without a policy use the estimate of the pose filter, which receives the points that the policy
+observes; INDI also has an inertial unit, which the policy does not have. In brackets the paper's figures,
 which are from its own plant."""
 
 

@@ -142,7 +142,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.link.pump(until)
 
     def land(self) -> None:
-        """Land the Crazyflie using its own commander, and disarm it; ignore a vehicle that no longer answers."""
+        """Land the Crazyflie using its own commander, and disarm it; ignore a vehicle that no longer responds."""
         link, self._link = self._link, None
         self._release_guardian()
         if link is None:
