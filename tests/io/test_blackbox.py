@@ -138,7 +138,8 @@ REFUSED = {
     "lists that do not match": (lambda: LOG.replace(b"signed:0,0,", b"signed:0,0,0,", 1), "fields do not match"),
     "an unknown encoding": (lambda: LOG.replace(b"I encoding:1,1,0", b"I encoding:1,1,77", 1), "no I frame"),
     "huge lists": (
-        lambda: LOG.replace(b"Field I name:", b"Field I name:" + b"a," * 40_000, 1), "incomplete|do not match|is damaged"
+        lambda: LOG.replace(b"Field I name:", b"Field I name:" + b"a," * 40_000, 1),
+        "incomplete|do not match|is damaged",
     ),
     "other firmware": (without(**{"Firmware revision": "INAV 7.1.0"}), "written by INAV 7.1.0, not by Betaflight"),
     "no gyroscope": (without("gyro"), "the log has no gyroADC; `set blackbox_disable_gyro = OFF` logs it"),

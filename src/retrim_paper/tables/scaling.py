@@ -115,12 +115,12 @@ def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
         lines.append((f"{m}", _time(compiling + bounds[most]), most))
     about = (
         f"Not measured, but computed: {MANY:,} such flights on this number of machines of this kind, with a Dask "
-        f"scheduler. Time = compiling ({compiling:.0f} s, on all machines at once, as measured above) + the largest of: "
-        f"flying ({1e3 * per_flight:.0f} ms a flight, measured above, divided by the machines); the network of the "
-        f"client, who receives {size / 1e3:.0f} kB a flight (measured) at {LINK / 1e6:.0f} MB/s (assumed, a gigabit); the "
-        f"scheduler, at {1e3 * JOB_S:.0f} ms a job of {CPU_LIMIT} flights (assumed). Training, slow machines and lost "
-        "machines are not included. Beyond the network's limit, more machines do not help; several clients help, "
-        "each with a part of the seeds."
+        f"scheduler. Time = compiling ({compiling:.0f} s, on all machines at once, as measured above) + the largest "
+        f"of: flying ({1e3 * per_flight:.0f} ms a flight, measured above, divided by the machines); the network of "
+        f"the client, who receives {size / 1e3:.0f} kB a flight (measured) at {LINK / 1e6:.0f} MB/s (assumed, a "
+        f"gigabit); the scheduler, at {1e3 * JOB_S:.0f} ms a job of {CPU_LIMIT} flights (assumed). Training, slow "
+        "machines and lost machines are not included. Beyond the network's limit, more machines do not help; several "
+        "clients help, each with a part of the seeds."
     )
     return TableSection(("machines", "time", "what takes longest"), tuple(lines), "On more machines", about)
 
