@@ -247,7 +247,7 @@ def test_frame_is_limited_and_defined_near_free_fall():
 
 
 def test_pose_filter_estimate_rotates_image(key):
-    """With a correct estimate, the command under a push equals that of the calm flight, and the last command is kept."""
+    """With a correct estimate, the command under a push equals that of the calm flight; the last command is kept."""
     d, x = jnp.array([1.5, -1.0, 2.0]), State(HOME + jnp.array([0.1, -0.1, 0.1]), jnp.eye(3), jnp.zeros(3))
     frame = EffectiveGravityFrame.of(d)
     full = Keypoints.of(HOME, small().omega_max, whitened=False)
@@ -376,7 +376,7 @@ def test_known_rate_bias_is_subtracted_from_command(key):
 
 
 def test_corrected_model_has_observed_rates(key):
-    """In the world it has the bias and the lag; in the frame, whose controller compensates for the bias, only the lag."""
+    """In the world it has bias and lag; in the frame, whose controller compensates for the bias, only the lag."""
     model = RegressionModel.of(0.02)
     fresh = model.init(key)
     names = replace_fields(

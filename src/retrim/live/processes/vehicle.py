@@ -70,7 +70,7 @@ def _carry(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: ParentWatch, 
         if setpoint is None:
             holds += 1  # without a new command the autopilot keeps the last one for as long as it permits
             if silent_ticks * plan.dt > ALONE and parent.has_ended():
-                return "nobody commands, and the supervisor is gone"
+                return "no commands arrive, and the supervisor is gone"
         elif setpoint.is_final:
             return setpoint.ending(float(now.p[2]))
         else:

