@@ -50,8 +50,7 @@ class LearnerServer:
         self._place = tempfile.TemporaryDirectory(prefix="retrim-ground-")
         self.folder = Path(self._place.name)
         self.address, self._fleet, self._trust = address, fleet, trust
-        self.processes: dict[str, Popen[bytes] | FleetSlot] = {}
-        self.restarts: dict[str, int] = {}
+        self.processes, self.restarts = dict[str, Popen[bytes] | FleetSlot](), dict[str, int]()
         self._mission: LearnerMission | None = None
         self._distrust: float | None = None
         self._bus: SharedMemoryBus | None = None
