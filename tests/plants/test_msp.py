@@ -399,7 +399,7 @@ def test_missing_states_end_flight(make):
     plant, board, states = make()
     hand_over(plant, board)
     states.is_seen = False
-    with pytest.raises(PlantError, match="no state has come for 1\.5 s"):
+    with pytest.raises(PlantError, match=r"no state has come for 1\.5 s"):
         plant.read()
 
 
