@@ -250,9 +250,7 @@ def learn_for(
     if twice := [str(each) for i, each in enumerate(addresses) if each in addresses[:i]]:
         raise ConfigError(f"address {twice[0]} is listed twice; each vehicle needs its own address or key")
     if len({(each.host, each.port) for each in addresses if each.kind == "ros"}) > 1:
-        raise ConfigError(
-            "vehicles at several rosmasters: a process of ROS 1 supports one; give them names at one master"
-        )
+        raise ConfigError("vehicles at several rosmasters: a process of ROS 1 has one; give them names at one master")
     for each in addresses:
         each.check_shared()
     with ExitStack() as stack:
