@@ -1,8 +1,8 @@
 """Make the check of a nested function once, instead of each time that its definition runs.
 
 The import hook checks the shapes and types of every function. For a function inside a function, it generates and
-compiles the check again at every call of the outer one, more than a millisecond each time. What it generates depends on
-the code and on the annotations, so it is kept by both; all arguments and results are checked as before.
+compiles the check again at every call of the outer one, which takes more than a millisecond. The check depends on the
+code and the annotations, so it is kept for each pair of them. All arguments and results are checked as before.
 """
 
 import functools
@@ -17,7 +17,7 @@ _GENERATED = ("_destring_annotation", "_make_fn_with_signature", "_apply_typeche
 
 
 def keep_checks():
-    """Keep what jaxtyping generates for nested functions; where its private names have changed, nothing is kept."""
+    """Keep the checks that jaxtyping generates for nested functions; keep none if its private names have changed."""
     module = getattr(jaxtyping, "_decorator", None)
     if not all(hasattr(module, name) for name in _GENERATED):
         return
@@ -60,7 +60,7 @@ def keep_checks():
 
 
 def _identity(annotation):
-    """Return what two annotations have in common if they check the same."""
+    """Return a value that is equal for annotations with the same check."""
     if isinstance(annotation, type) and issubclass(annotation, AbstractArray):
         return _identity(annotation.array_type), annotation.dtypes, annotation.dim_str
     arguments = typing.get_args(annotation)
