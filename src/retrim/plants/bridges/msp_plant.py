@@ -16,9 +16,9 @@ from ..entry import PlantEntry, PlantRequest
 from . import msp
 from .endpoint import address_of, open_endpoint
 from .guardian import Guardian, Phase, SafeCommands
-from .manual_start_plant import GO_S, ManualStartPlant
 from .msp_board import ThrustCurve
 from .msp_link import MspLink, StateLink
+from .piloted_plant import GO_S, PilotedPlant
 from .polling import KeepOn
 from .ros2 import await_states, connect_link
 from .ros2_address import Ros2Address
@@ -64,7 +64,7 @@ def msp_address_of(text: str) -> MspAddress:
     return MspAddress(parts["port"], states)
 
 
-class MspPlant(ManualStartPlant[MspLink]):
+class MspPlant(PilotedPlant[MspLink]):
     """A vehicle that a pilot takes off, and hands over by the switch of the mode MSP OVERRIDE.
 
     Before the hand-over, the board receives the pilot's own sticks. At the start of the flight, the pilot hovers; the
@@ -75,7 +75,9 @@ class MspPlant(ManualStartPlant[MspLink]):
     this process ends or is silent.
     """
 
-    def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, vehicle: Vehicle) -> None:
+    def __init__(
+        self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float, vehicle: Vehicle
+    ) -> None:
         """Build a plant; it opens the port when it connects.
 
         Args:
@@ -83,13 +85,14 @@ class MspPlant(ManualStartPlant[MspLink]):
             dt: Control period [s].
             low: Smallest command [c, omega].
             high: Largest command [c, omega].
+            strongest: Total thrust per mass at full throttle [m/s^2].
             vehicle: Vehicle whose motors determine the shape of the thrust curve.
 
         Raises:
             ConfigError: The address is invalid.
         """
         self._where, self._vehicle = msp_address_of(address), vehicle
-        super().__init__(f"msp:{address}", dt, low, high)
+        super().__init__(f"msp:{address}", dt, low, high, strongest)
         fence = np.full(3, 1e3)
         self._limits = Limits(-fence, fence, low, high)
         self._curve: ThrustCurve | None = None
@@ -117,7 +120,7 @@ class MspPlant(ManualStartPlant[MspLink]):
         link = self.link
         began = time.monotonic()
         while self.curve.hover is None:
-            self._place = self.await_start(p, yaw, keep_on)
+            super().take_off(p, yaw, keep_on)
             link.throttles.clear()  # they are the pilot's, since none is recorded under MSP OVERRIDE
             self.until(lambda: False, HOVER_S, keep_on)
             if link.has_mode(msp.ARM) and not link.has_mode(msp.OVERRIDE):
@@ -126,6 +129,8 @@ class MspPlant(ManualStartPlant[MspLink]):
                 raise PlantError(
                     f"{self.address}: for {GO_S:g} s nobody has hovered at the start with MSP OVERRIDE off"
                 )
+        x = self.reading()
+        self._place = x.p.copy() if p is None else np.asarray(p, dtype=float)
         hover = self._hover()
 
         def is_ours() -> bool:
@@ -271,7 +276,9 @@ class MspPlant(ManualStartPlant[MspLink]):
 
 
 def _make(request: PlantRequest) -> MspPlant:
-    return MspPlant(request.address, request.dt, *request.limits, request.vehicle)
+    vehicle = request.vehicle
+    strongest = float(vehicle.thrust_max / vehicle.mass)
+    return MspPlant(request.address, request.dt, *request.limits, strongest, vehicle)
 
 
 def _check_installed() -> None:

@@ -1,5 +1,6 @@
 """Base class of plants for a vehicle that another pilot takes off, hands over, and takes back."""
 
+import math
 import time
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -8,12 +9,15 @@ import numpy as np
 from ...errors import PlantError
 from ...physics.state import STANDARD_GRAVITY
 from .frames import heading_of
-from .linked_plant import VehicleLink
-from .manual_start_plant import ManualStartPlant
+from .linked_plant import LinkedPlant, VehicleLink
 from .polling import KeepOn
 from .target_guardian import SINK, SINK_BY_FILE, TargetGuardian
+from .vehicle_state import VehicleState
 
-WAIT_S, READY_S = 10.0, 20.0  # [s], limits for the first state, and for the start of the guardian
+# [s], limits for the first state, for the flight to the start, and for the start of the guardian
+WAIT_S, GO_S, READY_S = 10.0, 120.0, 20.0
+LOST_S = 1.5  # [s] of silence; after 2 s the guard would stop the motors
+HEADING = math.radians(20.0)
 
 
 @runtime_checkable
@@ -36,7 +40,7 @@ class TargetLink(VehicleLink, Protocol):
 L = TypeVar("L", bound=TargetLink)
 
 
-class PilotedPlant(ManualStartPlant[L]):
+class PilotedPlant(LinkedPlant[L]):
     """A vehicle that is handed over.
 
     The other pilot (mavros, or a flight stack's pilot) takes off, flies the vehicle to the start, and follows our
@@ -65,7 +69,21 @@ class PilotedPlant(ManualStartPlant[L]):
         """Wait until another pilot has flown the vehicle to the start and the vehicle stays there."""
         guardian = self._guardian = self._guardian or self.link.target_guardian()
         guardian.release()  # from an earlier start
-        self.await_start(p, yaw, keep_on)
+        x = self.reading()
+        place = x.p if p is None else np.asarray(p, dtype=float)
+        stays = self.staying(place)
+
+        def ready() -> bool:
+            away = 0.0 if yaw is None else heading_of(self.reading().R) - yaw
+            return stays() and abs(math.remainder(away, math.tau)) < HEADING
+
+        if not self.until(ready, GO_S, keep_on):
+            x = self.reading()
+            raise PlantError(
+                f"{self.address}: the vehicle was not flown to {place.round(2).tolist()} m"
+                f"{'' if yaw is None else f', heading {math.degrees(yaw):.0f} deg'}, in {GO_S:g} s; it is at "
+                f"{x.p.round(2).tolist()} m, {math.degrees(heading_of(x.R)):.0f} deg"
+            )
         share = SINK if self._learn_thrust(keep_on) else SINK_BY_FILE
         if not self.until(guardian.is_ready, READY_S, keep_on):
             raise PlantError(f"{self.address}: the node of the guardian has not started in {READY_S:g} s")
@@ -75,6 +93,13 @@ class PilotedPlant(ManualStartPlant[L]):
     def hold(self, until: float) -> None:
         """Let the other pilot hold the vehicle's position."""
         self.wait(until)
+
+    def read(self) -> VehicleState:
+        """Return the newest state."""
+        now, link = time.monotonic(), self.link
+        if now - link.last_message > LOST_S:
+            raise PlantError(f"no state has come for {LOST_S:g} s; the other pilot has control again")
+        return self.reading().at(now)
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
         """Publish a target."""
