@@ -5,8 +5,9 @@ import re
 import numpy as np
 
 from ..errors import ConfigError, PlantError
-from ..plants.bridges.piloted_plant import WAIT_S, PilotedPlant
+from ..plants.bridges.piloted_plant import WAIT_S
 from ..plants.bridges.polling import KeepOn
+from ..plants.bridges.target_plant import TargetPlant
 from ..plants.entry import PlantEntry, PlantRequest
 from .link import ODOMETRY, POSE, RosLink
 from .node import system_module
@@ -15,7 +16,7 @@ MASTER, NAMESPACE = "127.0.0.1:11311", "/mavros"
 ADDRESS = re.compile(r"(?P<master>[\w.-]+:\d{1,5})(?P<namespace>(/\w+)*)")
 
 
-class RosPlant(PilotedPlant[RosLink]):
+class RosPlant(TargetPlant[RosLink]):
     """A vehicle whose states and targets are ROS 1 topics; the world and body frames are the ROS frames, as are ours.
 
     The other pilot is mavros, or a flight stack's pilot.

@@ -7,15 +7,12 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from ...errors import PlantError
-from ...physics.state import STANDARD_GRAVITY
 from .frames import heading_of
 from .linked_plant import LinkedPlant, VehicleLink
 from .polling import KeepOn
-from .target_guardian import SINK, SINK_BY_FILE, TargetGuardian
 from .vehicle_state import VehicleState
 
-# [s], limits for the first state, for the flight to the start, and for the start of the guardian
-WAIT_S, GO_S, READY_S = 10.0, 120.0, 20.0
+WAIT_S, GO_S = 10.0, 120.0  # [s], limits for the first state, and for the flight to the start
 LOST_S = 1.5  # [s] of silence; after 2 s the guard would stop the motors
 HEADING = math.radians(20.0)
 
@@ -26,12 +23,6 @@ class TargetLink(VehicleLink, Protocol):
 
     def fly_rates(self, thrust: float, omega: np.ndarray) -> None:
         """Send a target: share of the motors' thrust, and body rates in our frame [rad/s]."""
-
-    def target_guardian(self) -> TargetGuardian:
-        """Start a guardian that publishes on the same topic."""
-
-    def level_target(self, thrust: float, yaw: float) -> bytes:
-        """Return a serialised target: share of the motors' thrust, level attitude, and heading [rad]."""
 
     def close(self) -> None:
         """Leave the network."""
@@ -44,10 +35,9 @@ class PilotedPlant(LinkedPlant[L]):
     """A vehicle that is handed over.
 
     The other pilot (mavros, or a flight stack's pilot) takes off, flies the vehicle to the start, and follows our
-    targets while they are published. The other pilot takes back control when the targets stop. Some stacks hold the
-    last target instead; a guardian therefore publishes a level one when the link ends. Thrust per mass is converted to
-    a share of the motors' thrust using the vehicle's mass and largest thrust; adaptation compensates for errors in
-    these values.
+    targets while they are published. The other pilot takes back control when the targets stop. Thrust per mass is
+    converted to a share of the motors' thrust using the vehicle's mass and largest thrust; adaptation compensates for
+    errors in these values.
     """
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
@@ -63,12 +53,9 @@ class PilotedPlant(LinkedPlant[L]):
         super().__init__(address, dt, low, high)
         self.strongest = strongest
         """Total thrust per mass at full throttle [m/s^2]."""
-        self._guardian: TargetGuardian | None = None
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Wait until another pilot has flown the vehicle to the start and the vehicle stays there."""
-        guardian = self._guardian = self._guardian or self.link.target_guardian()
-        guardian.release()  # from an earlier start
         x = self.reading()
         place = x.p if p is None else np.asarray(p, dtype=float)
         stays = self.staying(place)
@@ -84,11 +71,6 @@ class PilotedPlant(LinkedPlant[L]):
                 f"{'' if yaw is None else f', heading {math.degrees(yaw):.0f} deg'}, in {GO_S:g} s; it is at "
                 f"{x.p.round(2).tolist()} m, {math.degrees(heading_of(x.R)):.0f} deg"
             )
-        share = SINK if self._learn_thrust(keep_on) else SINK_BY_FILE
-        if not self.until(guardian.is_ready, READY_S, keep_on):
-            raise PlantError(f"{self.address}: the node of the guardian has not started in {READY_S:g} s")
-        thrust = min(1.0, share * STANDARD_GRAVITY / self.strongest)
-        guardian.guard(self.link.level_target(thrust, heading_of(self.reading().R)))
 
     def hold(self, until: float) -> None:
         """Let the other pilot hold the vehicle's position."""
@@ -105,8 +87,6 @@ class PilotedPlant(LinkedPlant[L]):
         """Publish a target."""
         thrust = float(np.clip(u[0] / self.strongest, 0.0, 1.0))
         self.link.fly_rates(thrust, u[1:])
-        if self._guardian is not None:
-            self._guardian.feed()
         return np.concatenate([[thrust * self.strongest], u[1:]])
 
     def wait(self, until: float) -> None:
@@ -114,14 +94,7 @@ class PilotedPlant(LinkedPlant[L]):
         time.sleep(max(0.0, until - time.monotonic()))
 
     def land(self) -> None:
-        """Stop publishing, so the other pilot takes back control; the last target is a level one."""
+        """Stop publishing, so the other pilot takes back control."""
         link, self._link = self._link, None
-        guardian, self._guardian = self._guardian, None
-        if guardian is not None:
-            guardian.close()
         if link is not None:
             link.close()
-
-    def _learn_thrust(self, keep_on: KeepOn) -> bool:
-        """Identify the thrust at hover, if the vehicle publishes it, and return whether it does."""
-        return False

@@ -13,11 +13,11 @@ from ...ros2.node import Ros2Node
 from ..entry import PlantEntry, PlantRequest
 from .linked_plant import ThrustScale
 from .offboard_plant import THRUST_S, OffboardPlant
-from .piloted_plant import PilotedPlant
 from .polling import KeepOn
 from .ros2_address import Ros2Address, address_of
 from .ros2_link import MavrosLink, Ros2Link
 from .ros2_px4_link import Px4Link
+from .target_plant import TargetPlant
 
 WAIT_S, LISTENER_S = 10.0, 5.0  # [s], limits for the first state, and for listeners to the setpoints
 CROWD_S = 25.0  # [s] for which a killed node may still be listed
@@ -85,7 +85,7 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
         )
 
 
-class MavrosPlant(PilotedPlant[MavrosLink]):
+class MavrosPlant(TargetPlant[MavrosLink]):
     """A vehicle behind mavros; thrust is scaled by the autopilot's thrust at hover, where mavros publishes it."""
 
     def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
