@@ -212,7 +212,8 @@ def children_of(supervisor):
     with contextlib.suppress(OSError):
         for pid in map(int, Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()):
             words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-            result[words[-2].decode().rpartition(".")[2]] = pid
+            if len(words) > 1:  # not a zombie
+                result[words[-2].decode().rpartition(".")[2]] = pid
     return result
 
 

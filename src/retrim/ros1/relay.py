@@ -1,16 +1,16 @@
 """A node that publishes the attitude targets of its standard input: ``main`` of a process that a guardian writes to."""
 
-import os
 import sys
+import time
 
-from ..ros2.relay import outlive_flight, publish_frames
+from ..ros2.relay import publish_frames, stand_apart
 from .attitude_target import attitude_target
 from .node import join
 
 
 def main() -> None:
     """Publish on a topic; the words are the address of the rosmaster and the topic."""
-    outlive_flight()
+    stand_apart()  # before threads start
     master, topic = sys.argv[1:]
     rospy, kind = join(master), attitude_target()
     publisher = rospy.Publisher(topic, kind, queue_size=10, tcp_nodelay=True)
@@ -18,5 +18,4 @@ def main() -> None:
         lambda data: publisher.publish(kind().deserialize(data)), lambda: publisher.get_num_connections() > 0,
         sys.stdin.buffer,
     )  # fmt: skip
-    rospy.sleep(0.1)  # until the last message has left
-    os._exit(0)  # threads of rospy can keep an interpreter from ending
+    time.sleep(0.1)  # until the last message has left

@@ -1,5 +1,6 @@
 """A node that publishes the messages of its standard input: ``main`` of the process that a guardian writes to."""
 
+import contextlib
 import os
 import signal
 import sys
@@ -26,16 +27,17 @@ def publish_frames(publish: Callable[[bytes], object], has_listener: Callable[[]
         publish(pipe.read(int.from_bytes(head, "little")))
 
 
-def outlive_flight() -> None:
-    """Ignore the signals that end a flight, and give up the real-time priority of the link.
+def stand_apart() -> None:
+    """Ignore the signals that end a flight, and give up the priority and the cores that a link passes on.
 
-    The end of the pipe ends this process. With the priority of the link, a thread of a ROS library that spins would
-    take a core from the flight.
+    The threads of a node at a real-time priority would take the core from the flight. The end of the pipe ends this
+    process.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    if hasattr(os, "sched_setscheduler"):
+    with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
 
 
 def main() -> None:
@@ -44,7 +46,7 @@ def main() -> None:
     from .message_type import message_type
     from .node import COMMAND
 
-    outlive_flight()
+    stand_apart()
     backend, router, topic, name = sys.argv[1:]
     node = open_node(backend, (), router)
     publish = node.advertise(topic, message_type(name), COMMAND)
