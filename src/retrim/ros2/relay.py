@@ -24,7 +24,9 @@ def publish_frames(publish: Callable[[bytes], object], has_listener: Callable[[]
         time.sleep(0.02)
     print("ready", flush=True)
     while len(head := pipe.read(4)) == 4:
-        publish(pipe.read(int.from_bytes(head, "little")))
+        length = int.from_bytes(head, "little")
+        if len(message := pipe.read(length)) == length:
+            publish(message)
 
 
 def stand_apart() -> None:
