@@ -285,7 +285,7 @@ def test_the_link_process_is_killed(rig, tmp_path):
     check(rig, key, fault)
 
 
-@asserts(["all processes killed"], LINKS)
+@asserts(["all processes killed"], LINKS, fly_by=["mavlink", "ros2:px4", "ros2:mavros", "crazyflie"])
 def test_all_processes_are_killed(rig, tmp_path):
     key = rig.name, "all processes killed"
     with flying_alone(spec_of(rig, tmp_path), rig) as processes:
