@@ -15,5 +15,5 @@ def test_whole_messages_come_out_as_they_went_in(messages, lost):
     data = b"".join(frame(each) for each in messages)
     data, whole = (data[:-lost], messages[:-1]) if lost and messages else (data, messages)
     published, looks = [], iter((False, False, True))
-    publish_frames(published.append, lambda: next(looks), io.BytesIO(data))
+    publish_frames(published.append, lambda: next(looks), io.BytesIO(data).read)
     assert published == whole

@@ -16,6 +16,6 @@ def main() -> None:
     publisher = rospy.Publisher(topic, kind, queue_size=10, tcp_nodelay=True)
     publish_frames(
         lambda data: publisher.publish(kind().deserialize(data)), lambda: publisher.get_num_connections() > 0,
-        sys.stdin.buffer,
+        sys.stdin.buffer.read,
     )  # fmt: skip
     time.sleep(0.1)  # until the last message has left

@@ -6,26 +6,27 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from typing import BinaryIO
 
 LISTENER_S = 5.0  # [s], longest wait for a subscription
 
 
-def publish_frames(publish: Callable[[bytes], object], has_listener: Callable[[], bool], pipe: BinaryIO) -> None:
+def publish_frames(
+    publish: Callable[[bytes], object], has_listener: Callable[[], bool], read: Callable[[int], bytes]
+) -> None:
     """Wait for a listener, announce this on the standard output, and publish messages until the pipe is closed.
 
     Args:
         publish: Publishes a serialised message.
         has_listener: Whether another node has subscribed.
-        pipe: Messages, each behind its length in four bytes.
+        read: Reads at most a number of bytes of the pipe: messages, each behind its length in four bytes.
     """
     until = time.monotonic() + LISTENER_S
     while not has_listener() and time.monotonic() < until:
         time.sleep(0.02)
     print("ready", flush=True)
-    while len(head := pipe.read(4)) == 4:
+    while len(head := read(4)) == 4:
         length = int.from_bytes(head, "little")
-        if len(message := pipe.read(length)) == length:
+        if len(message := read(length)) == length:
             publish(message)
 
 
@@ -52,6 +53,6 @@ def main() -> None:
     backend, router, topic, name = sys.argv[1:]
     node = open_node(backend, (), router)
     publish = node.advertise(topic, message_type(name), COMMAND)
-    publish_frames(publish, lambda: any(not each.publishes for each in node.endpoints(topic)), sys.stdin.buffer)
+    publish_frames(publish, lambda: any(not each.publishes for each in node.endpoints(topic)), sys.stdin.buffer.read)
     time.sleep(0.1)  # until the last message has left
     node.close()
