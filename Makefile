@@ -74,10 +74,11 @@ test-page: dev
 	$(UV) pip install --quiet --python $(VENV) --constraints constraints.txt --group browser --editable '.[rerun]'
 	$(BIN)/pytest -n 0 tests/live/test_page.py tests/io/test_recording.py
 
-# Links to vehicles, and the companion computer in C, flown against peers, also while processes are killed and links are
-# cut (docs/how-to/failures.md), and learners in another network namespace: against the clock, one at a time.
+# Links to vehicles, and the companion computer in C, flown against peers, and learners in another network namespace:
+# against the clock, one at a time. LINK_TESTS=link_failures kills processes and cuts links (docs/how-to/failures.md).
+LINK_TESTS := namespaces or autopilots or test_vehicles or companion
 test-links: dev
-	$(BIN)/pytest -n 0 -m "slow and not px4 and not betaflight" -k "namespaces or autopilots or test_vehicles or companion or link_failures"
+	$(BIN)/pytest -n 0 -m "slow and not px4 and not betaflight" -k "$(LINK_TESTS)"
 
 # A sweep by a Dask scheduler and three workers, one of which is killed, while the connection is cut for five seconds; and
 # what eight simulated devices share, beside one.

@@ -59,7 +59,7 @@ DISTURBANCE = (
 )
 PLANT = (
     f"Plant: {join_names(PLANTS)}, or module:name; docs/plant.md describes them. A vehicle has an address: "
-    "mavlink:udp:HOST:PORT, mavlink:serial:DEVICE:BAUD, crazyflie:udp:HOST:PORT, ros2:px4, ros2:mavros, ros:HOST:PORT."
+    "mavlink:udp:HOST:PORT, msp:serial:DEVICE:BAUD,pose=/TOPIC, crazyflie:udp:HOST:PORT, ros2:px4, ros:HOST:PORT."
 )
 REFERENCE = (
     f"Reference of a tracking policy: {join_names(REFERENCES)}, module:name, or a CSV file of t, x, y, z[, yaw]; by "
