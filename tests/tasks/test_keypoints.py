@@ -99,9 +99,9 @@ def test_observation_layout(plain, key):
 
 def test_equal_starts_have_equal_observations(key):
     noisy, us = keypoints(noise=2.0), small_commands(key, 4)
-    first, again = observe_motion(noisy, near_state(), us)[0], observe_motion(noisy, near_observation(), us)[0]
+    first, again = observe_motion(noisy, near_state(), us)[0], observe_motion(noisy, near_state(), us)[0]
     np.testing.assert_array_equal(first, again)
-    elsewhere = replace_fields(near_state(), v=near_observation().v + 0.01)
+    elsewhere = replace_fields(near_state(), v=near_state().v + 0.01)
     quiet = (
         observe_motion(keypoints(noise=0.0), elsewhere, us)[0]
         - observe_motion(keypoints(noise=0.0), near_state(), us)[0]
@@ -113,7 +113,7 @@ def test_observation_is_projection_plus_stated_noise(plain):
     """In pixels: 1280 by 720 across an image that is 2 wide and high."""
     exact = np.asarray(look(plain, near_state())[0])
     noisy = keypoints(noise=3.0)
-    starts = jax.vmap(lambda k: State(near_state().p, near_observation().R, 0.1 * random.normal(k, (3,))))(
+    starts = jax.vmap(lambda k: State(near_state().p, near_state().R, 0.1 * random.normal(k, (3,))))(
         random.split(random.key(4), 600)
     )
 
@@ -216,11 +216,11 @@ def test_frames_are_60_ms_apart_at_every_rate(dt, depth, stride, plain):
     for i, display in enumerate(np.asarray(stack(observation, frames)).reshape(5, 14)):
         then = replace_fields(
             near_state(),
-            p=jnp.asarray(np.asarray(near_state().p) - 0.06 * i * np.asarray(near_observation().v)),
+            p=jnp.asarray(np.asarray(near_state().p) - 0.06 * i * np.asarray(near_state().v)),
         )
         np.testing.assert_allclose(display, np.reshape(look(plain, then)[0], 14), atol=1e-12)
     # This also holds for the first observation of a flight.
-    _, memory = see(observation, begin(observation, near_state()), near_observation(), Command.hover())
+    _, memory = see(observation, begin(observation, near_state()), near_state(), Command.hover())
     np.testing.assert_allclose(memory.frames, frames, atol=1e-12)
 
 

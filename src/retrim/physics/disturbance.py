@@ -216,7 +216,8 @@ class RandomWalk(eqx.Module):
         """Draw a walk from zero with a standard deviation of ``rate`` [m/s^2] after one second, far from the bounds."""
         if not (bound > 0 and rate >= 0 and every > 0 and n >= 2):
             raise ValueError(
-                f"RandomWalk: rate = {rate}, bound = {bound}, every = {every}, n = {n} are not all possible"
+                "RandomWalk: bound and every must be positive, rate at least 0 and n at least 2, got "
+                f"bound = {bound}, every = {every}, rate = {rate}, n = {n}"
             )
         path = jnp.cumsum(rate * every**0.5 * random.normal(key, (n, 3)), axis=0)
         path = path - path[:1]

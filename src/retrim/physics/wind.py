@@ -154,8 +154,8 @@ class Fan(eqx.Module):
         """Draw a jet with gusts of ``intensity`` times its speed and eddies as wide as the outlet."""
         if not (speed > 0 and width > 0 and 0 <= intensity < 1) or float(jnp.linalg.norm(direction[:2])) == 0.0:
             raise ValueError(
-                f"Fan: speed = {speed}, width = {width}, intensity = {intensity}, direction = {direction} "
-                "are not all possible"
+                "Fan: speed and width must be positive, intensity from 0 to 1, and direction not vertical, got "
+                f"speed = {speed}, width = {width}, intensity = {intensity}, direction = {direction}"
             )
         eddies = Turbulence.of(jnp.array(speed), jnp.full(3, 2.0 * width), jnp.full(3, intensity), key=key)
         return cls(outlet, direction, jnp.array(speed), jnp.array(width), eddies)
