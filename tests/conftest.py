@@ -8,8 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 # Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. A
-# program in one piece takes fewer memory maps. The commands that tests start inherit this. What users run is what
-# `make demo` and `make wheel` fly. jaxlib 0.11 and later end the process for a flag that they do not know.
+# program in one piece takes fewer memory maps. The commands that tests start inherit this. `make demo` and
+# `make wheel` fly without these flags, as users do. jaxlib 0.11 and later end the process for a flag that they do not know.
 os.environ["XLA_FLAGS"] = " ".join(
     dict.fromkeys(
         [
@@ -37,9 +37,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 from retrim.runkit.compile_cache import enable_compile_cache, release_programs  # noqa: E402
 
 enable_compile_cache()  # shared by the workers and by the commands that tests start
-# Only what takes long to compile is worth a file: thousands of small programs are not written from test workers.
+# Only programs that compile slowly are worth a file; test workers do not write thousands of small ones.
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
-# What a shell starts in the background ignores Ctrl-C; tests raise it, wherever they run.
+# A background process of a shell ignores Ctrl-C; tests need it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.set_threshold(100_000, 20, 100)  # as it is by default, it takes some per cent of the time
 settings.register_profile("repeatable", derandomize=True)  # the same examples on every machine
@@ -51,7 +51,7 @@ LONG = ("test_examples.py", "test_extensions.py", "cli/", "docs/", "live/", "eva
 
 
 def pytest_collection_modifyitems(config, items):
-    if any("::" in argument for argument in config.args):  # who names tests has an order in mind
+    if any("::" in argument for argument in config.args):  # an explicit list of tests keeps its order
         return
 
     def place(item):
@@ -63,9 +63,9 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture(autouse=True)
 def forget_lowered():
-    """Free what programs were compiled from: JAX keeps it, and with thousands of them compiling takes twice as long.
+    """Free the sources of compiled programs: JAX keeps them, and with thousands of them compiling takes twice as long.
 
-    What was compiled stays. JAX has no public name for this; where its private ones have changed, nothing is freed.
+    The compiled programs stay. JAX has no public name for this; where its private ones have changed, nothing is freed.
     """
     yield
     for module, name in (("jax._src.pjit", "_pjit_lower"), ("jax._src.interpreters.pxla", "_cached_lowering_to_hlo")):
@@ -85,7 +85,7 @@ def optax_promotion():
 def keep_programs():
     """Share compiled programs between files, but free them before they are too many.
 
-    What stays is not looked through for garbage again.
+    The garbage collector does not visit the remaining objects again.
     """
     yield
     if release_programs():

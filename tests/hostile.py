@@ -294,7 +294,7 @@ class CaseMaker:
                     "2^63",
                     "googol",
                     "10^400",
-                )  # the tensor says it
+                )  # the header of the tensor states it
                 yield case(f"{field} {name}", self.lora, {**about, field: text}, fine)
 
     def deltas(self) -> Iterator[Case]:

@@ -67,13 +67,13 @@ def test_copies_go_where_a_builder_puts_them(container, tmp_path):
         (context / path).parent.mkdir(parents=True, exist_ok=True)
         (context / path).write_text(path)
     (context / ".dockerignore").write_text("# patterns\n*\n!a.txt\n!folder\n**/__pycache__\n")
-    image = container.Image(root, {}, "/work")
+    image = container.Image(root, {}, "/data")
     for text in ("a.txt ./", "a.txt /c.txt", "folder other", "folder/b.txt a.txt deep/er/"):
         container.copy_files(text, image, {}, context)
     result = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
-    assert result == {"work/a.txt", "c.txt", "work/other/b.txt", "work/deep/er/b.txt", "work/deep/er/a.txt"}
+    assert result == {"data/a.txt", "c.txt", "data/other/b.txt", "data/deep/er/b.txt", "data/deep/er/a.txt"}
     second = container.Image(tmp_path / "second", {})
-    container.copy_files("--from=first /work/other /x", second, {"first": image}, context)
+    container.copy_files("--from=first /data/other /x", second, {"first": image}, context)
     assert (tmp_path / "second/x/b.txt").read_text() == "folder/b.txt"
     for missing in ("secret /", "nowhere /"):
         with pytest.raises(container.ContainerError, match="no such file"):

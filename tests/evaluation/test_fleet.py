@@ -189,7 +189,7 @@ def test_lot_terminates_each_flight_at_its_tick(fleet):
 
 
 def test_lot_with_different_flight_is_flown_one_by_one(fleet, flights, monkeypatch):
-    """The first two of a lot are alike; all of them are compared before the flight."""
+    """The first two flights of a batch are equal; all of them are compared before the flight."""
 
     look = []
 
@@ -290,7 +290,7 @@ def test_process_builds_setup_once_per_fleet():
     ],
 )
 def test_crash_event_states_cause(fleet, off, why):
-    """The cause is the last event of the flight, alone or in a lot."""
+    """The cause is the last event of the flight, alone or in a batch."""
     setup, policy, spec = fleet.setups[None], fleet.policies[0], fleet.specs[0]
     x0 = State(jnp.array(fleet.preset.goal) + jnp.array(off), jnp.eye(3), 3.0 * jnp.array(off))
     alone = flying.fly_one(setup, policy, spec, x0, 0.4)
@@ -305,7 +305,7 @@ def test_crash_event_states_cause(fleet, off, why):
 
 
 def test_every_flight_receives_initial_learner_state(monkeypatch):
-    """The flights run alone, in a lot, or as a remote job."""
+    """The flights run alone, in a batch, or as a remote job."""
     preset, message = brief_preset(), []
     setup = Setup.from_preset(preset)
     policy = setup.new_policy(jax.random.key(0))

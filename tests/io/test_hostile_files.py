@@ -29,7 +29,7 @@ from retrim.tasks.trajectory_csv import from_csv
 
 LONGEST = 500
 FEW = 101
-"""Of how many cases one is read in every run."""
+"""Every run reads one of this number of cases."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Whole flights that lose their terminal, their folder or their supervisor: what was learnt is there, and it is told.
+"""Whole flights that lose their terminal, folder or supervisor keep and report the learned state.
 
 `make drill` flies them, each at several times.
 """
@@ -62,7 +62,7 @@ def wait_for(condition, seconds=120.0):
 
 
 def fly_once(folder, out, what, seed, page=("--no-page",), seconds=SECONDS):
-    """Fly, and do something once the flight has learnt; return exit code and output."""
+    """Fly, and act after the first policy update; return exit code and output."""
     words = "live", "--policy", "p", "--disturbance", "small", "--seconds", seconds, *page, "--out", out
     process, log = start_process(words, folder), folder / out / "flight.csv"
     at = 50.0 * np.random.default_rng(seed).uniform(3.0, SECONDS - 2.0)  # ticks
@@ -84,7 +84,7 @@ def whole(path):
 
 
 def check_kept(folder):
-    """Assert that what was learnt can be gone on from, and flown."""
+    """Assert that the learner state can be continued, and that its policy flies."""
     state, _ = load_learner_state(folder / "learner_state.safetensors")
     adapted_policy, _ = load_policy(folder / "adapted.safetensors")
     np.testing.assert_array_equal(adapted_policy.layers[0].weight, state.policy.policy.layers[0].weight)
@@ -147,7 +147,7 @@ def test_a_terminal_that_is_closed_lands_the_vehicle_and_all_is_written(folder, 
 
 @pytest.mark.parametrize("seed", DRILLS)
 @pytest.mark.parametrize("how", ["removed", "renamed"])
-def test_a_folder_that_is_gone_is_made_again_with_all_that_was_flown_and_learnt(folder, how, seed):
+def test_a_lost_folder_is_created_again_with_log_and_learner_state(folder, how, seed):
     out = folder / f"{how}{seed}"
     loss = (lambda: shutil.rmtree(out)) if how == "removed" else (lambda: out.rename(f"{out}-elsewhere"))
     code, text = fly_once(folder, out.name, lambda process: loss(), seed)
@@ -217,7 +217,7 @@ def fill(disk):
 
 
 @pytest.mark.parametrize("seed", DRILLS)
-def test_without_supervisor_and_recorder_what_was_learnt_is_kept(folder, seed):
+def test_learner_state_survives_the_loss_of_supervisor_and_recorder(folder, seed):
     out, flight, bus = folder / f"alone{seed}", {}, []
 
     def kill(process):

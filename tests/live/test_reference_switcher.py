@@ -1,4 +1,4 @@
-"""Another reference in flight: a person asks, the vehicle goes over to it, and the learner learns on it."""
+"""Change of the reference in flight: request, transition of the vehicle, and learning on the new reference."""
 
 import dataclasses
 import time
@@ -41,7 +41,7 @@ AT = 1.4  # [s]
 
 @pytest.fixture(scope="module")
 def setups():
-    """A set-up on the circle, what it starts from, and the controller."""
+    """A set-up on the circle, its initial learner state, and the controller."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(brief_preset("track/retrim"), "circle")
         state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
@@ -90,13 +90,13 @@ def test_what_is_followed_is_a_parameter_of_the_controller(setups, table):
         flight.until(0.7)
     other.bus.publish("parameters.reference", message(table, setups[2]))
     for flight in (one, other):
-        flight.until(0.96)  # what is seen 0.4 s ahead is still the old one
+        flight.until(0.96)  # the preview of 0.4 s still shows the old reference
     np.testing.assert_allclose(one.commands, other.commands, atol=0.02)
     for t in (0.9, 2.0, 3.3, 20.0):
         np.testing.assert_allclose(other.loop.pilot.target(t), table(jnp.array(t)).p, atol=1e-9)
         np.testing.assert_allclose(one.loop.pilot.target(t), setups[0].flight_task.target(jnp.array(t)), atol=1e-9)
     assert other.status["versions"] == {"policy": 0, "residual": 0, REFERENCE: 1}
-    assert other.status["swaps"] == []  # nothing was learnt
+    assert other.status["swaps"] == []  # no policy was learned
 
 
 def test_it_stays_whether_learning_is_flown_or_not(setups, table):
@@ -189,7 +189,7 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(setups, tmp_path):
     follows, supervisor = ask(setups, tmp_path)
     assert follows.ask("circle", 1.0) == follows.ask("module:name", 1.0) == []  # followed already; not offered
     assert [event.note for event in follows.ask("figure8", 1.0)] == ["reference figure8"]
-    assert follows.ask("star", 1.0) == []  # one at a time: it is asked for again below
+    assert follows.ask("star", 1.0) == []  # one change at a time; the request is repeated below
     bus = supervisor.bus
     assert poll_requests(follows, supervisor, lambda: bus.latest("parameters.reference") is not None) == []
     assert len(follows.pieces) == 1
@@ -238,7 +238,7 @@ def test_what_leaves_the_fence_or_is_not_taken_is_told(setups, tmp_path, monkeyp
     assert "reference figure8 cannot be followed: it passes" in message
     assert "--fence" in message
     assert supervisor.bus.latest("parameters.reference") is None
-    assert follows.ask("figure8", 2.0) == []  # a page repeats what it wishes
+    assert follows.ask("figure8", 2.0) == []  # a page repeats its request
 
     monkeypatch.setattr(following, "LEAD", 0.05)
     follows.ask("star", 2.0)
@@ -251,7 +251,7 @@ def test_what_leaves_the_fence_or_is_not_taken_is_told(setups, tmp_path, monkeyp
     back = Parameters.unpack(last, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=3)
     np.testing.assert_array_equal(
         back.arrays["rows"], setups[0].flight_reference.rows
-    )  # learners go back to what is flown
+    )  # learners return to the reference of the flight
 
 
 def test_only_who_sees_its_reference_has_a_choice(setups):

@@ -20,10 +20,8 @@ from .betaflight_wire import CLI, settings
 
 VARIABLE = "RETRIM_BETAFLIGHT"
 STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s], time limits
-TAKEN, AGAIN_S = (
-    "bind port",
-    0.5,
-)  # beginning of the program's complaint about a port in use; [s] until the next attempt
+PORT_IN_USE = "bind port"  # part of the program's message about a port in use
+AGAIN_S = 0.5  # [s] until the next attempt
 PRIORITY = 40  # above the processes for control, learning and display
 LISTENING = "0A"  # state of a socket in the kernel's tables
 SETTLES_S = 0.5  # [s] from the start until its command line listens
@@ -106,7 +104,7 @@ class Firmware:
         process = self._launch()
         while not _listens():
             has_ended = process.poll() is not None
-            if has_ended and TAKEN in self._output() and time.monotonic() < until:
+            if has_ended and PORT_IN_USE in self._output() and time.monotonic() < until:
                 time.sleep(AGAIN_S)  # the system has not freed the port of the board before the restart
                 process = self._launch()
             elif has_ended or time.monotonic() > until:

@@ -16,6 +16,7 @@ FORMS = {
     "tcp": "tcp:HOST:PORT, as tcp:127.0.0.1:5761,",
     "serial": "serial:DEVICE:BAUD, as serial:/dev/ttyACM0:921600",
 }
+CLOSED_S = 1e-3  # [s] of a read after the other end has closed, since select then returns at once
 NAP_S = 0.02  # [s], longest time between two calls of the periodic work
 
 
@@ -104,6 +105,8 @@ class TcpEndpoint:
             data = self._socket.recv(LONGEST)
         except OSError:
             return None
+        if not data:
+            time.sleep(CLOSED_S)
         return (data, "line") if data else None
 
     def send(self, data: bytes, to: Any) -> None:

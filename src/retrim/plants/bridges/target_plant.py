@@ -35,18 +35,7 @@ class TargetPlant(PilotedPlant[L]):
     silent, and at the end of a flight.
     """
 
-    def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
-        """Build a plant.
-
-        Args:
-            address: Address of the vehicle, for error messages.
-            dt: Control period [s].
-            low: Smallest command [c, omega].
-            high: Largest command [c, omega].
-            strongest: Total thrust per mass with all motors at full throttle [m/s^2].
-        """
-        super().__init__(address, dt, low, high, strongest)
-        self._guardian: TargetGuardian | None = None
+    _guardian: TargetGuardian | None = None
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Wait until another pilot has flown the vehicle to the start, and start the guardian there."""
