@@ -7,9 +7,9 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-# Nearly all of the suite's time is compiling, and half of that is optimisation that a short test never earns back. A
+# Nearly all of the suite's time is compiling, and half of that is optimisation that does not pay in a short test. A
 # program in one piece takes fewer memory maps. The commands that tests start inherit this. `make demo` and
-# `make wheel` fly without these flags, as users do. jaxlib 0.11 and later end the process for a flag that they do not know.
+# `make wheel` fly without these flags, as users do. jaxlib 0.11 and later end the process for an unknown flag.
 os.environ["XLA_FLAGS"] = " ".join(
     dict.fromkeys(
         [
