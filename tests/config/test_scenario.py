@@ -73,7 +73,7 @@ def test_fan_acts_at_goal_only():
     faster = np.stack([disturbance("fan=9")(jnp.array(t), HERE).wind for t in np.arange(0.0, 20.0, 1.0)]).mean(axis=0)
     assert np.linalg.norm(faster) == pytest.approx(6.0, rel=0.15)
     disturbance("fan=0.1")
-    with pytest.raises(ConfigError, match=r"disturbance 'fan=0': Fan: speed = 0\.0"):
+    with pytest.raises(ConfigError, match=r"disturbance 'fan=0': Fan: speed and width must be positive.*speed = 0\.0"):
         disturbance("fan=0")
 
 
