@@ -12,7 +12,7 @@ DEV := $(VENV)/.installed-dev
 # Some containers forbid compiled Python files; every process would then compile JAX anew, a second and a half each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup dev demo test check docs wheel container mutants drill test-page test-links test-cluster test-ros test-ros2 test-px4 test-crazyflie betaflight test-betaflight bench tables pins clean
+.PHONY: setup dev demo test check docs wheel container mutants drill test-page test-links test-cluster test-ros test-ros2 test-px4 test-crazyflie betaflight test-betaflight test-vehicles bench tables pins clean
 
 setup: $(STAMP)
 
@@ -89,7 +89,8 @@ test-cluster: dev
 # folder of an unpacked PX4, with bin/px4 and etc.
 test-px4: dev
 	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
-		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m px4'
+		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m px4 \
+		--ignore tests/live/test_firmware_vehicles.py'
 
 # The peer that stands in for a Crazyflie, flown by Bitcraze's own client library, in an environment of its own.
 test-crazyflie: dev
@@ -103,7 +104,13 @@ betaflight: dev
 
 test-betaflight: betaflight
 	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
-		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m betaflight'
+		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m betaflight \
+		--ignore tests/live/test_firmware_vehicles.py'
+
+# The same firmware with other gains of the rate controller, from the flight by hand to the hover, in half an hour.
+test-vehicles: betaflight
+	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
+		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m "px4 or betaflight" tests/live/test_firmware_vehicles.py'
 
 # Buses, vehicles and whole flights over ROS 1 with a real rosmaster, installed if there is none, and over zenoh and ROS 2
 # between two network namespaces, which takes the rights of root.

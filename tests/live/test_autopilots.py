@@ -15,19 +15,17 @@ import numpy as np
 import pytest
 
 from peers import peer, start_process
+from px4_rig import ADDRESS, PX4, SIH, Changes
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
 from retrim.plants.bridges import crtp
 from retrim.plants.bridges.crazyflie_link import CrazyflieLink
 from retrim.plants.bridges.endpoint import UdpEndpoint
 from retrim.plants.bridges.mavlink_link import MavlinkLink
-from retrim.testing.px4 import PAYLOAD
 
 pytestmark = pytest.mark.slow
 RETRIM = [sys.executable, "-m", "retrim.cli"]
 PORT = 24570
-PX4 = os.environ.get("RETRIM_PX4", "")
-SIH = str(Path(__file__).parents[2] / "examples/px4_sih.toml")
 HOME = np.array([0.0, 0.0, 1.0])
 TRUE = slice(18, 21)
 
@@ -169,23 +167,6 @@ def bridge_of(supervisor):
 # ---- PX4
 
 PX4_ONLY = pytest.mark.skipif(not PX4, reason="RETRIM_PX4 names no unpacked PX4")
-ADDRESS = "mavlink:udp:127.0.0.1:14540"
-
-
-class Changes:
-    """Sets parameters of PX4 in flight, by a link of its own."""
-
-    def __init__(self):
-        self.link = MavlinkLink(UdpEndpoint("127.0.0.1", PAYLOAD))
-
-    def set_at(self, log, when, flight, **parameters):
-        """Wait for a time of the flight [s], and set them."""
-        while flight.poll() is None and not (log.exists() and len(rows := read_log(log)) and rows[-1, 1] >= when):
-            self.link.pump(time.monotonic() + 0.1)
-        for name, value in parameters.items():
-            for _ in range(3):
-                self.link.set_parameter(name, value)
-                self.link.pump(time.monotonic() + 0.02)
 
 
 @PX4_ONLY

@@ -3,7 +3,8 @@
 ``python -m retrim.testing.betaflight_peer`` starts the board, whose MSP port is ``tcp:127.0.0.1:5761``. The pilot
 takes off and hovers. Motion capture publishes the pose over ROS 2 (``/mocap/quad``). Enter turns the pilot's switch of
 the mode MSP OVERRIDE on or off; Ctrl-C ends the flight. With ``--log FILE``, the pilot flies by hand for half a minute,
-with quick turns and changes of the throttle, and the board's Blackbox is written to the file.
+with quick turns and changes of the throttle, and the board's Blackbox is written to the file. ``--set p_roll=90``
+changes a setting of the board, for a vehicle with another rate controller.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -55,7 +57,14 @@ class BetaflightPeer:
     """A board, a vehicle and its pilot; :meth:`step` advances the pilot by 0.01 s."""
 
     def __init__(
-        self, scenario: Scenario, place: np.ndarray, node: Ros2Node | None, topic: str, *, poses: bool = True
+        self,
+        scenario: Scenario,
+        place: np.ndarray,
+        node: Ros2Node | None,
+        topic: str,
+        *,
+        poses: bool = True,
+        more: Sequence[str] = (),
     ) -> None:
         """Start the board, arm it, and hover.
 
@@ -65,15 +74,16 @@ class BetaflightPeer:
             node: Node through which motion capture publishes; None for no motion capture.
             topic: Topic of the state.
             poses: Whether poses are published, or odometry.
+            more: Further settings of the board, ``NAME=VALUE``.
 
         Raises:
-            PlantError: The firmware is not installed, or does not start.
+            PlantError: The firmware is not installed, does not start, or does not have such a setting.
         """
         vehicle = scenario.make_vehicle("small")
         model = BemQuadrotor.of(vehicle, 0.02, thrust_error=scenario.thrust_error)
         low, high = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
         steps = math.ceil(math.degrees(1.05 * float(np.abs(high[1:]).max())) / 10.0)
-        self._firmware = Firmware(find_firmware(), steps, [*SETTINGS, *LOGS])
+        self._firmware = Firmware(find_firmware(), steps, [*SETTINGS, *LOGS, *(f"set {each}" for each in more)])
         self._limits = low, high
         self._esc, self._thrust_map, self._mass = vehicle.esc, float(model.loop.thrust_map), float(vehicle.mass)
         self.world = World(model, scenario.make_disturbance("small"), math.radians(10.0 * steps))
@@ -193,6 +203,9 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--odometry", action="store_true", help="odometry in place of poses")
     parser.add_argument("--log", default="", help="fly by hand, and write the board's Blackbox to this file")
     parser.add_argument("--seconds", type=float, default=30.0, help="length of the flight by hand")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the board; repeatable"
+    )
     parser.add_argument("--backend", default="", help="rclpy, cyclonedds or zenoh; by default, what is installed")
     return parser.parse_args(words)
 
@@ -208,7 +221,8 @@ def main() -> None:
         return
     node = open_node(options.backend, ("geometry_msgs", "nav_msgs", "std_msgs"))
     try:
-        peer = BetaflightPeer(scenario, np.array(options.place), node, options.topic, poses=not options.odometry)
+        place, poses = np.array(options.place), not options.odometry
+        peer = BetaflightPeer(scenario, place, node, options.topic, poses=poses, more=options.set)
     except PlantError as error:
         sys.exit(str(error))
     print("the pilot hovers; MSP at tcp:127.0.0.1:5761; Enter turns the switch of MSP OVERRIDE", flush=True)
@@ -228,7 +242,7 @@ def write_manual_log(scenario: Scenario, options: argparse.Namespace) -> None:
     """Fly by hand, and write the log."""
     peer = None
     try:
-        peer = BetaflightPeer(scenario, np.array(HIGH_ABOVE), None, "")
+        peer = BetaflightPeer(scenario, np.array(HIGH_ABOVE), None, "", more=options.set)
         peer.fly_by_hand(options.seconds)
         peer.write_log(Path(options.log))
     except (PlantError, OSError) as error:

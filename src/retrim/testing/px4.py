@@ -1,9 +1,11 @@
 """Run PX4's own simulation and simulated motion capture on this machine, for flights without a vehicle.
 
-``python -m retrim.testing.px4 PACKAGE`` runs both until Ctrl-C. PACKAGE is a folder with ``bin/px4`` and ``etc``. PX4
-listens on every address of the machine; a network namespace can isolate it.
+``python -m retrim.testing.px4 PACKAGE`` runs both until Ctrl-C. PACKAGE is a folder with ``bin/px4`` and ``etc``.
+``--set MC_ROLLRATE_P=0.08`` sets a parameter, for a vehicle with another rate controller. PX4 listens on every address
+of the machine; a network namespace can isolate it.
 """
 
+import argparse
 import os
 import signal
 import subprocess
@@ -106,12 +108,30 @@ class MotionCapture:
                 self.link.stream("HIL_STATE_QUATERNION", CAPTURE_RATE)
 
 
-def main() -> None:
+def parameter(text: str) -> tuple[str, float]:
+    """Return the name and the value of ``NAME=VALUE``."""
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be NAME=NUMBER, got {text!r}") from None
+
+
+def main(words: list[str] | None = None) -> None:
     """Run until Ctrl-C."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("package", type=Path, help="folder with bin/px4 and etc")
+    parser.add_argument(
+        "--set",
+        type=parameter,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a parameter of PX4; repeatable",
+    )
+    options = parser.parse_args(words)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if len(sys.argv) != 2:
-        sys.exit("usage: python -m retrim.testing.px4 PACKAGE")
-    with tempfile.TemporaryDirectory() as run, Px4Simulation(Path(sys.argv[1]), Path(run)) as px4:
+    with tempfile.TemporaryDirectory() as run, Px4Simulation(options.package, Path(run), **dict(options.set)) as px4:
         try:
             cameras = MotionCapture()
             print("PX4 flies at udp:127.0.0.1:14540; Ctrl-C ends it", flush=True)
