@@ -1,5 +1,13 @@
 """Exceptions that retrim raises, with a common base class. Each message is one line of limited length."""
 
+import functools
+import sys
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
 LONGEST = 480
 """Maximum length of a message [characters]; invalid input can be megabytes long."""
 CUT = " ... "
@@ -77,3 +85,20 @@ class LogError(RetrimError, ValueError):
 
 class TrainingError(RetrimError, RuntimeError):
     """Training failed because the loss was not a number."""
+
+
+def exit_on_error(main: Callable[P, R]) -> Callable[P, R]:
+    """Make a program end with one line, instead of a traceback, after an error of retrim or of the system.
+
+    Args:
+        main: Main function of the program.
+    """
+
+    @functools.wraps(main)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return main(*args, **kwargs)
+        except (RetrimError, OSError) as error:
+            sys.exit(one_line(str(error)))
+
+    return run

@@ -11,7 +11,7 @@ from live_helpers import TOPICS
 from retrim import ConfigError, Scenario, Setup, changed, load
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.evaluation.fleet import Fleet
-from retrim.live.processes.controllers import plain_source, vehicle_half
+from retrim.live.processes.controllers import adaptive_source, plain_source, vehicle_half
 from retrim.live.processes.identifier import IdentifierLoop
 from retrim.onboard.messages import COLUMNS, COMMAND, MEASURED, FlightRows, Parameters, last_note
 from retrim.onboard.pilot import LivePilot
@@ -176,3 +176,14 @@ def test_the_controller_follows_slowly_and_keeps_the_vehicle_when_learning_is_sw
 def _shapes(setup):
     controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
     return plain_source(setup, controller).parameters[VEHICLE]
+
+
+def test_learning_flight_of_vehicle_file_without_lag_has_numpy_form(setup):
+    """The step response of its rate loop and the start of the estimator are numbers while the flight is traced."""
+    vehicle = VehicleSpec(
+        name="new", mass=0.7, inertia=(0.003, 0.003, 0.005), arm=(0.09, 0.09), thrust_max=30.0,
+        rates_max=(10.0, 10.0, 5.0), motor_tau=0.03,
+    )  # fmt: skip
+    result = Setup.from_preset(changed(setup.preset, vehicle=vehicle))
+    state = result.learner.init(result.new_policy(jax.random.key(0)), jax.random.key(1))
+    assert VEHICLE in adaptive_source(result, state).parameters

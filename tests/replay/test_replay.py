@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +98,8 @@ def test_too_short_log_is_refused_with_remedy(log):
     [
         ({"buffer": 0.0}, "--buffer 0"),
         ({"delay": 2.0}, "--delay 2"),
-        ({"adapt": "full"}, "--adapt and --policy need each other"),
+        ({"adapt": "full"}, "--adapt full needs --policy"),
+        ({"policy": Path("h")}, "--policy needs --adapt METHOD, or --identify"),
         ({"adapt": "base"}, "must be full, lora or none"),
         ({"updates": 0}, "--updates 0"),
     ],

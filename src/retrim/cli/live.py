@@ -21,7 +21,7 @@ from ..live.events import LiveEvents
 from ..live.flying import fly_live
 from ..live.operator.page import page_address
 from ..live.operator.page_opening import open_page
-from ..live.session import LONGEST, LiveRequest, check_limits, learners_at
+from ..live.session import LONGEST, LiveRequest, check_limits, learners_at, live_setup
 from ..live.status import Status
 from ..runkit.document import TableSection
 from ..runkit.flight_memory import FlightMemory, recall_flight, write_memory
@@ -105,7 +105,8 @@ def live(
         shows_page = page or (seconds is None and not no_page)
         address = page_address(page_host, page_port, is_explicit=page, say=RichReporter().say) if shows_page else None
         ground = learners_at(learners, RichReporter().say, key)
-        setup, run = Setup.from_preset(base, scenario.reference), report_start(Run("live", out, stop=stop))
+        setup = live_setup(base, scenario.reference, "base" if adapt == "none" else adapt)
+        run = report_start(Run("live", out, stop=stop))
         if weights is None:
             weights, losses = train(Setup.from_preset(base), seed, reporter=RichReporter(), stop=stop)
             if run.interrupted:

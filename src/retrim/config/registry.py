@@ -120,7 +120,8 @@ class Registry(Mapping[str, T], Generic[T]):
     def _import(self, name: str) -> Any:
         module, _, attribute = name.partition(":")
         if not (all(part.isidentifier() for part in module.split(".")) and attribute.isidentifier()):
-            raise ConfigError(f"no {self._kind} {excerpt(name)}; a Python name has the form module:name")
+            known = suggestion(module, tuple(self))
+            raise ConfigError(f"no {self._kind} {excerpt(name)}; {known}; a Python name has the form module:name")
         here = str(Path.cwd())
         if here not in sys.path:
             sys.path.append(here)

@@ -33,6 +33,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         if path.stat().st_size > MAX_TOML_BYTES:
             raise ConfigError(f"{path}: larger than the {MAX_TOML_BYTES} bytes that are accepted")
         return tomllib.loads(path.read_text(encoding="utf-8"))
+    except ConfigError:
+        raise
     except (ValueError, RecursionError) as error:  # an integer of 5,000 digits also raises ValueError
         raise ConfigError(f"{path}: not TOML ({error})") from error
     except OSError as error:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ..config.scenario import Scenario
-from ..errors import RetrimError
+from ..errors import ConfigError, RetrimError
 from ..plants.bridges.frames import heading_of
 from ..plants.bridges.vehicle_plant import VehiclePlant
 from ..plants.bridges.vehicle_state import VehicleState
@@ -22,6 +22,7 @@ from ..plants.bridges.vehicle_state import VehicleState
 EVERY_S, SHOWN_S = 0.02, 0.5  # [s] between two states, and between two lines
 MOVED, TURNED = 0.1, 0.2  # [m/s] and [rad/s], smallest mean motion that can be compared
 AGREES = 0.8
+LENGTHS_S = 1.0, 3600.0  # [s], length of a check
 SMOOTH = 5  # states over which a difference is taken
 
 
@@ -109,6 +110,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=30.0, help="length of the check")
     options = parser.parse_args(words)
     try:
+        if not LENGTHS_S[0] <= options.seconds <= LENGTHS_S[1]:
+            raise ConfigError(f"--seconds must be {LENGTHS_S[0]:g} to {LENGTHS_S[1]:g}, got {options.seconds:g}")
         scenario = Scenario(plant=options.plant)
         if not scenario.entry.is_vehicle or scenario.entry.has_world:
             sys.exit(f"plant {options.plant!r} is simulated; a link to a vehicle is needed, as mavlink or msp:...")

@@ -16,6 +16,7 @@ from ..adapt.learner_state import LearnerState
 from ..adapt.updates import Layer
 from ..config.faults import measurement_fault
 from ..config.methods import find_method, learning_methods
+from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..config.trust import python_names
@@ -43,6 +44,29 @@ WORLD_S = 60.0  # [s], flight time for which the page describes the disturbance
 STEP = 0.05  # [s] between two positions on the path
 BELOW_GROUND = 0.3  # [m], depth of the fence below z = 0: flights may start at z = 0, and transients go lower
 LONGEST = 3600.0  # [s], maximum duration of a flight
+
+
+def live_setup(preset: Preset, reference: str | None, method: str) -> Setup:
+    """Return the set-up of a live flight after checking, before training begins, that the method suits the preset.
+
+    Args:
+        preset: Preset of the policy.
+        reference: Reference of the flight; None for the one in the preset.
+        method: Method of the flight.
+
+    Raises:
+        ConfigError: The method cannot be used with the preset, or in a live flight.
+    """
+    setup, entry = Setup.from_preset(preset, reference), find_method(method)
+    if entry.on_board is not None:
+        raise ConfigError(
+            f"method {method!r} commands the motors on board; a live flight commands thrust and body rates"
+        )
+    if entry.learns is None and method != "base":
+        policy = setup.new_policy(random.key(0))
+        if not isinstance(setup.pilot(policy, method, random.key(0)), ControllerPilot):
+            raise ConfigError(f"method {method!r} must learn or return a ControllerPilot to fly live")
+    return setup
 
 
 def check_limits(fence: float, seconds: float | None, policy_age: float | None) -> None:
@@ -123,10 +147,6 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         raise ConfigError(f"adapt.window = {window} ticks: a live flight reports at most {MOST_TICKS}")
     start = request.folder / "start.safetensors"
     learns = find_method(request.method).learns is not None
-    if find_method(request.method).on_board is not None:
-        raise ConfigError(
-            f"method {request.method!r} commands the motors on board; a live flight commands thrust and body rates"
-        )
     if learns:
         state = request.state or learner_state(request, request.policy, request.method)
         controller = adaptive_source(setup, state)

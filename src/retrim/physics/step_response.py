@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 from jaxtyping import Array
 
 from .betaflight import RELAX_CUTOFF, RELAX_RATE, Betaflight
@@ -24,9 +25,13 @@ class StepResponse(NamedTuple):
 
 
 def step_responses(vehicle: Vehicle) -> tuple[StepResponse, StepResponse, StepResponse]:
-    """Return the responses of a vehicle's rate loop about roll, pitch and yaw on the plant ``bem``."""
-    tau, throttle, idle = (float(x) for x in (vehicle.motor_tau, _throttle(vehicle), vehicle.esc.idle))
-    room, axes = (1.0 - throttle, throttle - idle), [numbers.tolist() for numbers in _loop(vehicle)]
+    """Return the responses of a vehicle's rate loop about roll, pitch and yaw on the plant ``bem``.
+
+    The vehicle's parameters must be numbers, also where a caller is being compiled.
+    """
+    with jax.ensure_compile_time_eval():
+        tau, throttle, idle = (float(x) for x in (vehicle.motor_tau, _throttle(vehicle), vehicle.esc.idle))
+        room, axes = (1.0 - throttle, throttle - idle), [numbers.tolist() for numbers in _loop(vehicle)]
     roll, pitch, yaw = (_response(*(numbers[k] for numbers in axes), tau=tau, room=room) for k in range(3))
     return roll, pitch, yaw
 

@@ -84,8 +84,10 @@ class Replay:
                 raise ConfigError(f"--{name} {getattr(self, name):g}: must be {least:g} to {most:g} s")
         if self.adapt != "none" and find_method(self.adapt).learns is None:
             raise ConfigError(f"--adapt {self.adapt}: must be {', '.join(learning_methods())} or none")
-        if (self.adapt == "none") != (self.policy is None):
-            raise ConfigError("--adapt and --policy need each other; `retrim pretrain hover --out h` makes a policy")
+        if self.adapt != "none" and self.policy is None:
+            raise ConfigError(f"--adapt {self.adapt} needs --policy; `retrim pretrain hover --out h` makes a policy")
+        if self.policy is not None and self.adapt == "none" and not self.identify:
+            raise ConfigError("--policy needs --adapt METHOD, or --identify for the vehicle of the policy")
         if self.flight is not None and self.flight < 1:
             raise ConfigError(f"--flight {self.flight}: flights are numbered from 1")
         if not 1 <= self.updates <= 10_000:
@@ -145,7 +147,7 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
         document.add(identified_section(vehicle))
         if vehicle.known:
             run.write_text("vehicle.toml", vehicle_toml(vehicle, setup, path.name))
-    if policy is not None and not run.interrupted:
+    if policy is not None and request.adapt != "none" and not run.interrupted:
         document.add(_adapt(request, setup, policy, log, rows, run, reporter))
     document.write()
     return document

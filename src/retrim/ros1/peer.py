@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..config.scenario import Scenario
+from ..errors import exit_on_error
 from ..testing.peer_vehicle import PeerVehicle, fly_until_interrupt
 from .attitude_target import attitude_target
 from .link import ODOMETRY, POSE, TARGET
@@ -89,6 +90,7 @@ class RosPeer:
         self._publisher.publish(message)
 
 
+@exit_on_error
 def main() -> None:
     """Fly until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

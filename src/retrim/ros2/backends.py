@@ -41,8 +41,10 @@ def open_node(backend: str, packages: Iterable[str], router: str = "", domain: i
         domain: Domain of ROS; None for the one of ``ROS_DOMAIN_ID``.
 
     Raises:
-        ConfigError: The back end is not installed, or cannot join the network.
+        ConfigError: There is no such back end, it is not installed, or it cannot join the network.
     """
+    if backend and backend not in BACKENDS:
+        raise ConfigError(f"no back end {backend!r} of ROS 2; there are {', '.join(BACKENDS)}")
     message_type("std_msgs/msg/Header")  # an error if rosbags is missing
     return _opening(router, domain_id() if domain is None else domain)[backend or choose_backend(packages)]()
 

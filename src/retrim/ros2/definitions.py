@@ -116,3 +116,8 @@ def title_of(name: str, release: str) -> str:
 
 def _number(release: str) -> tuple[int, ...]:
     return tuple(int(part) for part in release.split(".") if part.isdigit())
+
+
+_PX4 = {release for name, forms in DEFINITIONS.items() if name.startswith("px4_msgs") for release in forms}
+RELEASES = (NEWEST, *sorted(_PX4, key=_number))
+"""Releases of PX4 in which a message has changed."""

@@ -8,6 +8,7 @@ changes a setting of the board, for a vehicle with another rate controller.
 """
 
 import argparse
+import contextlib
 import math
 import os
 import select
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..config.scenario import Scenario
-from ..errors import PlantError
+from ..errors import ConfigError, PlantError, exit_on_error
 from ..onboard.guard import GeometricHover, Limits
 from ..onboard.realtime import be_punctual
 from ..physics.bem import BemQuadrotor
@@ -50,6 +51,7 @@ LOGS = ["set blackbox_device = VIRTUAL", "set blackbox_sample_rate = 1/8"]
 HIGH_ABOVE = (0.0, 0.0, 50.0)  # [m], where the pilot flies by hand
 TURNS, TURN_S = np.array([1.5, 1.5, 1.0]), 0.1  # [rad/s], [s]: random rates and their memory
 PUSHES, PUSH_S = 2.0, 0.4  # [m/s^2], [s]: random thrusts
+LENGTHS_S = 5.0, 600.0  # [s], length of a flight by hand
 CLOSES_S = 2.0  # [s] that the board needs for the end of its log
 
 
@@ -193,7 +195,7 @@ class BetaflightPeer:
         return message
 
 
-def parse(words: list[str] | None = None) -> argparse.Namespace:
+def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     """Return the options of the peer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--vehicle", default="", help="vehicle file; by default the vehicle `small`")
@@ -210,46 +212,35 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def main() -> None:
+@exit_on_error
+def main(words: Sequence[str] | None = None) -> None:
     """Fly until Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    options = parse()
-    vehicle = Path(options.vehicle) if options.vehicle else None
-    scenario = Scenario(options.disturbance, vehicle=None if vehicle is None else str(vehicle))
+    options = parse(words)
+    scenario = Scenario(options.disturbance, vehicle=options.vehicle or None)
     if options.log:
         write_manual_log(scenario, options)
         return
-    node = open_node(options.backend, ("geometry_msgs", "nav_msgs", "std_msgs"))
-    try:
-        place, poses = np.array(options.place), not options.odometry
+    place, poses = np.array(options.place), not options.odometry
+    with contextlib.closing(open_node(options.backend, ("geometry_msgs", "nav_msgs", "std_msgs"))) as node:
         peer = BetaflightPeer(scenario, place, node, options.topic, poses=poses, more=options.set)
-    except PlantError as error:
-        sys.exit(str(error))
-    print("the pilot hovers; MSP at tcp:127.0.0.1:5761; Enter turns the switch of MSP OVERRIDE", flush=True)
-    try:
-        fly(peer)
-    except KeyboardInterrupt:
-        pass
-    except PlantError as error:
-        sys.exit(str(error))
-    finally:
+        print("the pilot hovers; MSP at tcp:127.0.0.1:5761; Enter turns the switch of MSP OVERRIDE", flush=True)
+        with contextlib.closing(peer), contextlib.suppress(KeyboardInterrupt):
+            fly(peer)
         print(peer.position, flush=True)
-        peer.close()
-        node.close()
 
 
 def write_manual_log(scenario: Scenario, options: argparse.Namespace) -> None:
     """Fly by hand, and write the log."""
-    peer = None
-    try:
-        peer = BetaflightPeer(scenario, np.array(HIGH_ABOVE), None, "", more=options.set)
+    if not LENGTHS_S[0] <= options.seconds <= LENGTHS_S[1]:
+        raise ConfigError(f"--seconds must be {LENGTHS_S[0]:g} to {LENGTHS_S[1]:g}, got {options.seconds:g}")
+    path = Path(options.log)
+    if not path.parent.is_dir() or path.is_dir():
+        raise ConfigError(f"--log must be a file in a folder that exists, got {options.log}")
+    peer = BetaflightPeer(scenario, np.array(HIGH_ABOVE), None, "", more=options.set)
+    with contextlib.closing(peer):
         peer.fly_by_hand(options.seconds)
-        peer.write_log(Path(options.log))
-    except (PlantError, OSError) as error:
-        sys.exit(str(error))
-    finally:
-        if peer is not None:
-            peer.close()
+        peer.write_log(path)
     print(f"{options.log}: {options.seconds:g} s of flight", flush=True)
 
 

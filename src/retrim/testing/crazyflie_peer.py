@@ -11,14 +11,15 @@ import math
 import socket
 import struct
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..config.scenario import Scenario
-from ..errors import MessageError
+from ..errors import MessageError, exit_on_error
 from ..plants.bridges import crtp
 from ..plants.bridges.crtp import Packet
-from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupt
+from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupt, port
 
 VERSION = 12  # protocol version
 LEVELS_S, STOPS_S = 0.5, 2.0  # [s]: time without a setpoint until the vehicle levels, and until the motors stop
@@ -218,14 +219,15 @@ class CrazyfliePeer:
                 return
 
 
-def main() -> None:
+@exit_on_error
+def main(words: Sequence[str] | None = None) -> None:
     """Fly until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--disturbance", default="none", help="as for `retrim fly`")
     parser.add_argument("--plant", default="bem", help="as for `retrim fly`")
-    parser.add_argument("--port", type=int, default=19850, help="where it listens, on this machine")
+    parser.add_argument("--port", type=port, default=19850, help="where it listens, on this machine")
     parser.add_argument("--cut", type=float, nargs=2, help="seconds by rates until the link is cut, and for how long")
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     peer = CrazyfliePeer(Scenario(options.disturbance, options.plant), port=options.port)
     engage_time = math.inf
 

@@ -9,15 +9,16 @@ import argparse
 import math
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..config.scenario import Scenario
+from ..errors import exit_on_error
 from ..plants.bridges import frames
 from ..plants.extras import import_extra
-from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupt
+from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupt, port
 
 OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)
 FAILSAFE_S = 1.0  # [s]: time without a setpoint until the failsafe
@@ -161,17 +162,18 @@ class MavlinkPeer:
                 return
 
 
-def main() -> None:
+@exit_on_error
+def main(words: Sequence[str] | None = None) -> None:
     """Fly until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--disturbance", default="none", help="as for `retrim fly`")
     parser.add_argument("--plant", default="bem", help="as for `retrim fly`")
-    parser.add_argument("--port", type=int, default=14540, help="where it sends to, on this machine")
+    parser.add_argument("--port", type=port, default=14540, help="where it sends to, on this machine")
     parser.add_argument(
         "--cut", type=float, nargs=2, help="seconds in offboard mode by rates until the link is cut, and for how long"
     )
     parser.add_argument("--takes-over", type=float, default=math.inf, help="seconds by rates until a pilot takes over")
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     peer = MavlinkPeer(Scenario(options.disturbance, options.plant), port=options.port)
     engage_time = math.inf
 

@@ -1,5 +1,6 @@
 """Simulate a vehicle with an autopilot's position controller, for the peers of all protocols."""
 
+import argparse
 import math
 import os
 import time
@@ -21,6 +22,13 @@ from ..plants.plant import as_numpy
 DT = 0.01  # [s]: tick
 GROUND = 0.05  # [m]: height below which a vehicle touches the ground
 ATTITUDE_IGNORED = 128  # in the type_mask of an AttitudeTarget
+
+
+def port(text: str) -> int:
+    """Return the number of a port on the command line of a peer."""
+    if not (text.isdecimal() and 1 <= int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"a port must be 1 to 65535, got {text}")
+    return int(text)
 
 
 class PeerVehicle:

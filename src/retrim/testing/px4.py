@@ -12,10 +12,11 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
-from ..errors import PlantError
+from ..errors import PlantError, exit_on_error
 from ..plants.bridges.endpoint import UdpEndpoint
 from ..plants.bridges.mavlink_link import MavlinkLink
 
@@ -117,7 +118,8 @@ def parameter(text: str) -> tuple[str, float]:
         raise argparse.ArgumentTypeError(f"must be NAME=NUMBER, got {text!r}") from None
 
 
-def main(words: list[str] | None = None) -> None:
+@exit_on_error
+def main(words: Sequence[str] | None = None) -> None:
     """Run until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("package", type=Path, help="folder with bin/px4 and etc")

@@ -7,12 +7,14 @@ holds its position when setpoints stop.
 """
 
 import argparse
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..config.scenario import Scenario
+from ..errors import exit_on_error
 from ..ros2.backends import open_node
-from ..ros2.definitions import NEWEST
+from ..ros2.definitions import NEWEST, RELEASES
 from ..ros2.node import Ros2Node
 from .peer_vehicle import fly_until_interrupt
 from .ros2_mavros_peer import Habits, MavrosPeer, Ros2Peer
@@ -35,7 +37,7 @@ def make_peer(node: Ros2Node, options: argparse.Namespace) -> Ros2Peer:
     )  # fmt: skip
 
 
-def parse(words: list[str] | None = None) -> argparse.Namespace:
+def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     """Return the options of a peer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dialect", choices=("mavros", "px4"), help="whose topics it has")
@@ -47,7 +49,7 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--place", type=float, nargs=3, default=(0.0, 0.0, 1.0), help="mavros: where it waits [m]")
     parser.add_argument("--yaw", type=float, default=0.0, help="mavros: its heading there [rad]")
     parser.add_argument("--poses", action="store_true", help="mavros: poses alone, no odometry")
-    parser.add_argument("--release", default=NEWEST, help="px4: release of its messages")
+    parser.add_argument("--release", default=NEWEST, choices=RELEASES, help="px4: release of its messages")
     parser.add_argument("--silent", action="store_true", help="px4: no answers about the formats of its inputs")
     parser.add_argument("--reports-thrust", action="store_true", help="it publishes the autopilot's thrust")
     parser.add_argument("--rate", type=float, default=100.0, help="of its states [Hz]")
@@ -58,9 +60,10 @@ def parse(words: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def main() -> None:
+@exit_on_error
+def main(words: Sequence[str] | None = None) -> None:
     """Fly until Ctrl-C."""
-    options = parse()
+    options = parse(words)
     packages = ("px4_msgs",) if options.dialect == "px4" else ("mavros_msgs", "nav_msgs", "geometry_msgs")
     if options.listen:
         from ..ros2.zenoh_node import ZenohNode
