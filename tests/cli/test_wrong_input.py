@@ -211,7 +211,9 @@ def test_refused_flight_prints_no_other_remark(folder, monkeypatch):
         (("fyl",), "no command 'fyl'; did you mean 'fly'?"),
         (("fly", "--latency", "maybe"), "invalid choice 'maybe'"),
         (("fly", "--bogus", "3"), "--bogus"),
-        (("fly", "--seconds", "soon"), "could not convert string to float: 'soon'"),
+        (("fly", "--seconds", "soon"), "retrim: --seconds: could not convert string to float: 'soon'; `retrim fly --help`"),
+        (("fly", "--policy"), "Missing value for argument '--policy'"),
+        (("replay", "log.csv", "--adapt", "full"), "retrim: --adapt full needs --policy; `retrim pretrain hover"),
         (("pretrain",), "required"),
         (("reproduce", "nope"), "nope"),
     ],
@@ -221,6 +223,7 @@ def test_wrong_usage_explains_usage(folder, words, message):
     out = retrim(*words, cwd=folder, code=2)
     assert message in out
     assert "Traceback" not in out
+    assert out.count("\n") == 1 or not words
     assert tree(folder) == before
 
 

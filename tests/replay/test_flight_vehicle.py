@@ -6,10 +6,10 @@ import jax
 import pytest
 
 from retrim import Scenario, Setup, load
-from retrim.cli.flight_vehicle import check_vehicle_file, save_flight_vehicle
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
 from retrim.errors import ConfigError
 from retrim.evaluation.fleet import Fleet
+from retrim.replay.flight_vehicle import check_vehicle_file, write_flight_vehicle
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -32,7 +32,9 @@ def sample_flight(as_a_user):
 def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
     flight, setup = sample_flight
     path = tmp_path / "found.toml"
-    assert save_flight_vehicle(flight, setup, path) == ([path], 0)
+    faults = []
+    assert write_flight_vehicle(flight, setup, path, faults) == [path]
+    assert not faults
     result = read_vehicle(path)
     assert result.command_delay == pytest.approx(0.03, abs=0.002)
     assert result.rate_lag[0] == pytest.approx(0.08, rel=0.05)
@@ -42,11 +44,11 @@ def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
 
 
 def test_no_file_is_written_without_option(sample_flight):
-    assert save_flight_vehicle(*sample_flight, None) == ([], 0)
+    assert write_flight_vehicle(*sample_flight, None, []) == []
     check_vehicle_file(None)
 
 
-def test_too_short_flight_is_refused_in_one_line(sample_flight, tmp_path, capsys):
+def test_too_short_flight_is_refused_in_one_line(sample_flight, tmp_path):
     flight, setup = sample_flight
     log = flight.log
     cut = lambda states: type(states)(*(part[:20] for part in states))  # noqa: E731
@@ -54,9 +56,10 @@ def test_too_short_flight_is_refused_in_one_line(sample_flight, tmp_path, capsys
         t=log.t[:20], u=log.u[:20], true=cut(log.true), measured=cut(log.measured), age=log.age, events=()
     )
     path = tmp_path / "found.toml"
-    assert save_flight_vehicle(dataclasses.replace(flight, log=short), setup, path) == ([], 1)
+    faults = []
+    assert write_flight_vehicle(dataclasses.replace(flight, log=short), setup, path, faults) == []
     assert not path.exists()
-    assert "must be at least 1 s long to identify its vehicle" in capsys.readouterr().out
+    assert "must be at least 1 s long to identify its vehicle" in faults[0]
 
 
 @pytest.mark.parametrize(

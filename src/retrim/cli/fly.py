@@ -16,6 +16,7 @@ from ..evaluation.figures import picture
 from ..evaluation.fleet import Fleet
 from ..evaluation.flight_table import figure_cells, figure_columns
 from ..evaluation.metrics import notes, rows
+from ..replay.flight_vehicle import check_vehicle_file, write_flight_vehicle
 from ..runkit.document import TableSection
 from ..runkit.flight_memory import FlightMemory, recall_flight, write_memory
 from ..runkit.flights import Flight
@@ -24,7 +25,6 @@ from ..runkit.outlet import Outlet
 from ..runkit.run import INTERRUPTED, Run
 from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, same_policy, with_residual
 from .console import RichReporter, Trust, console, refuse, report_start, show_paths, show_table
-from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 from .options import option
 
 
@@ -115,9 +115,9 @@ def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, 
     show_table(TableSection(("disturbance", "method", *figure_columns(fleet.seconds)), lines, title))
     for note in notes(flights, preset):
         console.print(note, markup=False, soft_wrap=True)
-    vehicle_path, code = save_flight_vehicle(flights[-1], setup, vehicle_file)
+    vehicle_path = write_flight_vehicle(flights[-1], setup, vehicle_file, outlet.faults)
     show_paths([*pictures, *([] if results is None else [results]), *vehicle_path, *memories])
-    return run.exit_code or max((code, *(refuse(fault) for fault in outlet.faults)))
+    return run.exit_code or max((refuse(fault) for fault in outlet.faults), default=0)
 
 
 def _warn(setup: Setup, scenario: Scenario) -> None:

@@ -23,6 +23,7 @@ from ..live.operator.page import page_address
 from ..live.operator.page_opening import open_page
 from ..live.session import LONGEST, LiveRequest, check_limits, learners_at, live_setup
 from ..live.status import Status
+from ..replay.flight_vehicle import check_vehicle_file, write_flight_vehicle
 from ..runkit.document import TableSection
 from ..runkit.flight_memory import FlightMemory, recall_flight, write_memory
 from ..runkit.interrupts import interrupts_only_set
@@ -32,7 +33,6 @@ from ..runtime.events import Event
 from ..transport.remote import LOOPBACK
 from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, with_residual
 from .console import RichReporter, Trust, console, refuse, report_start, show_paths, show_table
-from .flight_vehicle import check_vehicle_file, save_flight_vehicle
 from .options import option
 
 LINE_EVERY = 5.0  # [s]: interval between status lines if the output is not a terminal
@@ -131,11 +131,11 @@ def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None, memory: Flig
     flights, setup = [done.flight], done.request.setup
     pictures = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
-    vehicle_path, code = save_flight_vehicle(done.flight, setup, vehicle_file)
+    vehicle_path = write_flight_vehicle(done.flight, setup, vehicle_file, done.outlet.faults)
     memories = write_memory(memory, flights, setup, done.outlet.faults)
     show_paths([*(pictures or [])[:1], *done.paths, *vehicle_path, *memories])
     codes = [refuse(fault) for fault in done.outlet.faults]
-    return run.exit_code or max(codes, default=int(not done.has_landed)) or code
+    return run.exit_code or max(codes, default=int(not done.has_landed))
 
 
 def _open_page(url: str, folder: Path) -> None:

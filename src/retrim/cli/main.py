@@ -118,24 +118,20 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
     from ..runkit.compile_flags import compile_for
     from .console import console, refuse
     from .options import simplify_help
+    from .usage import one_line_usage
 
     compile_for(name)
     command = importlib.import_module(module)
     full_traceback = TRACEBACK in words
     words = [word for word in words if word != TRACEBACK]
     try:
-        if hasattr(command, "COMMANDS"):
-            call = tyro.extras.subcommand_cli_from_dict(
-                {
-                    n: tyro.conf.configure(tyro.conf.AvoidSubcommands)(simplify_help(f))
-                    for n, f in command.COMMANDS.items()
-                },
-                prog=f"retrim {name}",
-                description=about,
-                args=words,
-            )
-        else:
-            call = tyro.cli(simplify_help(getattr(command, name)), prog=f"retrim {name}", args=words)
+        prog, plain = f"retrim {name}", tyro.conf.configure(tyro.conf.AvoidSubcommands)
+        with one_line_usage(prog):
+            if hasattr(command, "COMMANDS"):
+                entries = {n: plain(simplify_help(f)) for n, f in command.COMMANDS.items()}
+                call = tyro.extras.subcommand_cli_from_dict(entries, prog=prog, description=about, args=words)
+            else:
+                call = tyro.cli(simplify_help(getattr(command, name)), prog=prog, args=words)
         code: int = call(stop)
     except Exception as error:
         if full_traceback:

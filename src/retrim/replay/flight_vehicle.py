@@ -1,19 +1,59 @@
 """Writes the vehicle of a retrim flight as a vehicle file."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 
 from ..adapt.vehicles import estimate_path
 from ..config.setup import Setup
-from ..errors import LogError
+from ..errors import ConfigError, LogError
 from ..estimation.command_path import Estimate as PathParameter
 from ..estimation.command_path import PathEstimator
+from ..io.files import write_whole
+from ..runkit.flights import Flight
 from ..runtime.flight import Log
 from .identification import Estimate, IdentifiedVehicle
 from .vehicle import vehicle_toml
 
 MEMORY = 1e4  # [s]: the vehicle does not change during a flight
 LEAST = 1.0  # shortest flight [s]
+
+
+def check_vehicle_file(path: Path | None) -> None:
+    """Check the file of ``--save-vehicle`` before the flight.
+
+    Args:
+        path: File to write; None if the option is not given.
+
+    Raises:
+        ConfigError: The name does not end in .toml, or the folder does not exist.
+    """
+    if path is None:
+        return
+    if path.suffix != ".toml":
+        raise ConfigError(f"--save-vehicle {path}: the name of a vehicle file must end with .toml")
+    if not path.absolute().parent.is_dir():
+        raise ConfigError(f"--save-vehicle {path}: folder {path.absolute().parent} does not exist; create it first")
+
+
+def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults: list[str]) -> list[Path]:
+    """Write the vehicle identified from a flight, and return the written files.
+
+    Args:
+        flight: Flight to identify the vehicle from.
+        setup: Set-up of the policy that flew.
+        path: File to write; None if the option is not given.
+        faults: Receives a line if the vehicle cannot be identified or written.
+    """
+    if path is None:
+        return []
+    try:
+        write_whole(path, flight_vehicle_toml(flight.log, setup, path.stem).encode())
+    except (LogError, OSError) as error:
+        faults.append(f"--save-vehicle {path}: {error}")
+        return []
+    return [path]
 
 
 def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
