@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from live_helpers import holding, plan
-from live_processes import DT, DrillPlan, level, rotation
+from live_helpers import DrillSupervisor, holding, plan
+from live_processes import DT, level, rotation
 from retrim import Scenario
 from retrim.live.processes import vehicle
 from retrim.live.roles import ROLES
 from retrim.live.spec import LiveSpec
-from retrim.live.supervisor import Supervisor
 from retrim.onboard.guard import G
 from retrim.onboard.launch import launch
 from retrim.onboard.recorder import read_log
@@ -122,15 +121,6 @@ class Rig:
             time.sleep(max(0.0, due - time.monotonic()))
 
 
-class Flight(Supervisor):
-    """Its learners, its page and its identifier are stand-ins."""
-
-    def _plan(self, role):
-        if role in STAND_INS:
-            return DrillPlan(self.bus.folder, os.getpid(), role, self.spec.x0, self.spec.controller.base)
-        return super()._plan(role)
-
-
 def fly_soon(plan):
     """The process of the link; it needs less time for the thrust at hover, since the peers hover without a wind."""
     for module in (crazyflie, offboard_plant, ros2):
@@ -160,10 +150,10 @@ def more_roles():
         ROLES.update(before)
 
 
-def fly(spec, rig) -> Iterator[Flight]:
+def fly(spec, rig) -> Iterator[DrillSupervisor]:
     """Fly; yield the flight and its newest status, again and again until it is over."""
     rig.hover()
-    with Flight(spec) as flight:
+    with DrillSupervisor(spec) as flight:
         for _ in flight.warm_up():
             pass
         flight.take_off()
@@ -177,21 +167,11 @@ def fly(spec, rig) -> Iterator[Flight]:
             time.sleep(0.02)
 
 
-def supervise(spec):
-    """A supervisor in a process of its own."""
-    with Flight(spec) as flight:
-        for _ in flight.warm_up():
-            pass
-        flight.take_off()
-        while flight.watch().end_reason is None:
-            time.sleep(0.02)
-
-
 @contextlib.contextmanager
 def flying_alone(spec, rig, seconds=0.6):
     """A flight with a supervisor that can be killed; yield the processes by function once it has flown for a while."""
     rig.hover()
-    supervisor = launch("failure_rigs:supervise", spec, spec.folder / "supervisor.log")
+    supervisor = launch("live_helpers:supervise", spec, spec.folder / "supervisor.log")
     log, until = spec.folder / "flight.csv", time.monotonic() + 60.0
     try:
         while not (log.exists() and len(rows := read_log(log)) and rows[-1, 1] > seconds):

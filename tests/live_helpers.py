@@ -1,5 +1,7 @@
-"""A minimal controller, plan and plant for tests of live flight."""
+"""A minimal controller, plan and supervisor for tests of live flight."""
 
+import os
+import time
 from pathlib import Path
 
 import equinox as eqx
@@ -7,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from live_processes import DT, HOME
+from live_processes import DT, HOME, DrillPlan
 from retrim.config.setup import Setup
 from retrim.control import AbstractController
 from retrim.live.processes.controllers import _source, plain_source
+from retrim.live.spec import LiveSpec
+from retrim.live.supervisor import Supervisor
 from retrim.onboard.guard import UP, G, Limits
 from retrim.onboard.plan import ControlPlan
 from retrim.physics import Command, State
@@ -60,3 +64,22 @@ def holding(gains=(4.0, 3.5), *, fit_result=False, home=HOME):
         return f_a(*inputs, jnp.zeros(3)).v + 0.0 * parameters["residual"]["fit"]
 
     return _source(setup(), lambda result: eqx.combine(result["policy"], fixed), predict, parameters)
+
+
+class DrillSupervisor(Supervisor):
+    """A supervisor whose roles with a function of ``live_processes`` have the plan of a drill."""
+
+    def _plan(self, role):
+        if self.spec.mains.get(role, "").startswith("live_processes:"):
+            return DrillPlan(self.bus.folder, os.getpid(), role, self.spec.x0, self.spec.controller.base)
+        return super()._plan(role)
+
+
+def supervise(spec: LiveSpec) -> None:
+    """Run a flight until its end; as the function of a process, it is a supervisor that a test can kill."""
+    with DrillSupervisor(spec) as flight:
+        for _ in flight.warm_up():
+            pass
+        flight.take_off()
+        while flight.watch().end_reason is None:
+            time.sleep(0.02)

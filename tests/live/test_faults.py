@@ -9,13 +9,12 @@ from subprocess import Popen
 import numpy as np
 import pytest
 
-from live_helpers import holding, plan
-from live_processes import DT, HOME, DrillPlan, level
+from live_helpers import DrillSupervisor, holding, plan
+from live_processes import DT, HOME, level
 from retrim.config import PRESETS, Scenario
 from retrim.config.loading import dump
 from retrim.live.events import LiveEvents
 from retrim.live.spec import LiveSpec
-from retrim.live.supervisor import Supervisor
 from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import COMMAND, TRUE, Setpoint
@@ -25,26 +24,6 @@ from retrim.transport.message import pack_arrays
 
 DRILL = {"plant": "live_processes:plant", "residual": "live_processes:learner", "policy": "live_processes:learner"}
 SECONDS = 1.5
-
-
-class Drill(Supervisor):
-    """Its plant and learners are those of the drill."""
-
-    def _plan(self, role):
-        if role in DRILL:
-            spec = self.spec
-            return DrillPlan(self.bus.folder, os.getpid(), role, spec.x0, spec.controller.base)
-        return super()._plan(role)
-
-
-def supervise(spec):
-    """A supervisor in a process of its own, for a drill in which it dies."""
-    with Drill(spec) as drill:
-        for _ in drill.warm_up():
-            pass
-        drill.take_off()
-        while drill.watch().end_reason is None:
-            time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +48,7 @@ def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
     """Fly, and kill processes on the way, each at its time; return the last status, the events, how long the watchdog
     took, and whether the system allowed real-time scheduling, without which a loaded machine is late."""
     events, took, kills = LiveEvents(), None, dict(kills or {})
-    with Drill(spec) as drill:
+    with DrillSupervisor(spec) as drill:
         for _ in drill.warm_up():
             pass
         drill.take_off()
@@ -185,7 +164,7 @@ def test_each_process_is_suspended_for_ever_at_a_random_time(tmp_path, controlle
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_without_its_supervisor_the_vehicle_lands_and_the_log_is_whole(tmp_path, controller, number):
     spec = spec_in(tmp_path, controller, seconds=1.5 if number == signal.SIGKILL else 60.0)
-    process: Popen[bytes] = launch("live.test_faults:supervise", spec, tmp_path / "supervisor.log")
+    process: Popen[bytes] = launch("live_helpers:supervise", spec, tmp_path / "supervisor.log")
     log = tmp_path / "flight.csv"
     until = time.monotonic() + 30.0
     while (not log.exists() or len(log.read_text().splitlines()) < 20) and time.monotonic() < until:

@@ -8,7 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from live.test_faults import Drill, controller, spec_in, whole_log  # noqa: F401
+from live.test_faults import controller, spec_in, whole_log  # noqa: F401
+from live_helpers import DrillSupervisor
 from live_processes import HOME, DrillPlan, level
 from retrim.config import PRESETS, changed
 from retrim.config.loading import dump
@@ -68,7 +69,7 @@ def fly_while(gap, folder, controller):  # noqa: F811
     thread.start()
     events, complete = LiveEvents(), True
     try:
-        with Drill(spec_in(folder, controller, **changes)) as drill:
+        with DrillSupervisor(spec_in(folder, controller, **changes)) as drill:
             for _ in drill.warm_up():
                 pass
             drill.take_off()
@@ -136,7 +137,7 @@ def test_with_another_key_or_none_nothing_takes_off_and_both_ends_say_why(
     thread = threading.Thread(target=listen)
     thread.start()
     address = Address("zenoh", "127.0.0.1", port, shared=here)
-    with Drill(spec_in(tmp_path, flight, learners=address)) as drill, pytest.raises(PlantError) as error:
+    with DrillSupervisor(spec_in(tmp_path, flight, learners=address)) as drill, pytest.raises(PlantError) as error:
         for _ in drill.warm_up():
             pass
     thread.join(20.0)

@@ -8,28 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from live_helpers import holding, plan
-from live_processes import DT, HOME, DrillPlan, level
+from live_helpers import DrillSupervisor, holding, plan
+from live_processes import DT, HOME, level
 from retrim import ConfigError, PlantError, Scenario, load
 from retrim.evaluation import Fleet
 from retrim.live.events import LiveEvents
 from retrim.live.spec import VEHICLE, LiveSpec
 from retrim.live.status import Status
-from retrim.live.supervisor import Supervisor
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
 
 LEARNERS = {"residual": "live_processes:learner", "policy": "live_processes:learner"}
 SECONDS = 1.5
-
-
-class Flight(Supervisor):
-    """Its learners are those of the drill; its vehicle is made up."""
-
-    def _plan(self, role):
-        if role in LEARNERS:
-            return DrillPlan(self.bus.folder, os.getpid(), role, self.spec.x0, self.spec.controller.base)
-        return super()._plan(role)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +41,7 @@ def spec(tmp_path, controller):
 def fly_once(spec, kill=None):
     """Fly; return how it ended and what was said of it."""
     events = LiveEvents()
-    with Flight(spec) as flight:
+    with DrillSupervisor(spec) as flight:
         for _ in flight.warm_up():
             pass
         flight.take_off()
@@ -112,14 +102,14 @@ def test_a_lost_link_ends_the_flight_and_keeps_the_log(alone):
 def test_what_does_not_arm_never_flies(alone):
     spec = replace(alone, scenario=Scenario(plant="fake_vehicle:unarmed"))
     with pytest.raises(PlantError, match=r"before it began: .*refuses to be armed; it said: no battery"), \
-            Flight(spec) as flight:  # fmt: skip
+            DrillSupervisor(spec) as flight:  # fmt: skip
         for _ in flight.warm_up():
             pass
     assert not flight.bus.folder.exists()
 
 
 def test_an_interrupt_on_the_ground_leaves_it_there(alone):
-    flight = Flight(alone)
+    flight = DrillSupervisor(alone)
     with flight:
         for _ in flight.warm_up():
             if flight.bus.latest("ready.plant") is not None:
