@@ -25,7 +25,7 @@ def test_time_is_in_units_of_its_moment(monkeypatch):
 
 
 @pytest.mark.skipif("one" not in measure.CORES, reason="the system does not let a process choose its core")
-def test_one_core_is_one():
+def test_one_core_run_uses_one_core():
     code = "import os; from retrim.bench.machine import on_core; on_core(0); print(len(os.sched_getaffinity(0)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "1\n"
 

@@ -27,17 +27,17 @@ def instructions(container):
     return container.parse_instructions((ROOT / "Containerfile").read_text())
 
 
-def test_comments_and_line_breaks_are_no_part_of_an_instruction(container):
+def test_comments_and_line_breaks_are_removed_from_instructions(container):
     text = "# a\nFROM x AS y\n\nRUN one \\\n  # between\n    && two\n  WORKDIR /z\n"
     assert container.parse_instructions(text) == [("FROM", "x AS y"), ("RUN", "one     && two"), ("WORKDIR", "/z")]
 
 
-def test_an_instruction_that_the_program_does_not_run_is_an_error(container):
+def test_unsupported_instruction_is_refused(container):
     with pytest.raises(container.ContainerError, match="and not VOLUME"):
         container.parse_instructions("FROM x\nVOLUME /runs\n")
 
 
-def test_the_image_starts_retrim_without_rights_in_the_mounted_folder(container, instructions):
+def test_image_starts_retrim_as_user_in_mounted_folder(container, instructions):
     last = dict(instructions)
     assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", last["USER"])
     assert last["WORKDIR"] == "/runs"
@@ -54,14 +54,14 @@ def test_every_installation_is_pinned(instructions):
         assert re.search(r"--require-hashes|--constraints constraints\.txt|--no-deps", command), command
 
 
-def test_the_last_match_decides_what_is_left_out(container):
+def test_last_matching_pattern_decides(container):
     patterns = ["*", "!src", "!tools/uv.txt", "**/__pycache__", "*.md", "!README.md"]
     kept = ["src", "src/a/b.py", "tools/uv.txt", "README.md"]
     left_out = ["docs", "tools", "tools/mutants.py", "src/a/__pycache__", "src/a/__pycache__/b.pyc", "OTHER.md"]
     assert [path for path in kept + left_out if not container.is_ignored(path, patterns)] == kept
 
 
-def test_copies_go_where_a_builder_puts_them(container, tmp_path):
+def test_copies_have_same_places_as_in_docker(container, tmp_path):
     context, root = tmp_path / "context", tmp_path / "root"
     for path in ("a.txt", "folder/b.txt", "folder/__pycache__/b.pyc", "secret"):
         (context / path).parent.mkdir(parents=True, exist_ok=True)
@@ -80,6 +80,6 @@ def test_copies_go_where_a_builder_puts_them(container, tmp_path):
             container.copy_files(missing, image, {}, context)
 
 
-def test_another_base_image_is_refused(container, tmp_path):
+def test_other_base_image_is_refused(container, tmp_path):
     with pytest.raises(container.ContainerError, match="only python:"):
         container.begin_stage("python:2.7-slim", tmp_path, {})

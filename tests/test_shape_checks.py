@@ -34,7 +34,7 @@ def test_arguments_and_results_of_every_definition_are_checked():
             scaled(size, result_size=4)(np.zeros(5), 2.0)
 
 
-def test_a_check_is_generated_once_for_the_same_annotations():
+def test_check_is_generated_once_for_equal_annotations():
     for kind, value in ((int, 2), (str, "x"), (int, 2)):
         scale = scaled(1 if kind is int else "", kind=kind)
         with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):

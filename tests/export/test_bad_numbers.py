@@ -118,7 +118,7 @@ CASES = [(kind, ticks, place) for kind in NUMBERS for ticks, place in ((1, 0), (
 
 
 @pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
-def test_jax_goes_on_as_if_the_bad_ticks_had_not_been(kind, ticks, place, plain, good):
+def test_jax_controller_ignores_bad_ticks(kind, ticks, place, plain, good):
     rows, fine = sequence(good, kind, ticks, place)
     result, message = commands(FiniteController(plain), rows)
     np.testing.assert_array_equal(message, fine)
@@ -129,7 +129,7 @@ def test_jax_goes_on_as_if_the_bad_ticks_had_not_been(kind, ticks, place, plain,
 
 
 @pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
-def test_c_and_numpy_do_what_jax_does(kind, ticks, place, plain, good, folder, programs, setup):
+def test_c_and_numpy_equal_jax(kind, ticks, place, plain, good, folder, programs, setup):
     """Also under -ffast-math, and without a word of the sanitizers."""
     rows, fine = sequence(good, kind, ticks, place)
     expected, _ = commands(FiniteController(plain), rows)
@@ -152,11 +152,11 @@ def test_c_and_numpy_do_what_jax_does(kind, ticks, place, plain, good, folder, p
         assert np.max(np.abs(np.array(outputs) - expected) / (high - low)) <= SHARE, name
 
 
-def test_the_controller_keeps_every_law(plain):
+def test_finite_controller_conforms(plain):
     check_controller(FiniteController(plain))
 
 
-def test_a_flight_may_begin_with_numbers_that_are_not_finite(plain, good, folder, programs):
+def test_flight_may_begin_with_bad_ticks(plain, good, folder, programs):
     """Hover is the last command then."""
     rows = np.concatenate([np.full((2, 15), np.nan), good[:3]])
     expected, _ = commands(FiniteController(plain), rows)
@@ -169,7 +169,7 @@ def test_a_flight_may_begin_with_numbers_that_are_not_finite(plain, good, folder
         np.testing.assert_allclose(np.frombuffer(process.stdout, np.float32).reshape(-1, 5)[:, :4], expected, atol=1e-4)
 
 
-def test_without_memory_a_bad_row_gives_nan_and_says_so(folder, good):
+def test_bad_row_without_memory_gives_nan_and_flag(folder, good):
     loaded_policy = Runner(folder / "quad.npz")
     rows = np.tile(loaded_policy._arrays["test_observations"][:1], (4, 1))
     rows[1, 5], rows[2, 20], rows[3, 0] = np.nan, np.inf, LARGEST
@@ -183,13 +183,13 @@ def test_without_memory_a_bad_row_gives_nan_and_says_so(folder, good):
     np.testing.assert_allclose(commands, loaded_policy.command(rows), atol=1e-4)
 
 
-def test_the_limit_is_the_same_everywhere(folder):
+def test_limit_is_equal_in_all_formats(folder):
     assert runner.LARGEST == LARGEST
     bits = np.float32(LARGEST).view(np.uint32)
     assert f">= 0x{bits:08x}u) return 0;" in (folder / "quad.h").read_text()
 
 
-def test_the_check_notices_a_header_without_the_test_of_bits(folder, programs):
+def test_check_detects_header_without_test_of_bits(folder, programs):
     text = (folder / "quad.h").read_text()
     blind = text.replace("u) return 0;", "u && 0) return 0;")
     assert blind != text

@@ -51,14 +51,14 @@ def untrained(tmp_path_factory):
     return build(tmp_path_factory.mktemp("untrained"), setup.new_policy(random.key(0)), setup)
 
 
-def test_it_is_short_and_names_its_header():
+def test_program_is_short_and_tests_itself_before_binding():
     text = SOURCE.read_text()
     assert len(text.splitlines()) <= 150
     assert "malloc" not in text
     assert text.index("retrim_selftest()") < text.index("bind(")
 
 
-def test_it_refuses_to_start_with_a_damaged_policy(untrained, tmp_path):
+def test_damaged_policy_is_refused_at_start(untrained, tmp_path):
     text = (untrained.parent / "policy.h").read_text()
     damaged = re.sub(r"(policy_b0\[\d+\] = {\n)[^,]+,", r"\g<1>0.5f,", text)
     assert damaged != text
@@ -78,7 +78,7 @@ def test_wrong_arguments_give_one_line(words, untrained):
     assert process.stderr == "usage: companion PORT HOVER, e.g. 14540 0.49\n"
 
 
-def test_a_port_in_use_is_named(untrained):
+def test_occupied_port_is_named(untrained):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = str(other.getsockname()[1])
@@ -87,7 +87,7 @@ def test_a_port_in_use_is_named(untrained):
     assert process.stderr.startswith(f"{port}: ")
 
 
-def test_it_reads_and_writes_messages_as_pymavlink_does(untrained):
+def test_messages_equal_pymavlink(untrained):
     """Damaged frames, other senders and other frames of reference are ignored; several messages fit in a datagram."""
     mavlink = pytest.importorskip("pymavlink.dialects.v20.common")
     out = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
@@ -183,7 +183,7 @@ def flight(trained):
 
 
 @pytest.mark.slow
-def test_it_hovers_and_a_pilot_takes_over_and_gives_back(flight):
+def test_program_hovers_before_and_after_pilot_takes_over(flight):
     flight.hand_over()
     assert flight.peer.by_rates
     assert flight.run(6.0) < 0.15
@@ -200,7 +200,7 @@ def test_it_hovers_and_a_pilot_takes_over_and_gives_back(flight):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cause", ["no state", "a pause of the program"])
-def test_the_watchdog_ends_the_flight(cause, flight):
+def test_watchdog_ends_flight(cause, flight):
     """PX4 falls back by itself, and the program does not return."""
     flight.hand_over()
     if cause == "no state":
@@ -243,7 +243,7 @@ class Px4Pilot:
 
 @pytest.mark.skipif(not PX4, reason="RETRIM_PX4 names no unpacked PX4")
 @pytest.mark.px4
-def test_it_hovers_through_px4_and_px4_falls_back_when_it_is_paused(tmp_path):
+def test_program_hovers_through_px4_and_px4_falls_back_after_pause(tmp_path):
     setup = Setup.from_preset(changed(load("hover/retrim"), vehicle=str(SIH)))
     with jax.numpy_dtype_promotion("standard"):
         program = build(tmp_path, setup.pretrained(), setup)

@@ -62,7 +62,7 @@ class Said(Silent):
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_every_format_computes_what_jax_computes(to, policy, setup, policy_file, tmp_path):
+def test_every_format_equals_jax(to, policy, setup, policy_file, tmp_path):
     for name in NEEDS[to]:
         pytest.importorskip(name)
     if to == "c" and shutil.which("gcc") is None:
@@ -80,7 +80,7 @@ def test_every_format_computes_what_jax_computes(to, policy, setup, policy_file,
     assert shift_check.worst > 9e-4
 
 
-def test_a_file_that_computes_something_else_is_refused(policy_file, tmp_path):
+def test_file_with_different_results_is_refused(policy_file, tmp_path):
     export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     with np.load(tmp_path / "p.npz") as file:
         arrays = dict(file)
@@ -115,7 +115,7 @@ def sample_flight(policy, setup, states):
     return np.asarray(fly(PolicyController(setup.env.task.observation, policy), *map(jnp.asarray, states)))
 
 
-def test_the_runner_flies_as_the_controller_does(setup, policy_file, states, sample_flight, tmp_path):
+def test_runner_equals_controller(setup, policy_file, states, sample_flight, tmp_path):
     export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     loaded_policy = Runner(tmp_path / "p.npz")
     for _ in range(2):  # the second flight begins as the first
@@ -126,7 +126,7 @@ def test_the_runner_flies_as_the_controller_does(setup, policy_file, states, sam
 
 
 @HAS_C
-def test_c_flies_as_the_controller_does(policy_file, states, sample_flight, tmp_path):
+def test_c_equals_controller(policy_file, states, sample_flight, tmp_path):
     export(policy_file, "c", tmp_path / "my-quad.h", None, Silent())
     p, R, v = (x.astype(np.float32) for x in states)
     rows = np.concatenate([p, R.reshape(12, 9), v], axis=1)
@@ -152,7 +152,7 @@ int main(void) {
     assert not any(word in text for word in ("malloc", "double", "static float"))
 
 
-def test_the_runner_needs_numpy_only(policy_file, tmp_path):
+def test_runner_needs_only_numpy(policy_file, tmp_path):
     tree = ast.parse(Path(runner.__file__).read_text())
     imports = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     imports |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
@@ -164,7 +164,7 @@ def test_the_runner_needs_numpy_only(policy_file, tmp_path):
     assert len(process.stdout.split()) == 4
 
 
-def test_a_delta_travels_alone(policy, setup, policy_file, tmp_path):
+def test_delta_is_exported_separately_or_merged(policy, setup, policy_file, tmp_path):
     low = LoraPolicy.of(policy, key=random.key(1), ranks=(2, 2, 1))
     low = low.with_params(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), low.delta)).shifted(
         jnp.array([0.1, 0.0, -0.1, 0.0])
@@ -190,14 +190,14 @@ def test_a_delta_travels_alone(policy, setup, policy_file, tmp_path):
         ("delta", None, None, "give it as --delta"),
     ],
 )
-def test_what_cannot_be_asked_is_named(to, out, delta, text, policy_file, tmp_path, monkeypatch):
+def test_invalid_options_are_named(to, out, delta, text, policy_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=text):
         export(policy_file, to, out and Path(out), delta, Silent())
     assert not list(tmp_path.iterdir())
 
 
-def test_a_runner_of_somebody_else_is_left_alone(policy_file, tmp_path):
+def test_foreign_runner_file_is_not_overwritten(policy_file, tmp_path):
     """One's own is written again."""
     export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     export(policy_file, "npz", tmp_path / "q.npz", None, Silent())
@@ -209,12 +209,12 @@ def test_a_runner_of_somebody_else_is_left_alone(policy_file, tmp_path):
     assert not (tmp_path / "r.npz").exists()
 
 
-def test_a_missing_policy_is_named(tmp_path):
+def test_missing_policy_is_named(tmp_path):
     with pytest.raises(CheckpointError, match="no such file"):
         export(tmp_path / "nowhere.safetensors", "c", None, None, Silent())
 
 
-def test_hover_is_what_the_first_command_remembers(policy_file, tmp_path):
+def test_first_observation_contains_hover_command(policy_file, tmp_path):
     export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     loaded_policy = Runner(tmp_path / "p.npz")
     np.testing.assert_array_equal(loaded_policy.observe(np.zeros(3), np.eye(3), np.zeros(3))[15:], 0.0)

@@ -84,7 +84,7 @@ def replaced(old, new, count=-1):
 
 
 @pytest.mark.parametrize("kind", PRESETS)
-def test_a_policy_of_every_kind_passes(kind, tmp_path):
+def test_policy_of_every_kind_passes(kind, tmp_path):
     policy = portable(changed(load(PRESETS[kind]), pretrain={"hidden_sizes": [16, 16]}))
     for compiler in ("c99", "fast-math", "c++"):
         case, deviation = run(tmp_path, policy, compiler=compiler)
@@ -101,7 +101,7 @@ def test_every_history_and_depth_passes_with_every_compiler(history, sizes, comp
     assert run(tmp_path, policy, compiler=compiler)[0] == "0"
 
 
-def test_a_merged_delta_passes(tmp_path):
+def test_merged_delta_passes(tmp_path):
     setup = Setup.from_preset(tiny_preset(command_history=2))
     low = LoraPolicy.of(grown(setup.new_policy(random.key(0))), key=random.key(1), ranks=(2, 2, 1))
     low = low.with_params(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), low.delta))
@@ -139,7 +139,7 @@ int main(void) {
 """
 
 
-def test_one_wrong_bit_of_any_stored_number_is_found(tmp_path):
+def test_wrong_bit_in_any_number_is_found(tmp_path):
     """Also in the last bit of a weight, which hardly moves a command."""
     names = [f"{kind}{i}" for i in range(3) for kind in "wb"]
     names += ["low", "high", "y0", "test_observations", "test_commands", "test_states", "test_flight"]
@@ -149,7 +149,7 @@ def test_one_wrong_bit_of_any_stored_number_is_found(tmp_path):
 
 
 @pytest.mark.parametrize("row", range(TESTS))
-def test_a_wrong_command_is_found_by_its_number(row, quad, tmp_path):
+def test_wrong_command_is_found_by_number(row, quad, tmp_path):
     """The checksum is right here, so that the comparison itself is tested."""
     wrong = quad.test_commands.copy()
     wrong[row:, row] += 3.0 * TOLERANCE * (quad.high - quad.low)[row]
@@ -159,14 +159,14 @@ def test_a_wrong_command_is_found_by_its_number(row, quad, tmp_path):
 
 
 @pytest.mark.parametrize("tick", range(FLIGHT + 2))
-def test_a_wrong_tick_of_the_flight_is_found_by_its_number(tick, quad, tmp_path):
+def test_wrong_tick_of_flight_is_found_by_number(tick, quad, tmp_path):
     wrong = quad.test_flight.copy()
     wrong[tick:, tick % 4] -= 3.0 * TOLERANCE * (quad.high - quad.low)[tick % 4]
     assert int(run(tmp_path, dataclasses.replace(quad, test_flight=wrong))[0]) == TICKS + tick
 
 
 @pytest.mark.parametrize("layer", range(3))
-def test_other_weights_than_those_of_the_policy_are_found(layer, quad, tmp_path):
+def test_different_weights_are_found(layer, quad, tmp_path):
     layers = list(quad.layers)
     layers[layer] = (np.float32(1.01) * layers[layer][0], layers[layer][1])
     assert VECTORS <= int(run(tmp_path, dataclasses.replace(quad, layers=tuple(layers)))[0]) < VECTORS + TESTS
@@ -193,16 +193,16 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_code_that_computes_something_else_is_found(wrong, quad, tmp_path):
+def test_code_with_different_results_is_found(wrong, quad, tmp_path):
     case, change = WRONG[wrong]
     assert int(run(tmp_path, quad, change=change)[0]) == case
 
 
-def test_the_reciprocal_of_fast_math_does_no_harm(quad, tmp_path):
+def test_reciprocal_of_fast_math_passes(quad, tmp_path):
     assert run(tmp_path, quad, change=lambda text: RECIPROCAL + DIVISION(text))[0] == "0"
 
 
-def test_a_float_of_another_width_is_found(quad, tmp_path):
+def test_float_of_different_width_is_found(quad, tmp_path):
     wide = "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n#define float double\n"
     main = MAIN.replace('#include "quad.h"', wide + '#include "quad.h"')
     write_c(tmp_path / "quad.h", quad)
@@ -213,7 +213,7 @@ def test_a_float_of_another_width_is_found(quad, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["w0", "test_commands", "test_flight"])
-def test_a_damaged_number_in_the_file_is_found(name, quad, tmp_path):
+def test_damaged_number_in_file_is_found(name, quad, tmp_path):
     """The neighbour of a number deviates less than the tolerance."""
 
     def change(text):
@@ -245,11 +245,11 @@ int main(void) {
 """
 
 
-def test_a_flight_goes_on_as_if_there_had_been_no_test(quad, tmp_path):
+def test_self_test_does_not_change_flight(quad, tmp_path):
     assert run(tmp_path, quad, main=FLY.replace("QUAD_TICKS", str(len(quad.test_flight)))) == ["0"]
 
 
-def test_a_program_with_two_policies_names_each_self_test(quad, tmp_path):
+def test_program_with_two_policies_must_name_self_test(quad, tmp_path):
     """The common name would test one of them only."""
     write_c(tmp_path / "other.h", quad)
     both = '#include "other.h"\n#include "quad.h"\n'

@@ -79,7 +79,7 @@ def start_vehicle(speaks, *words):
 
 
 @each_peer
-def test_a_flight_adapts_under_a_large_disturbance(speaks, small, tmp_path):
+def test_flight_adapts_under_large_disturbance(speaks, small, tmp_path):
     with start_vehicle(speaks, "--disturbance", "large"):
         text = output_of(live(small, PEERS[speaks], tmp_path))
     figures, rows = find(tmp_path)
@@ -91,7 +91,7 @@ def test_a_flight_adapts_under_a_large_disturbance(speaks, small, tmp_path):
 
 
 @each_peer
-def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(speaks, small, tmp_path):
+def test_link_cut_for_one_second_ends_in_landing(speaks, small, tmp_path):
     """The guard sinks blindly, holds when it sees again, and lands; the log goes on."""
     with start_vehicle(speaks, "--cut", "5", "1"):
         text = output_of(live(small, PEERS[speaks], tmp_path))
@@ -105,7 +105,7 @@ def test_a_link_that_is_cut_for_a_second_ends_in_a_landing(speaks, small, tmp_pa
 
 
 @each_peer
-def test_a_link_that_is_cut_for_five_seconds_is_lost_and_the_log_is_kept(speaks, small, tmp_path):
+def test_link_cut_for_five_seconds_ends_flight_and_log_is_complete(speaks, small, tmp_path):
     """The vehicle is its autopilot's, which holds its place, or lets it fall; nobody takes it back."""
     with start_vehicle(speaks, "--cut", "5", "5"):
         text = output_of(live(small, PEERS[speaks], tmp_path), fails=True)
@@ -125,7 +125,7 @@ def kill_in_flight(speaks, policy, out):
     assert "the plant process is gone" in output_of(flight, fails=True)
 
 
-def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_path):
+def test_autopilot_holds_vehicle_after_link_process_is_killed(small, tmp_path):
     with start_vehicle("mavlink") as autopilot:
         kill_in_flight("mavlink", small, tmp_path)
         assert autopilot.poll() is None
@@ -142,7 +142,7 @@ def test_a_bridge_that_is_killed_leaves_the_vehicle_to_its_autopilot(small, tmp_
             listener.close()
 
 
-def test_a_crazyflie_whose_bridge_is_killed_is_landed_by_its_guardian(small, tmp_path):
+def test_guardian_lands_crazyflie_after_link_process_is_killed(small, tmp_path):
     """Without a guardian, its motors would stop after two seconds without a setpoint, and it would lock itself."""
     with start_vehicle("crazyflie"):
         kill_in_flight("crazyflie", small, tmp_path)
@@ -171,7 +171,7 @@ PX4_ONLY = pytest.mark.skipif(not PX4, reason="RETRIM_PX4 names no unpacked PX4"
 
 @PX4_ONLY
 @pytest.mark.px4
-def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_seconds(tmp_path_factory, tmp_path):
+def test_px4_compensates_load_and_weak_battery_within_three_seconds(tmp_path_factory, tmp_path):
     policy = train_policy(tmp_path_factory, "hover", "--vehicle", SIH)
     with start_process(sys.executable, "-m", "retrim.testing.px4", PX4):
         changes, flight = Changes(), live(policy, ADDRESS, tmp_path, seconds=90)
@@ -193,7 +193,7 @@ def test_px4_hovers_and_a_load_and_a_weak_battery_are_felt_for_less_than_three_s
 
 @PX4_ONLY
 @pytest.mark.px4
-def test_px4_flies_a_circle(tmp_path_factory, tmp_path):
+def test_px4_follows_circle(tmp_path_factory, tmp_path):
     policy = train_policy(tmp_path_factory, "track", "--vehicle", SIH, "--reference", "circle")
     with start_process(sys.executable, "-m", "retrim.testing.px4", PX4):
         text = output_of(live(policy, ADDRESS, tmp_path, "--reference", "circle", seconds=30))

@@ -29,11 +29,11 @@ def skip_if_late(loss, gap=0.0):
         pytest.skip(f"the machine is busy: the simulation lost {loss:.2f} s, the test {gap:.3f} s")
 
 
-def test_it_is_a_link_to_a_vehicle():
+def test_link_conforms():
     check_vehicle(lambda: Scenario(plant="betaflight").make("small"))
 
 
-def test_rates_follow_on_every_axis_in_the_right_sense():
+def test_rates_follow_commands_on_every_axis():
     """Wrong signs of the gyroscope diverge."""
     plant = Scenario(plant="betaflight").make("small")
     try:
@@ -83,7 +83,7 @@ def real_time():
 
 @pytest.mark.skipif(not real_time(), reason="SCHED_FIFO is refused here")
 @pytest.mark.parametrize(("disturbance", "allowance"), [("none", 0.03), ("small", 0.03), ("large", 0.05)])
-def test_a_flight_adapts_in_real_time(policy, disturbance, allowance, tmp_path):
+def test_flight_adapts_in_real_time(policy, disturbance, allowance, tmp_path):
     words = ["live", "--policy", str(policy), "--plant", "betaflight", "--disturbance", disturbance, "--no-page"]
     process = subprocess.run(
         [*RETRIM, *words, "--seconds", "30", "--out", str(tmp_path)], capture_output=True, text=True, timeout=240

@@ -48,7 +48,7 @@ def fly(folder, monkeypatch, more, seconds=25.0):
 
 
 @pytest.mark.parametrize(("p", "d"), [(30, 20), (45, 30)])
-def test_values_are_within_a_tenth_of_the_settings(p, d, tmp_path, monkeypatch):
+def test_identified_values_deviate_from_settings_by_at_most_10_percent(p, d, tmp_path, monkeypatch):
     gains = [f"set {name}_{axis} = {x}" for axis in ("roll", "pitch") for name, x in (("p", p), ("d", d))]
     path, model, sensors = fly(tmp_path, monkeypatch, [*PLAIN, *gains])
     lag, damping, hover = settings_say(path, model)
@@ -76,7 +76,7 @@ def best_match(log, values, sensors, column):
     return max(np.corrcoef(each, values[log.valid])[0, 1] for each in result if np.std(each) > 0.0)
 
 
-def test_a_log_of_high_resolution_has_the_rates_of_the_sticks(tmp_path, monkeypatch):
+def test_high_resolution_log_has_stick_rates(tmp_path, monkeypatch):
     """In tenths of a degree per second; full stick is the rate in the settings."""
     path, model, _ = fly(tmp_path, monkeypatch, ["set blackbox_high_resolution = ON"], seconds=12.0)
     data = path.read_bytes()

@@ -42,7 +42,7 @@ def bridge_case(between, tmp_path):
     bridge.wait()
 
 
-def test_a_flight_that_lost_its_supervisor_tells_the_ground_how_it_ended(bridge_case):
+def test_bridge_reports_end_of_flight_without_supervisor(bridge_case):
     here, there, parent, bridge = bridge_case
     here.publish("sample", b"flies")
     parent.kill()
@@ -57,7 +57,7 @@ def test_a_flight_that_lost_its_supervisor_tells_the_ground_how_it_ended(bridge_
     assert Path(f"{there.folder}-left").exists()
 
 
-def test_without_a_supervisor_and_a_flight_it_ends(between, monkeypatch):
+def test_bridge_without_supervisor_and_flight_exits(between, monkeypatch):
     _, there, parent, plan = between
     monkeypatch.setattr(bridge_process, "SILENCE", 0.2)
     monkeypatch.setattr(bridge_process.signal, "signal", lambda *_: None)
@@ -67,7 +67,7 @@ def test_without_a_supervisor_and_a_flight_it_ends(between, monkeypatch):
     assert last_note(there, "ended") == {}
 
 
-def test_a_bridge_that_is_told_to_end_leaves_the_network(bridge_case):
+def test_terminated_bridge_leaves_network(bridge_case):
     _, there, _, bridge = bridge_case
     bridge.terminate()
     assert bridge.wait(10.0) == 128 + 15

@@ -46,7 +46,7 @@ def show_for(show, seconds=0.3, stop=None):
     return flight, stop
 
 
-def test_all_events_are_shown_once_and_the_end_too():
+def test_events_and_end_are_shown_once():
     observation, times = list[Event](), []
 
     def show(status, new):
@@ -58,7 +58,7 @@ def test_all_events_are_shown_once_and_the_end_too():
     assert times[-1] == "landed"
 
 
-def test_a_report_of_swaps_costs_no_look_at_those_before():
+def test_new_swaps_are_added_without_reading_earlier_ones():
     class Unread(list):
         def __iter__(self):
             raise AssertionError("all swaps so far are looked at")
@@ -75,7 +75,7 @@ def test_a_report_of_swaps_costs_no_look_at_those_before():
     assert len(events.swaps) == 180
 
 
-def test_what_is_ignored_of_a_vehicle_is_told_once():
+def test_ignored_messages_of_vehicle_are_reported_once():
     events = LiveEvents()
     for notes in ([], ["ODOMETRY in frame 7"], ["ODOMETRY in frame 7"], ["ODOMETRY in frame 7", "another"]):
         events.take(Status(1.0, {}, {"notes": notes}, {}, {}, None, [], False, 0, None))
@@ -84,7 +84,7 @@ def test_what_is_ignored_of_a_vehicle_is_told_once():
     ]
 
 
-def test_a_terminal_that_stands_still_stops_nobody():
+def test_blocked_terminal_does_not_delay_landing():
     blocker, stop = threading.Event(), threading.Event()
     threading.Timer(0.3, stop.set).start()
     began = time.monotonic()
@@ -97,7 +97,7 @@ def test_a_terminal_that_stands_still_stops_nobody():
 
 
 @pytest.mark.parametrize("error", [BrokenPipeError, SystemExit])
-def test_when_nobody_reads_any_more_it_lands(error):
+def test_closed_output_lands_vehicle(error):
     def show(status, new):
         raise error
 

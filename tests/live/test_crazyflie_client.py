@@ -78,7 +78,7 @@ def port():
         yield result
 
 
-def test_its_own_client_connects_logs_arms_and_flies_it(port):
+def test_genuine_client_connects_logs_arms_and_flies_peer(port):
     vehicle = Scenario(plant="simple").make_vehicle("small")
     share = float(9.81 * vehicle.mass / vehicle.thrust_max)
     percent = (share * 65_535 - 10_001) / 499.99 if share * 65_535 > 10_001 else 0.0
@@ -96,7 +96,7 @@ def test_its_own_client_connects_logs_arms_and_flies_it(port):
     assert result["landed"]
 
 
-def test_we_fly_it_through_the_script_for_the_radio(port):
+def test_link_through_radio_script_conforms(port):
     ours = port + 1 if port < 65_000 else port - 1
     with start_process(CFLIB, RADIO, f"udp://127.0.0.1:{port}", ours):
         testing.check_vehicle(lambda: Scenario(plant=f"crazyflie:udp:127.0.0.1:{ours}").make("small"))

@@ -100,7 +100,7 @@ def whole_log(folder, status=None, until=None):
     return rows
 
 
-def test_a_flight_without_faults(tmp_path, controller):
+def test_flight_without_faults_lands(tmp_path, controller):
     status, events, *_ = fly_once(spec_in(tmp_path, controller))
     rows = whole_log(tmp_path, status)
     assert status.end_reason == "landed"
@@ -113,7 +113,7 @@ def test_a_flight_without_faults(tmp_path, controller):
 
 @pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies four
 @pytest.mark.parametrize("roles", ["control", "plant", "watchdog recorder residual policy"])
-def test_each_process_is_killed_at_a_random_time(tmp_path, controller, roles, seed):
+def test_flight_survives_processes_killed_at_random_times(tmp_path, controller, roles, seed):
     """What nobody flies by is killed in one flight, each at its own time, and comes back."""
     names = roles.split()
     kills = dict(zip(names, np.random.default_rng([seed, len(roles)]).uniform(0.0, SECONDS, len(names)), strict=True))
@@ -138,7 +138,7 @@ def test_each_process_is_killed_at_a_random_time(tmp_path, controller, roles, se
 
 @pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))
 @pytest.mark.parametrize("roles", ["control", "plant", "watchdog recorder residual policy"])
-def test_each_process_is_suspended_for_ever_at_a_random_time(tmp_path, controller, roles, seed):
+def test_hung_processes_are_detected_at_random_times(tmp_path, controller, roles, seed):
     names = roles.split()
     times = np.random.default_rng([seed, len(roles)]).uniform(0.0, 1.0, len(names))
     stops, spec = dict(zip(names, times, strict=True)), spec_in(tmp_path, controller, seconds=4.0)
@@ -162,7 +162,7 @@ def test_each_process_is_suspended_for_ever_at_a_random_time(tmp_path, controlle
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_without_its_supervisor_the_vehicle_lands_and_the_log_is_whole(tmp_path, controller, number):
+def test_vehicle_lands_without_supervisor_and_log_is_complete(tmp_path, controller, number):
     spec = spec_in(tmp_path, controller, seconds=1.5 if number == signal.SIGKILL else 60.0)
     process: Popen[bytes] = launch("live_helpers:supervise", spec, tmp_path / "supervisor.log")
     log = tmp_path / "flight.csv"

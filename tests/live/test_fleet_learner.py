@@ -48,7 +48,7 @@ def find(vehicle, layer):
 
 
 @pytest.mark.parametrize("layer", ["residual", "policy"])
-def test_each_vehicle_gets_what_its_own_learner_learns(start, vehicles, layer):  # noqa: F811
+def test_batched_updates_equal_separate_updates(start, vehicles, layer):  # noqa: F811
     """Together, to rounding: of three, whose program is one for four."""
     for i, vehicle in enumerate(vehicles.values()):
         vehicle.fly(60 + 10 * i)
@@ -68,7 +68,7 @@ def test_each_vehicle_gets_what_its_own_learner_learns(start, vehicles, layer): 
     assert any(vehicle.bus.latest(f"parameters.{layer}") for vehicle in vehicles.values())
 
 
-def test_a_vehicle_that_is_late_is_not_waited_for(start, vehicles):  # noqa: F811
+def test_late_vehicle_does_not_delay_others(start, vehicles):  # noqa: F811
     vehicles["d"] = Beside(start)
     fleet = fleet_for(vehicles, start, "residual")
     for name in "acd":
@@ -81,7 +81,7 @@ def test_a_vehicle_that_is_late_is_not_waited_for(start, vehicles):  # noqa: F81
     assert fleet.step() == 0
 
 
-def test_a_vehicle_may_go_and_the_others_are_learnt_for(start, vehicles):  # noqa: F811
+def test_learning_continues_after_vehicle_leaves(start, vehicles):  # noqa: F811
     vehicles["d"] = Beside(start)
     fleet = fleet_for(vehicles, start, "residual")
     fleet.drop("b")
@@ -92,7 +92,7 @@ def test_a_vehicle_may_go_and_the_others_are_learnt_for(start, vehicles):  # noq
     assert vehicles["b"].bus.latest("parameters.residual") is None
 
 
-def test_nothing_is_published_for_a_vehicle_that_went_meanwhile(start, vehicles):  # noqa: F811
+def test_update_of_departed_vehicle_is_not_published(start, vehicles):  # noqa: F811
     fleet = FleetLearner(lambda: vehicles["a"].now)
     fleet.add("a", plan_of(start, "residual", 1), vehicles["a"].bus, lambda: False)
     vehicles["a"].fly()
@@ -100,7 +100,7 @@ def test_nothing_is_published_for_a_vehicle_that_went_meanwhile(start, vehicles)
     assert vehicles["a"].bus.latest("parameters.residual") is None
 
 
-def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_back(start, tmp_path):  # noqa: F811
+def test_low_rank_vehicles_share_base_until_rollback(start, tmp_path):  # noqa: F811
     path, controller, _ = start
     _, preset = load_learner_state(path)
     setup = Setup.from_preset(preset)
@@ -125,7 +125,7 @@ def test_low_rank_vehicles_share_a_base_and_lose_it_with_a_policy_that_is_taken_
     assert id(next(iter(fleet._bases.values()))) != was
 
 
-def test_programs_are_there_for_any_number_that_is_due(start, vehicles, monkeypatch):  # noqa: F811
+def test_warm_up_compiles_program_for_each_batch_size(start, vehicles, monkeypatch):  # noqa: F811
     learner_state = []
     monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: learner_state.append(len(workers)))
     fleet = fleet_for(vehicles, start, "residual")
@@ -136,7 +136,7 @@ def test_programs_are_there_for_any_number_that_is_due(start, vehicles, monkeypa
     assert [room_for(n) for n in (1, 2, 3, 4, 5, 16, 17)] == [1, 2, 4, 4, 8, 16, 32]
 
 
-def test_plans_come_and_go_and_a_flight_that_is_over_is_left(start, vehicles, tmp_path, monkeypatch):  # noqa: F811
+def test_fleet_process_follows_added_and_removed_plans(start, vehicles, tmp_path, monkeypatch):  # noqa: F811
     buses = {f"{i:06d}-residual": vehicle.bus for i, vehicle in enumerate(vehicles.values(), start=1)}
     monkeypatch.setattr(fleet_process, "SharedMemoryBus", lambda folder: buses[folder.name])
     monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: [])
@@ -168,5 +168,5 @@ def test_plans_come_and_go_and_a_flight_that_is_over_is_left(start, vehicles, tm
     assert [seat.poll() for seat in seats] == [-9] * 3
 
 
-def test_the_clock_of_the_fleet_is_that_of_the_machine():
+def test_fleet_uses_monotonic_clock():
     assert FleetLearner()._clock is time.monotonic

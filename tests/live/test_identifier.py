@@ -76,7 +76,7 @@ def parameters(loop, expected, after=0):
     return Parameters.unpack(data, expected, half=VEHICLE, base=BASE, after=after)
 
 
-def test_the_vehicle_is_found(setup, vehicle_notes):
+def test_vehicle_is_identified(setup, vehicle_notes):
     controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
     expected = plain_source(setup, controller).parameters[VEHICLE]
     result = parameters(vehicle_notes, expected)
@@ -90,13 +90,13 @@ def test_the_vehicle_is_found(setup, vehicle_notes):
     assert 1.0 < result.computed_from <= 6.0  # an unchanged vehicle is not sent again
 
 
-def test_it_is_reported_after_one_and_after_five_seconds(vehicle_notes):
+def test_identification_is_reported_after_one_and_five_seconds(vehicle_notes):
     reports = last_note(vehicle_notes.bus, "identified")["reports"]
     assert [t for t, _ in reports] == [pytest.approx(1.0, abs=0.2), pytest.approx(5.0, abs=0.2)]
     assert all(text.startswith("thrust gain 0.") and "rate delay" in text for _, text in reports)
 
 
-def test_pieces_of_any_length_give_vehicles_that_agree(setup, rows, vehicle_notes):
+def test_estimate_does_not_depend_on_length_of_messages(setup, rows, vehicle_notes):
     other = IdentifierLoop(setup.preset, BASE, bus())
     feed(other, rows, every=50)
     (centre, width, gain), (centre_50, width_50, gain_50) = (
@@ -106,7 +106,7 @@ def test_pieces_of_any_length_give_vehicles_that_agree(setup, rows, vehicle_note
     assert abs(gain - gain_50) < 0.02
 
 
-def test_a_process_that_was_started_again_counts_on(setup, rows, vehicle_notes):
+def test_restarted_identifier_continues_versions(setup, rows, vehicle_notes):
     before = vehicle_notes.bus.latest(f"parameters.{VEHICLE}").version
     again = IdentifierLoop(setup.preset, BASE, vehicle_notes.bus)
     again.bus.publish("flight", FlightRows(rows[-150:]).pack())
@@ -115,7 +115,7 @@ def test_a_process_that_was_started_again_counts_on(setup, rows, vehicle_notes):
     assert parameters(again, _shapes(setup), after=before).version == before + 1
 
 
-def test_nothing_is_compiled_after_the_warm_up(setup, rows):
+def test_warm_up_compiles_all_programs(setup, rows):
     """A process that compiles in flight is silent, and is ended for it."""
     loop, program = IdentifierLoop(setup.preset, BASE, bus()), list[str]()
 
@@ -137,25 +137,25 @@ def test_damaged_rows_are_ignored(setup):
     assert not loop.step()
 
 
-def test_a_preset_for_one_vehicle_is_refused():
+def test_preset_for_one_vehicle_is_refused():
     with pytest.raises(ConfigError, match="is for one vehicle"):
         IdentifierLoop(load("hover/retrim"), BASE, bus())
 
 
-def test_a_live_flight_does_not_excite_its_vehicle(setup):
+def test_excitation_in_live_flight_is_refused(setup):
     excitation = Setup.from_preset(changed(setup.preset, family={"excitation": True}))
     controller = excitation.pilot(excitation.new_policy(jax.random.key(0)), "base-id").controller
     with pytest.raises(ConfigError, match=r"family\.excitation: a live flight does not excite its vehicle"):
         plain_source(excitation, controller)
 
 
-def test_only_a_controller_that_identifies_has_the_half(setup):
+def test_only_identifying_controller_has_vehicle_parameters(setup):
     policy = setup.new_policy(jax.random.key(0))
     assert vehicle_half(setup, setup.pilot(policy, "base-id").controller).keys() == {VEHICLE}
     assert vehicle_half(setup, setup.pilot(policy, "base-do").controller) == {}
 
 
-def test_the_controller_follows_slowly_and_keeps_the_vehicle_when_learning_is_switched_off(setup):
+def test_controller_follows_slowly_and_keeps_vehicle_after_restart(setup):
     policy = setup.new_policy(jax.random.key(0))
     source = plain_source(setup, setup.pilot(policy, "base-id").controller)
     pilot = LivePilot(source)

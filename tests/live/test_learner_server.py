@@ -95,7 +95,7 @@ def fly_while(gap, folder, controller):  # noqa: F811
 
 
 @pytest.mark.parametrize("gap", ["ground", "bridge and page"])
-def test_a_flight_with_learners_elsewhere(tmp_path, controller, gap):  # noqa: F811
+def test_flight_uses_remote_learners(tmp_path, controller, gap):  # noqa: F811
     pytest.importorskip("zenoh")
     for attempt in ("first", "second", "third"):  # a busy machine may hold a process back until the guard takes over
         (tmp_path / attempt).mkdir()
@@ -120,7 +120,7 @@ def test_a_flight_with_learners_elsewhere(tmp_path, controller, gap):  # noqa: F
     [(KEY, OTHER, FOREIGN, FOREIGN), (None, KEY, MISSING, UNSIGNED), (KEY, None, UNSIGNED, MISSING)],
     ids=("another", "none here", "none there"),
 )
-def test_with_another_key_or_none_nothing_takes_off_and_both_ends_say_why(
+def test_wrong_or_missing_key_prevents_flight_and_both_ends_report_it(
     tmp_path, monkeypatch, request, here, there, said_here, said_there
 ):
     pytest.importorskip("zenoh")
@@ -153,7 +153,7 @@ def test_with_another_key_or_none_nothing_takes_off_and_both_ends_say_why(
         (["zenoh:127.0.0.1:1", "zenoh:10.0.0.5:1"], "zenoh:10.0.0.5:1: learners beyond this machine need a shared key"),
     ],
 )
-def test_addresses_that_cannot_be_learnt_for_together_are_named(addresses, why):
+def test_incompatible_addresses_are_refused(addresses, why):
     with pytest.raises(ConfigError, match=why):
         learn_for([Address.of(each) for each in addresses], threading.Event())
 
@@ -168,7 +168,7 @@ def mission_in(folder, base, number=1, start=None, reference=None):
     return LearnerMission.of(number, reference, 0, base, ("residual", "policy"), 0, capacities, folder / "start").pack()
 
 
-def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch):
+def test_new_flight_replaces_learners(tmp_path, monkeypatch):
     network, start_time = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
@@ -196,7 +196,7 @@ def test_a_new_flight_has_new_learners_and_an_old_one_none(tmp_path, monkeypatch
     assert not last.exists()
 
 
-def test_a_learner_that_is_suspended_for_ever_is_started_again(tmp_path, monkeypatch):
+def test_hung_learner_is_restarted(tmp_path, monkeypatch):
     network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
     with DrillGround(Address("zenoh", "127.0.0.1", 1)) as ground:
@@ -240,9 +240,7 @@ def bus_case(tmp_path, monkeypatch):
         ({"vehicle": "quad.toml"}, None, "names a file of this machine"),
     ],
 )
-def test_a_flight_that_names_code_or_files_of_the_ground_is_refused_and_told(
-    bus_case, tmp_path, changes, reference, why
-):
+def test_mission_with_code_or_file_names_is_refused_and_reported(bus_case, tmp_path, changes, reference, why):
     network, ground = bus_case
     start = learner_state_of(changed(PRESETS["hover/retrim"], **changes))
     network.publish("mission", mission_in(tmp_path, "first", start=start, reference=reference))
@@ -255,14 +253,14 @@ def test_a_flight_that_names_code_or_files_of_the_ground_is_refused_and_told(
     assert list(ground.wait()) == []
 
 
-def test_a_name_that_the_ground_trusts_is_learnt_for(bus_case, tmp_path):
+def test_trusted_name_is_accepted(bus_case, tmp_path):
     network, ground = bus_case
     start = learner_state_of(changed(PRESETS["hover/retrim"], adapt={"residual": "mine:trusted"}))
     network.publish("mission", mission_in(tmp_path, "first", start=start))
     assert list(ground.wait()) == []
 
 
-def test_a_new_flight_gets_nothing_of_the_one_before_and_all_that_is_its_own(bus_case, tmp_path):
+def test_new_flight_gets_only_own_messages(bus_case, tmp_path):
     network, ground = bus_case
     network.publish("learning", b"paused before anybody was here")
     network.publish("mission", mission_in(tmp_path, "first"))
@@ -284,7 +282,7 @@ def test_a_new_flight_gets_nothing_of_the_one_before_and_all_that_is_its_own(bus
     assert ground._bus.latest("flight").data == b"of the second"
 
 
-def test_a_flight_is_told_that_its_end_was_heard(bus_case, tmp_path):
+def test_ground_confirms_end_of_flight(bus_case, tmp_path):
     network, ground = bus_case
     network.publish("mission", mission_in(tmp_path, "first"))
     stands = ground.learn()
@@ -297,7 +295,7 @@ def test_a_flight_is_told_that_its_end_was_heard(bus_case, tmp_path):
     assert (text["base"], text["over"]) == ("first", True)
 
 
-def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(monkeypatch):
+def test_failure_is_reported_at_once_and_raised_at_end(monkeypatch):
     monkeypatch.setattr(Address, "join", lambda *_, **__: InProcessBus({}))
     message = threading.Event()
 
@@ -322,7 +320,7 @@ def test_a_failure_is_told_while_the_other_flights_go_on_and_raised_at_the_end(m
     assert message.is_set()
 
 
-def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
+def test_mission_survives_round_trip_and_damaged_bytes_are_refused(tmp_path):
     start = tmp_path / "start"
     start.write_bytes(np.random.default_rng(0).bytes(1000))
     capacities = {"flight": 1000, "parameters.policy": 5000, "knobs": 10}
@@ -341,7 +339,7 @@ def test_a_mission_survives_the_bus_and_nothing_else_is_one(tmp_path):
             LearnerMission.unpack(data)
 
 
-def test_a_bridge_carries_each_topic_its_way_and_no_more_than_needed():
+def test_bridge_forwards_each_topic_in_one_direction_at_limited_rate():
     now = 0.0
     topics = dict.fromkeys((*OUT, *INTO), 100)
     here, there = InProcessBus(topics), InProcessBus(topics | {"status": 1})

@@ -21,7 +21,7 @@ def states(v_sign=1.0, omega_signs=(1.0, 1.0, 1.0), size=1.0):
     return result
 
 
-def test_a_consistent_vehicle_agrees():
+def test_consistent_states_agree():
     assert all(value > 0.99 for value in compare(states()).values())
 
 
@@ -32,17 +32,17 @@ def test_wrong_signs_of_body_rates_disagree(signs):
     assert rates < 0.8
 
 
-def test_a_wrong_frame_of_the_velocity_disagrees():
+def test_wrong_frame_of_velocity_disagrees():
     assert next(iter(compare(states(v_sign=-1.0)).values())) < -0.99
 
 
-def test_a_vehicle_that_stands_still_is_no_evidence():
+def test_vehicle_at_rest_gives_no_verdict():
     assert list(compare(states(size=0.0)).values()) == [None, None]
     assert not any(good for _, good in verdicts(compare(states(size=0.0))))
     assert not any(good for _, good in verdicts(compare([])))
 
 
-def test_a_nose_that_points_down_is_positive():
+def test_nose_down_is_positive():
     R = Rotation.from_euler("y", 30.0, degrees=True).as_matrix()
     text = line(VehicleState(np.zeros(3), R, np.zeros(3), np.zeros(3), 0.02))
     assert "tilt 30 deg (nose down +30, left side up +0), age 20 ms" in text
@@ -56,6 +56,6 @@ def test_a_nose_that_points_down_is_positive():
         (["msp:nowhere"], "expected msp:"),
     ],
 )
-def test_other_links_are_refused_in_one_line(words, text):
+def test_unsuitable_links_are_refused_in_one_line(words, text):
     with pytest.raises(SystemExit, match=text):
         main(words)

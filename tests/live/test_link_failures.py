@@ -75,7 +75,7 @@ def asserts(failures, links, *, fly_by=None):
     return mark
 
 
-def test_each_row_of_the_page_has_a_test_and_each_test_its_row():
+def test_rows_of_page_correspond_to_tests():
     assert {key: row.test for key, row in ROWS.items()} == CHECKED
 
 
@@ -233,7 +233,7 @@ RESTARTED = {"watchdog": "watchdog", "recorder": "recorder", "a learner": "polic
 
 
 @asserts([f"{name} killed" for name in (*RESTARTED, "control")], ["every link"], fly_by=["mavlink"])
-def test_processes_are_killed_one_after_the_other(rig, tmp_path):
+def test_processes_are_killed_in_turn(rig, tmp_path):
     with more_roles():
         flight, steps = begin(rig, tmp_path, ("residual", "policy"))
         for name, role in RESTARTED.items():
@@ -257,7 +257,7 @@ def test_processes_are_killed_one_after_the_other(rig, tmp_path):
 
 
 @asserts(["supervisor killed"], ["every link"], fly_by=["ros2:mavros"])
-def test_the_supervisor_is_killed(rig, tmp_path):
+def test_supervisor_is_killed(rig, tmp_path):
     key = "every link", "supervisor killed"
     with flying_alone(spec_of(rig, tmp_path), rig) as processes:
         before, fault = read_log(tmp_path / "flight.csv")[-1, 1], time.monotonic()
@@ -273,7 +273,7 @@ def test_the_supervisor_is_killed(rig, tmp_path):
 
 
 @asserts(["link process killed"], LINKS, fly_by=["mavlink", "ros2:mavros", "crazyflie"])
-def test_the_link_process_is_killed(rig, tmp_path):
+def test_link_process_is_killed(rig, tmp_path):
     key = rig.name, "link process killed"
     flight, steps = begin(rig, tmp_path)
     fault = time.monotonic()
@@ -297,7 +297,7 @@ def test_all_processes_are_killed(rig, tmp_path):
 
 
 @asserts(["all processes killed, last target held"], PILOTED)
-def test_all_processes_are_killed_in_front_of_a_stack_that_holds_the_last_target(rig, tmp_path):
+def test_all_processes_are_killed_before_stack_that_holds_last_target(rig, tmp_path):
     """The last target is one that turns the vehicle: it has just been pushed."""
     key = rig.name, "all processes killed, last target held"
     before, rig.peer.fresh = rig.peer.fresh, np.inf
@@ -326,7 +326,7 @@ def cut_for(rig, seconds):
 
 
 @asserts(["cut for 0.3 s", "cut for 1 s"], LINKS, fly_by=["mavlink", "ros2:mavros", "crazyflie"])
-def test_the_link_is_cut_for_a_short_time_twice(rig, tmp_path):
+def test_link_is_cut_twice_for_short_times(rig, tmp_path):
     flight, steps = begin(rig, tmp_path)
     cuts = []
     for seconds in (0.3, 1.0):  # the second one comes while the guard holds the vehicle after the first one
@@ -349,7 +349,7 @@ def test_the_link_is_cut_for_a_short_time_twice(rig, tmp_path):
 
 
 @asserts(["cut for 5 s", "cut for ever"], LINKS, fly_by=["ros2:px4", "ros", "crazyflie"])
-def test_the_link_is_cut_for_a_long_time(rig, tmp_path):
+def test_link_is_cut_for_long_time(rig, tmp_path):
     """After 5 s the vehicle is in the state in which it stays, and a link that comes back does not change it."""
     flight, steps = begin(rig, tmp_path)
     fault = time.monotonic()
@@ -407,7 +407,7 @@ def companion_flies(rig):
 
 
 @asserts(["all processes killed"], ["companion.c"], fly_by=())
-def test_the_companion_computer_is_killed(companion):
+def test_companion_computer_is_killed(companion):
     with companion_flies(companion) as process:
         fault = time.monotonic()
         process.kill()
@@ -416,7 +416,7 @@ def test_the_companion_computer_is_killed(companion):
 
 
 @asserts([f"cut for {time}" for time in ("0.3 s", "1 s", "5 s", "ever")], ["companion.c"], fly_by=())
-def test_the_companion_computer_is_cut_off(companion):
+def test_link_of_companion_computer_is_cut(companion):
     for seconds in (0.3, 1.0, 5.0):
         key = "companion.c", f"cut for {seconds:g} s"
         with companion_flies(companion) as process:
@@ -429,7 +429,7 @@ def test_the_companion_computer_is_cut_off(companion):
 
 
 @asserts(["link process killed", "all processes killed"], ["betaflight"], fly_by=())
-def test_a_simulated_board_ends_with_the_process_of_its_link():
+def test_simulated_board_ends_with_link_process():
     """A program stands in for the board: the kernel kills it."""
     words = f"[sys.executable, '-c', {TIED!r}, '/bin/sleep', '60']"
     code = f"import subprocess, sys, time; print(subprocess.Popen({words}).pid, flush=True); time.sleep(60)"

@@ -98,7 +98,7 @@ def base_of(loop):
     return weights(loop.worker._policy.policy)
 
 
-def test_a_window_becomes_parameters_that_the_controller_takes(start):
+def test_learner_publishes_parameters_from_window(start):
     beside = Beside(start, "residual")
     loop = beside.loops["residual"]
     assert not loop.step()
@@ -115,7 +115,7 @@ def test_a_window_becomes_parameters_that_the_controller_takes(start):
     assert beside.parameters("residual", after=1).version == 2
 
 
-def test_on_a_bus_that_is_new_it_counts_on_from_what_is_flown(start):
+def test_versions_continue_from_active_policy_on_new_bus(start):
     beside = Beside(start, "policy")
     loop = improving(beside.loops["policy"])
     beside.says(57)
@@ -124,7 +124,7 @@ def test_on_a_bus_that_is_new_it_counts_on_from_what_is_flown(start):
     assert beside.parameters("policy").version == 58
 
 
-def test_what_is_paused_while_it_learns_is_not_published(start):
+def test_update_during_pause_is_not_published(start):
     beside = Beside(start, "policy")
     note = pack_note("learning", paused=True)
     loop = improving(beside.loops["policy"], lambda: beside.bus.publish("learning", note))
@@ -133,7 +133,7 @@ def test_what_is_paused_while_it_learns_is_not_published(start):
     assert beside.bus.latest("parameters.policy") is None
 
 
-def test_nothing_is_learnt_that_nobody_would_fly(start):
+def test_paused_or_descending_flight_starts_no_update(start):
     beside = Beside(start, "residual")
     loop = beside.loops["residual"]
     beside.fly()
@@ -146,7 +146,7 @@ def test_nothing_is_learnt_that_nobody_would_fly(start):
     assert loop.step()
 
 
-def test_a_policy_goes_on_from_what_is_flown(start):
+def test_policy_update_starts_from_active_policy(start):
     beside = Beside(start, "policy")
     loop = improving(beside.loops["policy"])
     beside.fly()
@@ -169,7 +169,7 @@ def test_a_policy_goes_on_from_what_is_flown(start):
     assert beside.parameters("policy", after=2).parent == 1
 
 
-def test_one_that_is_taken_back_at_once_is_not_gone_on_from(start):
+def test_update_does_not_start_from_rolled_back_policy(start):
     beside = Beside(start, "policy")
     loop = improving(beside.loops["policy"])
     beside.fly()
@@ -180,7 +180,7 @@ def test_one_that_is_taken_back_at_once_is_not_gone_on_from(start):
     np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
 
 
-def test_what_was_learnt_from_a_policy_that_is_taken_back_meanwhile_is_dropped(start):
+def test_update_of_policy_rolled_back_during_training_is_discarded(start):
     beside = Beside(start, "policy")
     loop = improving(beside.loops["policy"])
     beside.fly()
@@ -193,7 +193,7 @@ def test_what_was_learnt_from_a_policy_that_is_taken_back_meanwhile_is_dropped(s
     np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
 
 
-def test_an_update_that_takes_seconds_is_waited_for(start):
+def test_learner_waits_for_report_about_slow_update(start):
     beside = Beside(start, "policy")
     loop = improving(beside.loops["policy"])
 
@@ -211,7 +211,7 @@ def test_an_update_that_takes_seconds_is_waited_for(start):
     np.testing.assert_array_equal(base_of(loop), weights(beside.update("policy", 1).state.policy))
 
 
-def test_a_policy_that_nobody_takes_is_not_waited_for_for_ever(start):
+def test_learner_stops_waiting_for_unused_policy(start):
     beside = Beside(start, "policy")
     loop = improving(beside.loops["policy"])
     beside.fly()
@@ -222,7 +222,7 @@ def test_a_policy_that_nobody_takes_is_not_waited_for_for_ever(start):
     np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
 
 
-def test_one_that_was_started_again_goes_on_from_what_is_flown(start):
+def test_restarted_learner_continues_from_active_parameters(start):
     beside = Beside(start, "residual", "policy")
     beside.fly()
     improving(beside.loops["policy"])
@@ -244,7 +244,7 @@ def test_one_that_was_started_again_goes_on_from_what_is_flown(start):
 
 
 @pytest.mark.parametrize("given_up", [[], [5]])
-def test_what_is_flown_stays_on_the_bus_however_much_is_learnt_that_nobody_takes(start, given_up):
+def test_active_update_remains_on_bus_despite_unused_updates(start, given_up):
     """A process that flew and hangs takes nothing any more."""
     beside = Beside(start)
     update = PolicyUpdate(0.0, 0.0, 0.0, beside.state.policy)

@@ -26,7 +26,7 @@ def speeds(plant, ticks):
     return np.array([np.asarray(plant.step(Command.hover(jnp.zeros(0).dtype))[0].v) for _ in range(ticks)])
 
 
-def test_knobs_survive_the_bus():
+def test_knobs_survive_round_trip():
     knobs = ManualDisturbance((1.0, -2.0, 0.5), (3.0, 0.0, -1.0), 0.05, 0.8, (8.0, 0.0, 0.0), 3)
     assert ManualDisturbance.unpack(knobs.pack()) == knobs
 
@@ -39,14 +39,14 @@ def test_knobs_survive_the_bus():
         {"kicks": float("inf")}, {"kick": [99.0, 0.0, 0.0]},
     ],
 )  # fmt: skip
-def test_a_knob_that_is_turned_too_far_is_refused(fields):
+def test_invalid_knobs_are_refused(fields):
     good = json.loads(json.dumps(vars(ManualDisturbance())))
     assert ManualDisturbance.unpack(pack_note("knobs", **good)) == ManualDisturbance()
     with pytest.raises(MessageError, match="knobs"):
         ManualDisturbance.unpack(pack_note("knobs", **(good | fields)))
 
 
-def test_a_push_is_an_acceleration_and_ends_with_the_knob():
+def test_push_accelerates_vehicle_until_knob_is_reset():
     plant, still = add_knobs(), add_knobs()
     plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
     with_push = speeds(plant, 10) - speeds(still, 10)
@@ -56,14 +56,14 @@ def test_a_push_is_an_acceleration_and_ends_with_the_knob():
     np.testing.assert_allclose(after, after[0], atol=0.02)
 
 
-def test_knobs_come_on_top_of_the_disturbance():
+def test_knobs_add_to_disturbance():
     both, alone = add_knobs(disturbance="push=1"), add_knobs(disturbance="push=1")
     both.turn(ManualDisturbance(push=(-1.0, 0.0, 0.0)))
     difference = speeds(both, 10)[-1] - speeds(alone, 10)[-1]
     np.testing.assert_allclose(difference, [-0.2, 0.0, 0.0], atol=0.01)
 
 
-def test_a_kick_ends_by_itself_and_comes_once():
+def test_kick_is_short_and_acts_once():
     plant, still = add_knobs(), add_knobs()
     kick = ManualDisturbance(kick=(8.0, 0.0, 0.0), kicks=1)
     plant.turn(kick)
@@ -78,13 +78,13 @@ def test_a_kick_ends_by_itself_and_comes_once():
 @pytest.mark.parametrize(
     "knobs", [ManualDisturbance(load=0.05), ManualDisturbance(rotor=0.7), ManualDisturbance(wind=(4.0, 0.0, 0.0))]
 )
-def test_every_knob_moves_the_vehicle(knobs):
+def test_every_knob_moves_vehicle(knobs):
     plant, still = add_knobs(), add_knobs()
     plant.turn(knobs)
     assert np.abs(speeds(plant, 15) - speeds(still, 15)).max() > 0.02
 
 
-def test_a_plant_that_does_not_know_an_effect_flies_on():
+def test_plant_without_effect_flies_on_and_refuses_it():
     plant, still = add_knobs("rotorpy"), add_knobs("rotorpy")
     plant.turn(ManualDisturbance(load=0.1, push=(1.0, 0.0, 0.0)))
     np.testing.assert_array_equal(speeds(plant, 5), speeds(still, 5))
@@ -94,7 +94,7 @@ def test_a_plant_that_does_not_know_an_effect_flies_on():
     assert speeds(plant, 5)[-1, 0] - speeds(still, 5)[-1, 0] > 0.05
 
 
-def test_a_plant_without_knobs_says_so_and_its_errors_are_its_own():
+def test_plant_without_knobs_refuses_them_and_raises_own_errors():
     class Bare(Plant):
         dt = 0.02
 

@@ -67,13 +67,13 @@ def wish(calls, **fields):
     return [f"{event.kind}: {event.note}" for event in calls.obey(status())]
 
 
-def test_landing_is_an_order(requests):
+def test_landing_request_lands_vehicle(requests):
     assert wish(requests, land=True) == ["asked: land"]
     assert requests._supervisor.messages == ["land"]
     assert requests.obey(status()) == []
 
 
-def test_pausing_keeps_what_flies_and_none_does_not(requests):
+def test_pause_keeps_learned_parameters_and_none_removes_them(requests):
     assert wish(requests, method="full", paused=False) == []
     assert wish(requests, method="full", paused=True) == ["asked: method full, paused"]
     assert wish(requests, method="none", paused=False) == ["asked: method none"]
@@ -85,7 +85,7 @@ def test_pausing_keeps_what_flies_and_none_does_not(requests):
     assert "land" not in requests._supervisor.messages
 
 
-def test_another_way_of_learning_goes_on_from_what_is_flown(requests):
+def test_other_method_continues_from_active_policy(requests):
     supervisor = requests._supervisor
     state = load_learner_state(supervisor.start)[0]
     nudge = state.policy.policy.with_params(jax.tree.map(lambda leaf: leaf + 0.01, state.policy.policy.params))
@@ -104,7 +104,7 @@ def test_another_way_of_learning_goes_on_from_what_is_flown(requests):
         np.testing.assert_allclose(leaf, expected, atol=1e-12)
 
 
-def test_knobs_are_an_event_once_they_rest(requests, monkeypatch):
+def test_settled_knobs_give_one_event(requests, monkeypatch):
     monkeypatch.setattr(wishes, "SETTLED_S", 0.0)
     requests._supervisor.bus.publish("knobs", b"noise")
     assert requests.obey(status()) == []
@@ -113,7 +113,7 @@ def test_knobs_are_an_event_once_they_rest(requests, monkeypatch):
     assert requests.obey(status()) == []
 
 
-def test_a_knobs_event_states_the_change_and_its_time(requests, monkeypatch):
+def test_knobs_event_states_change_and_time(requests, monkeypatch):
     def turned(**knobs):
         requests._supervisor.bus.publish("knobs", ManualDisturbance(**knobs).pack())
         monkeypatch.setattr(wishes, "SETTLED_S", 60.0)

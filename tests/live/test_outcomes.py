@@ -91,7 +91,7 @@ def check_kept(folder):
 
 
 @pytest.mark.parametrize("seed", DRILLS)
-def test_processes_that_are_suspended_for_ever_come_back_and_the_log_is_whole(folder, seed):
+def test_hung_processes_are_restarted_and_log_is_complete(folder, seed):
     out, roles = f"suspended{seed}", {"record": "recorder", "show": "page", "watch": "watchdog"}
 
     def suspend(process):
@@ -111,7 +111,7 @@ def test_processes_that_are_suspended_for_ever_come_back_and_the_log_is_whole(fo
 
 @pytest.mark.parametrize("seed", DRILLS)
 @pytest.mark.parametrize("role", ["plant", "control"])
-def test_what_a_flight_cannot_do_without_ends_it_in_a_defined_way(folder, role, seed):
+def test_hung_plant_or_control_ends_flight_in_defined_way(folder, role, seed):
     out, function = f"{role}{seed}", {"plant": "simulate", "control": "fly"}[role]
 
     def suspend(process):
@@ -135,7 +135,7 @@ def test_what_a_flight_cannot_do_without_ends_it_in_a_defined_way(folder, role, 
 
 
 @pytest.mark.parametrize("seed", DRILLS)
-def test_a_terminal_that_is_closed_lands_the_vehicle_and_all_is_written(folder, seed):
+def test_closed_terminal_lands_vehicle_and_results_are_written(folder, seed):
     out = f"hangup{seed}"
     code, _ = fly_once(folder, out, lambda process: process.send_signal(signal.SIGHUP), seed)
     result = results(folder / out)
@@ -147,7 +147,7 @@ def test_a_terminal_that_is_closed_lands_the_vehicle_and_all_is_written(folder, 
 
 @pytest.mark.parametrize("seed", DRILLS)
 @pytest.mark.parametrize("how", ["removed", "renamed"])
-def test_a_lost_folder_is_created_again_with_log_and_learner_state(folder, how, seed):
+def test_lost_folder_is_created_again_with_log_and_learner_state(folder, how, seed):
     out = folder / f"{how}{seed}"
     loss = (lambda: shutil.rmtree(out)) if how == "removed" else (lambda: out.rename(f"{out}-elsewhere"))
     code, text = fly_once(folder, out.name, lambda process: loss(), seed)
@@ -166,7 +166,7 @@ def elsewhere(text, name, reason):
 
 
 @pytest.mark.parametrize("seed", DRILLS)
-def test_a_folder_in_whose_place_is_something_else_loses_nothing(folder, seed):
+def test_results_are_saved_elsewhere_if_file_replaces_folder(folder, seed):
     out = folder / f"replaced{seed}"
 
     def replace(process):
@@ -196,7 +196,7 @@ def small_disk(folder, tmp_path):
 
 
 @pytest.mark.parametrize("seed", DRILLS)
-def test_a_full_disk_loses_nothing(folder, small_disk, seed):
+def test_results_are_saved_elsewhere_if_disk_is_full(folder, small_disk, seed):
     full = "No space left on device"
     code, text = fly_once(folder, small_disk.name, lambda process: fill(small_disk), seed)
     assert code == 1, text
@@ -217,7 +217,7 @@ def fill(disk):
 
 
 @pytest.mark.parametrize("seed", DRILLS)
-def test_learner_state_survives_the_loss_of_supervisor_and_recorder(folder, seed):
+def test_learner_state_survives_loss_of_supervisor_and_recorder(folder, seed):
     out, flight, bus = folder / f"alone{seed}", {}, []
 
     def kill(process):

@@ -44,7 +44,7 @@ DRAWING = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
            "--disable-background-networking", "--disable-component-update", "--no-first-run")  # fmt: skip
 
 
-def test_a_port_that_is_taken_is_left_to_who_has_it():
+def test_occupied_port_is_skipped():
     import socket
 
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -57,7 +57,7 @@ def test_a_port_that_is_taken_is_left_to_who_has_it():
 @pytest.mark.parametrize(
     "vector", [(0.1, -0.2, 0.3), (3.1, 0.0, 0.1), (0.0, 3.1, 0.2), (0.1, 0.1, 3.1), (0.0, 0.0, 0.0)]
 )
-def test_a_quaternion_turns_as_its_matrix_does(vector):
+def test_quaternion_equals_rotation_matrix(vector):
     w, *u = quaternion(np.asarray(so3.exp(jnp.array(vector))))
     x = np.array([0.3, -0.5, 0.8])
     turned_x = x + 2.0 * np.cross(u, np.cross(u, x) + w * x)
@@ -93,7 +93,7 @@ def hover(bus, seconds, until=lambda: False):
         time.sleep(DT)
 
 
-def test_it_says_who_flies_now_and_not_who_once_did(monkeypatch):
+def test_page_shows_present_source_of_commands(monkeypatch):
     pytest.importorskip("viser")
     bus, texts = InProcessBus(dict.fromkeys(SMALL, 65536)), []
     page = _Page(PageSpec("", 0, "hover", HOME[None].repeat(2, 0), (), 0.06, 0.19), bus, MagicMock())
@@ -105,7 +105,7 @@ def test_it_says_who_flies_now_and_not_who_once_did(monkeypatch):
     assert [text.partition("**")[2].partition("**")[0] for text in texts] == ["policy", "watchdog", "policy"]
 
 
-def test_it_listens_on_the_loopback_address_only(flight):
+def test_page_listens_on_loopback_address_only(flight):
     bus, url = flight
     hover(bus, 60.0, lambda: bus.latest("ready.page") is not None)
     port = urlsplit(url).port
@@ -116,7 +116,7 @@ def test_it_listens_on_the_loopback_address_only(flight):
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs chromium: make test-page installs it")
-def test_a_knob_in_a_browser_is_a_message_on_the_bus(flight):
+def test_knob_in_browser_sends_message_on_bus(flight):
     api = pytest.importorskip("playwright.sync_api", reason="needs playwright: make test-page installs it")
     bus, url = flight
     hover(bus, 60.0, lambda: bus.latest("ready.page") is not None)

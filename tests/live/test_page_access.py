@@ -115,19 +115,19 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_handshake_is_refused(page, name):
+def test_hostile_handshake_is_refused(page, name):
     assert handshake(page, **HOSTILE[name]) in (400, 403, 404)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "LOCALHOST:{port}"])
-def test_the_printed_address_opens_the_page_and_its_websocket(page, host):
+def test_printed_address_opens_page_and_websocket(page, host):
     port, token, _ = page
     assert handshake(page, host=host, origin=f"http://{host.lower()}") == 101
     for path in (f"/{token}", f"/{token}/", f"/{token}/index.html", f"/{token}?x=1"):
         assert status(port, path, "Host: " + host.format(port=port)) == 200
 
 
-def test_a_file_is_refused_like_a_handshake(page):
+def test_file_is_refused_like_handshake(page):
     port, token, _ = page
     assert status(port, "/", f"Host: 127.0.0.1:{port}") == 404
     assert status(port, "/index.html", f"Host: 127.0.0.1:{port}") == 404
@@ -146,7 +146,7 @@ def test_a_file_is_refused_like_a_handshake(page):
         ("::", ("::ffff:10.0.0.2", 80, 0, 0), {"10.0.0.2:80", "10.0.0.2"}),
     ],
 )
-def test_a_page_answers_to_the_address_that_was_reached(listens, reached_hosts, names):
+def test_page_accepts_only_names_of_reached_address(listens, reached_hosts, names):
     calls = {*names, "192.168.1.5:8080", "localhost:8080", "quad.local:8080", "0.0.0.0:8080", "evil.example:8080"}
     answer = {
         name for name in calls
@@ -157,7 +157,7 @@ def test_a_page_answers_to_the_address_that_was_reached(listens, reached_hosts, 
     assert wrong == HTTPStatus.NOT_FOUND
 
 
-def test_an_address_has_a_token_of_its_own_and_a_host_that_can_be_reached():
+def test_page_address_has_own_token_and_reachable_host():
     specs = [PageSpec("0.0.0.0", 80, "", HOME[None], (), 0.1, 1.0) for _ in range(2)]
     assert specs[0].token != specs[1].token
     assert specs[0].token not in repr(specs[0])
@@ -165,13 +165,13 @@ def test_an_address_has_a_token_of_its_own_and_a_host_that_can_be_reached():
     assert page_url("::1", 8080, "T") == "http://[::1]:8080/T"
 
 
-def test_without_protection_there_is_no_page():
+def test_page_without_protection_is_refused():
     pytest.importorskip("viser")
     with pytest.raises(PlantError, match="cannot be protected"), only_for("T", "127.0.0.1"):
         pass
 
 
-def test_a_browser_is_told_the_address_in_a_file_of_this_user(tmp_path, monkeypatch):
+def test_browser_reads_address_from_private_file(tmp_path, monkeypatch):
     message = []
     monkeypatch.setattr(webbrowser, "open", message.append)
     monkeypatch.setenv("DISPLAY", ":0")
@@ -184,7 +184,7 @@ def test_a_browser_is_told_the_address_in_a_file_of_this_user(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("host", ["a\0b", "a\x1bb", "x" * 400, "."])
-def test_a_host_that_is_none_is_one_line(host):
+def test_invalid_host_gives_one_line(host):
     with pytest.raises(ConfigError) as error:
         free_port(host, 18080)
     assert len(str(error.value)) < 300

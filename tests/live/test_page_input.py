@@ -77,7 +77,7 @@ def settled(true):
     return true()
 
 
-def test_no_value_of_any_control_stops_the_page_and_land_lands(server, bus):
+def test_page_survives_any_value_of_controls_and_lands(server, bus):
     page = _Page(SPEC, bus, server)
     take_values_only(server, page.refuse)
     result = controls(server)
@@ -102,7 +102,7 @@ def test_no_value_of_any_control_stops_the_page_and_land_lands(server, bus):
 
 
 @pytest.mark.parametrize("updates", [{"visible": False}, {"removed": True}, {"disabled": True, "value": True}, {}])
-def test_a_browser_cannot_take_the_button_away(server, bus, updates):
+def test_browser_cannot_remove_land_button(server, bus, updates):
     page = _Page(SPEC, bus, server)
     take_values_only(server, page.refuse)
     land = controls(server)["Land"]
@@ -115,7 +115,7 @@ def test_a_browser_cannot_take_the_button_away(server, bus, updates):
 
 
 @pytest.mark.parametrize("topic", [topic for topic in TOPICS if topic not in ("sample", "setpoint", "fallback")])
-def test_no_note_of_any_kind_stops_the_page_or_a_page_that_is_started_again(bus, topic):
+def test_page_and_restarted_page_survive_any_note(bus, topic):
     pytest.importorskip("viser")
     kind = topic.partition(".")[0]
     name = "ready" if kind == "ready" else topic
@@ -140,7 +140,7 @@ def test_no_note_of_any_kind_stops_the_page_or_a_page_that_is_started_again(bus,
     assert watch.count >= len(NOISE)
 
 
-def test_an_attitude_that_is_none_is_not_shown_and_stops_nothing(bus):
+def test_invalid_attitude_is_not_shown(bus):
     pytest.importorskip("viser")
     page, display = _Page(SPEC, bus, MagicMock()), []
     page._scene.move = lambda *argument: display.append(argument)
@@ -152,7 +152,7 @@ def test_an_attitude_that_is_none_is_not_shown_and_stops_nothing(bus):
     assert len(display) == 1
 
 
-def test_text_of_a_process_is_no_markup_of_the_page(bus, monkeypatch):
+def test_text_of_process_is_not_interpreted_as_markup(bus, monkeypatch):
     pytest.importorskip("viser")
     page, texts = _Page(SPEC, bus, MagicMock()), []
     monkeypatch.setattr(page._panel, "show", texts.append)
@@ -163,7 +163,7 @@ def test_text_of_a_process_is_no_markup_of_the_page(bus, monkeypatch):
     assert "<script" not in text
 
 
-def test_a_refused_note_is_counted_each_time_and_told_now_and_then():
+def test_refused_notes_are_counted_and_occasionally_reported():
     bus = InProcessBus({"learner.policy": 4096, "sample": 4096, "refusals.page": 4096})
     watch, text = RefusedNotes(bus, ("learner.policy", "sample", "refusals.page")), []
     for i in range(12):

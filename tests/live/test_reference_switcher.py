@@ -84,7 +84,7 @@ class Flight:
 # ---- the process that flies
 
 
-def test_what_is_followed_is_a_parameter_of_the_controller(setups, table):
+def test_reference_is_parameter_of_controller(setups, table):
     one, other = Flight(setups[2]), Flight(setups[2])
     for flight in (one, other):
         flight.until(0.7)
@@ -99,7 +99,7 @@ def test_what_is_followed_is_a_parameter_of_the_controller(setups, table):
     assert other.status["swaps"] == []  # no policy was learned
 
 
-def test_it_stays_whether_learning_is_flown_or_not(setups, table):
+def test_reference_remains_with_learning_on_and_off(setups, table):
     flight = Flight(setups[2])
     flight.until(0.7)
     flight.loop.intake.open = False
@@ -112,7 +112,7 @@ def test_it_stays_whether_learning_is_flown_or_not(setups, table):
         assert flight.status["versions"][REFERENCE] == 1
 
 
-def test_one_that_comes_too_late_would_jump_and_is_refused(setups, table):
+def test_late_reference_is_refused(setups, table):
     flight = Flight(setups[2])
     flight.until(AT)
     flight.bus.publish("parameters.reference", message(table, setups[2]))
@@ -124,7 +124,7 @@ def test_one_that_comes_too_late_would_jump_and_is_refused(setups, table):
 # ---- the learner
 
 
-def test_the_learner_learns_on_it_without_compiling_again(setups, table, tmp_path):
+def test_learner_uses_new_reference_without_compiling_again(setups, table, tmp_path):
     setup, state, controller = setups
     start = tmp_path / "start.safetensors"
     save_learner_state(start, state, setup.preset)
@@ -185,7 +185,7 @@ def poll_requests(follows, supervisor, done, version=0):
     return events
 
 
-def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(setups, tmp_path):
+def test_choice_is_sent_as_table_and_followed_once_accepted(setups, tmp_path):
     follows, supervisor = ask(setups, tmp_path)
     assert follows.ask("circle", 1.0) == follows.ask("module:name", 1.0) == []  # followed already; not offered
     assert [event.note for event in follows.ask("figure8", 1.0)] == ["reference figure8"]
@@ -214,7 +214,7 @@ def test_a_choice_becomes_a_table_and_counts_once_it_is_taken(setups, tmp_path):
     assert float(whole.flight_task.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
 
 
-def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(setups, tmp_path):
+def test_late_plant_changes_reference_at_plant_time(setups, tmp_path):
     """A table is made for the time of the plant; by the wall's it would be of a time to come, and then too late."""
     follows, supervisor = ask(setups, tmp_path, behind=5.0)
     follows.ask("figure8", 10.0)
@@ -231,7 +231,7 @@ def test_a_plant_that_fell_behind_the_wall_goes_over_by_its_own_time(setups, tmp
     assert follows.pieces[-1][0] == pytest.approx(result.computed_from + following.LEAD)
 
 
-def test_what_leaves_the_fence_or_is_not_taken_is_told(setups, tmp_path, monkeypatch):
+def test_reference_outside_fence_or_not_accepted_is_reported(setups, tmp_path, monkeypatch):
     follows, supervisor = ask(setups, tmp_path, fence=0.5)
     follows.ask("figure8", 1.0)
     (message,) = poll_requests(follows, supervisor, lambda: follows._coming is None)
@@ -254,7 +254,7 @@ def test_what_leaves_the_fence_or_is_not_taken_is_told(setups, tmp_path, monkeyp
     )  # learners return to the reference of the flight
 
 
-def test_only_who_sees_its_reference_has_a_choice(setups):
+def test_only_policies_that_observe_reference_have_choices(setups):
     assert choices(setups[0], "circle") == ("circle", "figure8", "lissajous", "star")
     assert choices(setups[0], "my.csv") == ("my.csv", "circle", "figure8", "lissajous", "star")
     assert choices(Setup.from_preset("track/blind"), "figure8") == ()
@@ -265,7 +265,7 @@ def test_only_who_sees_its_reference_has_a_choice(setups):
     assert pictures["star"].shape == (400, 3)
 
 
-def test_a_set_up_on_another_reference_is_the_same_but_for_it(setups, table):
+def test_setup_on_other_reference_differs_only_in_reference(setups, table):
     other = setups[0].on(table)
     assert other.flight_reference is table
     assert other.env is setups[0].env

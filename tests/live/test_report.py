@@ -46,7 +46,7 @@ def report(calls, rows, end_note, stalls=None, **control):
     return {row["metric"]: row for row in results(calls, flight, result, status, events)}
 
 
-def test_a_crash_is_counted_with_its_last_row_and_without(requests):
+def test_crash_is_counted_with_and_without_last_row(requests):
     rows = fly_once(requests)
     assert report(requests, rows, "landed")["steady"]["crashes"] == 0
     without = report(requests, rows, CRASHED)
@@ -58,7 +58,7 @@ def test_a_crash_is_counted_with_its_last_row_and_without(requests):
     assert report(requests, rows, CRASHED)["steady"]["crashes"] == 1
 
 
-def test_the_table_of_a_flight_has_labels_in_words_and_leaves_out_nothing(requests):
+def test_table_of_flight_is_complete_and_has_labels_in_words(requests):
     rows = list(report(requests, fly_once(requests), "landed", missed=5).values())
     display = figures([*rows, {"metric": "later_figure", "value": 1.0}])
     assert len(display) < len(rows)
@@ -69,7 +69,7 @@ def test_the_table_of_a_flight_has_labels_in_words_and_leaves_out_nothing(reques
     assert ("error, last seconds", "mm", "0") in display
 
 
-def test_ticks_that_were_missed_while_the_machine_stood_still_are_told_apart(requests):
+def test_ticks_missed_in_stalls_are_counted_separately(requests):
     gaps = [(10.0, 10.04, 1), (11.0, 11.08, 3), (12.0, 12.04, 1)]
     stalls = {"count": 2, "longest": 0.05, "newest": [[11.01, 11.06], [12.05, 12.06]]}
     result = report(requests, fly_once(requests), "landed", stalls, missed=5, gaps=gaps)
@@ -79,7 +79,7 @@ def test_ticks_that_were_missed_while_the_machine_stood_still_are_told_apart(req
     assert [unknown[name]["value"] for name in ("missed_in_stalls", "stalls", "stall_max_ms")] == [None] * 3
 
 
-def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(requests):
+def test_statistics_contain_hangs_and_exclude_untimed_ticks(requests):
     rows = fly_once(requests)
     rows[20, ACCOUNTS["step"]] = 0.06
     rows[20:23, -1] = Mode.WATCHDOG
@@ -91,7 +91,7 @@ def test_a_hang_is_in_the_statistics_and_what_nobody_timed_is_not(requests):
     assert [ticks for ticks in histograms(rows)["step"] if ticks] == [26, 1]
 
 
-def test_a_log_that_is_shorter_than_the_flight_is_a_fault_and_missed_ticks_are_none(requests):
+def test_log_shorter_than_flight_is_fault_except_for_missed_ticks(requests):
     rows = fly_once(requests, ticks=340)
 
     def lose(rows, ticks=340, **control):
@@ -107,7 +107,7 @@ def test_a_log_that_is_shorter_than_the_flight_is_a_fault_and_missed_ticks_are_n
     assert lose(rows[:0]) == [f"{text} 0 of 340 ticks, none from 0.00 to 6.80 s"]
 
 
-def test_a_vehicle_that_was_dropped_has_crashed_and_what_was_commanded_meanwhile_is_counted(requests):
+def test_dropped_vehicle_is_crash_and_commands_are_counted(requests):
     rows = fly_once(requests)
     rows[20:, -1], rows[20:, ACCOUNTS["step"]] = Mode.BLIND, 0.0
     rows[-1, -1] = Mode.DROP

@@ -33,7 +33,7 @@ def needed(spec):
     return [name for name, role in ROLES.items() if role.is_needed(spec)]
 
 
-def test_a_flight_has_the_processes_that_it_needs(spec):
+def test_flight_has_required_processes(spec):
     here = replace(spec, layers=("residual", "policy"))
     remote = replace(here, learners=Address.of("zenoh:127.0.0.1:7447", None))
     identifying = replace(spec, controller=replace(spec.controller, parameters={VEHICLE: {}}))
@@ -45,12 +45,12 @@ def test_a_flight_has_the_processes_that_it_needs(spec):
 
 
 @pytest.mark.parametrize("name", ROLES)
-def test_the_main_function_of_a_role_exists(name):
+def test_main_function_of_role_exists(name):
     module, _, function = ROLES[name].main.partition(":")
     assert callable(getattr(importlib.import_module(module), function))
 
 
-def test_plans_carry_the_flight_and_the_priority_of_their_role(spec):
+def test_plans_contain_flight_and_priority_of_role(spec):
     request = RoleRequest(spec, spec.start, Path("bus"), cores=frozenset({1}), control=7)
     plans = {name: ROLES[name].plan(request) for name in (*ALWAYS, "residual", "policy", "identifier")}
     assert {setup.folder for setup in plans.values()} == {Path("bus")}

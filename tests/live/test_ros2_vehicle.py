@@ -90,7 +90,7 @@ for k, name in enumerate(sys.argv[1:]):
 
 
 @pytest.mark.parametrize(("backend", "dialect", "words"), CASES, ids=[f"{a} {b} {c[-1:]}" for a, b, c in CASES])
-def test_it_is_a_link_to_a_vehicle(backend, dialect, words):
+def test_link_conforms(backend, dialect, words):
     with vehicle(backend, dialect, "--plant", "simple", *words) as (_, address):
         done = subprocess.run(
             [python_of(backend), "-P", PACKAGES / "conform.py", address], capture_output=True, text=True, timeout=200
@@ -99,7 +99,7 @@ def test_it_is_a_link_to_a_vehicle(backend, dialect, words):
     assert "it conforms" in done.stdout
 
 
-def test_hashes_are_those_of_this_rclpy():
+def test_hashes_equal_those_of_this_rclpy():
     names = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "std_msgs/msg/UInt8MultiArray")
     done = subprocess.run([ROS2, "-P", "-c", HASHES, *names], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.split() == [message_type(name).hash for name in names]
@@ -143,7 +143,7 @@ def error(rows, since):
     ("backend", "dialect"),
     [("rclpy", "mavros"), ("cyclonedds", "px4"), ("cyclonedds", "mavros"), ("zenoh", "px4")],
 )
-def test_a_flight_adapts_under_a_large_disturbance_as_in_lockstep(backend, dialect, policy, tmp_path):
+def test_flight_adapts_under_large_disturbance_as_in_lockstep(backend, dialect, policy, tmp_path):
     with vehicle(backend, dialect, "--disturbance", "large") as (_, address):
         text = output_of(fly(policy, address, tmp_path, backend=backend))
     figures, rows = find(tmp_path)
@@ -162,7 +162,7 @@ HABITS = {
 
 
 @pytest.mark.parametrize("habit", HABITS)
-def test_what_a_vehicle_may_do_with_its_messages_does_not_end_a_flight(habit, policy, tmp_path):
+def test_flight_survives_irregular_messages(habit, policy, tmp_path):
     with vehicle("cyclonedds", "mavros", "--disturbance", "large", *HABITS[habit]) as (_, address):
         text = output_of(fly(policy, address, tmp_path))
     figures, rows = find(tmp_path)
@@ -183,7 +183,7 @@ def wait_for_flight(out, seconds):
     raise AssertionError("no flight began")
 
 
-def test_a_vehicle_that_is_killed_ends_the_flight_and_its_successor_is_left_alone(policy, tmp_path):
+def test_killed_vehicle_ends_flight_and_successor_is_unaffected(policy, tmp_path):
     with vehicle("cyclonedds", "mavros") as (process, address):
         flight = fly(policy, address, tmp_path, seconds=60)
         wait_for_flight(tmp_path, 5.0)
@@ -203,7 +203,7 @@ def refusal(policy, address, out):
     return text
 
 
-def test_another_release_of_px4_is_refused_with_both_named_and_flies_once_it_is_named(policy, tmp_path, monkeypatch):
+def test_another_release_of_px4_is_refused_until_it_is_named(policy, tmp_path, monkeypatch):
     monkeypatch.setenv("RETRIM_PX4_MSGS", "1.14")
     with genuine("px4", "--release", "1.14"):
         text = refusal(policy, "ros2:cyclonedds:px4", tmp_path / "newest")
@@ -213,7 +213,7 @@ def test_another_release_of_px4_is_refused_with_both_named_and_flies_once_it_is_
     assert "flight over: landed" in text
 
 
-def test_another_version_of_mavros_msgs_is_refused_with_both_named(policy, tmp_path, monkeypatch):
+def test_another_version_of_mavros_msgs_is_refused_with_both_names(policy, tmp_path, monkeypatch):
     monkeypatch.setenv("RETRIM_OTHER_HASH", "RIHS01_" + 32 * "ab")
     with genuine("mavros"):
         text = refusal(policy, "ros2:cyclonedds:mavros", tmp_path)

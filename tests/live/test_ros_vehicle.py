@@ -28,25 +28,25 @@ def master():
         yield f"{result.host}:{result.port}"
 
 
-def test_targets_are_those_of_mavros(master):
+def test_targets_equal_those_of_mavros(master):
     assert attitude_target()._md5sum == "456f3af666b22ccd0222ea053a86b548"
 
 
 @pytest.mark.parametrize("more", [(), ("--poses",)], ids=["odometry", "poses alone"])
-def test_it_is_a_link_to_a_vehicle(master, more):
+def test_link_conforms(master, more):
     place = (0.3, -0.2, 1.5)
     with peer("ros", f"http://{master}", "--plant", "simple", "--place", *place, "--yaw", HEADING, *more):
         testing.check_vehicle(lambda: Scenario(plant=f"ros:{master}").make("small"), place=place)
 
 
-def test_nobody_there_is_named(master, monkeypatch):
+def test_missing_topics_are_named(master, monkeypatch):
     monkeypatch.setattr(ros, "WAIT_S", 0.3)
     plant, why = Scenario(plant=f"ros:{master}/elsewhere").make("small"), r"neither /elsewhere/.* came in 0\.3 s"
     with plant, pytest.raises(PlantError, match=why):
         plant.connect()
 
 
-def test_a_flight_adapts_under_a_large_disturbance(master, tmp_path):
+def test_flight_adapts_under_large_disturbance(master, tmp_path):
     policy, flight = tmp_path / "policy", tmp_path / "flight"
     words = [*RETRIM, "pretrain", "hover", "--preset", "hover/retrim", "--out", str(policy)]
     subprocess.run(words, check=True, capture_output=True, timeout=300)

@@ -34,7 +34,7 @@ def angles(server, places):
 
 
 @pytest.mark.parametrize("arm", [0.06, 0.08, 0.25])
-def test_a_hovering_vehicle_fills_a_tenth_of_the_picture_and_the_ground_is_in_it(arm):
+def test_picture_of_hover_contains_large_vehicle_and_ground(arm):
     server, _ = scene_of(HOME[None].repeat(2, 0), arm)
     width = 2 * (1 + ROTOR) * max(arm, 0.08)
     ends = HOME + 0.5 * width * np.array([[0.7, -0.8, 0.0], [-0.7, 0.8, 0.0]]) / np.hypot(0.7, 0.8)
@@ -43,12 +43,12 @@ def test_a_hovering_vehicle_fills_a_tenth_of_the_picture_and_the_ground_is_in_it
     assert np.abs(angles(server, HOME * [1.0, 1.0, 0.0])).max() < 1.0
 
 
-def test_the_whole_reference_is_in_the_picture():
+def test_picture_contains_whole_reference():
     server, _ = scene_of(CIRCLE)
     assert np.abs(angles(server, CIRCLE)).max() < 1.0
 
 
-def test_the_world_has_a_sky_the_ground_and_axes():
+def test_world_has_sky_ground_and_axes():
     server, _ = scene_of(CIRCLE)
     (image,), _ = server.scene.set_background_image.call_args
     assert image.dtype == np.uint8
@@ -61,14 +61,14 @@ def test_the_world_has_a_sky_the_ground_and_axes():
     assert {"/ground", "/axes", "/axes/x", "/axes/y", "/axes/z", "/target/name", "/vehicle"} <= names
 
 
-def test_rotors_are_opaque_behind_the_transparent_grip():
+def test_rotors_are_opaque_behind_transparent_grip():
     server, _ = scene_of(CIRCLE)
     rotors = [call for call in server.scene.add_cylinder.call_args_list if "rotor" in call.args[0]]
     assert len(rotors) == 4
     assert all("opacity" not in call.kwargs for call in rotors)
 
 
-def test_the_flight_to_the_goal_does_not_set_the_scale():
+def test_flight_to_goal_does_not_set_scale():
     t = np.arange(0.0, 10.0, 0.05)
     error = np.where(t < 0.9 * START_S, 70.0, 2.0)
     assert top_of(t, error) == pytest.approx(2.2)
@@ -77,7 +77,7 @@ def test_the_flight_to_the_goal_does_not_set_the_scale():
     assert top_of(t + 60.0, error) == pytest.approx(77.0)  # a later error of this size does
 
 
-def test_the_panel_states_the_scenario_and_that_its_knobs_add_to_it():
+def test_panel_states_scenario_and_addition_of_knobs():
     pytest.importorskip("viser")
     server = MagicMock()
     Panel(server, MagicMock(), MagicMock(), ManualDisturbance(), {}, (), (), 0.19, 20.0, "pushed by 2")

@@ -33,7 +33,7 @@ def request_for(task, folder, seconds):
         return LiveRequest(setup, setup.new_policy(random.key(0)), Scenario(), "full", seconds, 0, 3.0, folder)
 
 
-def test_a_fence_holds_all_that_the_reference_passes_and_none_is_made_for_one_that_is_not_finite(tmp_path):
+def test_fence_contains_reference_and_infinite_reference_is_refused(tmp_path):
     limits = live_spec(request_for(Lost, tmp_path, 2.0)).limits
     home = np.asarray(request_for(Hover, tmp_path, 2.0).setup.flight_task.home())
     np.testing.assert_allclose(limits.high, home + 3.0)

@@ -34,7 +34,7 @@ def ground_of(folder, base, reply):
 
 
 @pytest.mark.parametrize("reason", ["landed", None])
-def test_learners_elsewhere_hear_of_the_end_before_their_bridge_goes(tmp_path, controller, reason):  # noqa: F811
+def test_remote_learners_receive_end_before_bridge_exits(tmp_path, controller, reason):  # noqa: F811
     reply = list[str]()
     with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
         ground = threading.Thread(target=ground_of, args=(flight.bus.folder, controller.base, reply))
@@ -47,7 +47,7 @@ def test_learners_elsewhere_hear_of_the_end_before_their_bridge_goes(tmp_path, c
     ground.join()
 
 
-def test_learners_elsewhere_that_are_gone_are_not_waited_for(tmp_path, controller, monkeypatch):  # noqa: F811
+def test_supervisor_does_not_wait_for_lost_remote_learners(tmp_path, controller, monkeypatch):  # noqa: F811
     monkeypatch.setattr(remote_learners, "PARTING", 1000.0)
     with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
         folder = flight.bus.folder
@@ -76,7 +76,7 @@ class Process:
         self.stop_time, self._code = time.monotonic(), -15
 
 
-def test_control_that_has_nothing_left_to_fly_has_time_to_say_its_last_rows(tmp_path, controller):  # noqa: F811
+def test_control_has_time_to_publish_last_rows_after_plant_ends(tmp_path, controller):  # noqa: F811
     with Supervisor(spec_in(tmp_path, controller)) as flight:
         control = Process()
         flight.processes = {"recorder": Process(), "control": control, "plant": Process(runs=False)}

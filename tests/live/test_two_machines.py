@@ -22,7 +22,7 @@ def policy(tmp_path_factory):
 
 
 @pytest.mark.parametrize("network", ["zenoh between namespaces", "ROS 2 between namespaces", "ROS 1"])
-def test_a_flight_learns_on_another_machine(policy, tmp_path, network, monkeypatch):
+def test_flight_uses_learners_on_another_machine(policy, tmp_path, network, monkeypatch):
     with ExitStack() as stack:
         if network == "ROS 1":
             master = stack.enter_context(rosmaster())
@@ -65,7 +65,7 @@ def test_a_flight_learns_on_another_machine(policy, tmp_path, network, monkeypat
     assert result["refused_messages"] == 0
 
 
-def test_one_process_on_the_ground_learns_for_two_vehicles_as_between_namespaces(policy, tmp_path):
+def test_one_ground_process_learns_for_two_vehicles_as_between_namespaces(policy, tmp_path):
     """Over zenoh on this machine: two flights with low-rank policies, which share a base."""
     pytest.importorskip("zenoh")
     where = [f"zenoh:127.0.0.1:{free_port()}" for _ in range(2)]

@@ -59,7 +59,7 @@ def fly_once(spec, kill=None):
     return status, events.all
 
 
-def test_it_is_flown_from_the_hand_over_to_the_landing(spec):
+def test_vehicle_flies_from_hand_over_to_landing(spec):
     status, _ = fly_once(spec)
     rows = read_log(spec.folder / "flight.csv")
     assert status.end_reason == "landed"
@@ -73,7 +73,7 @@ def test_it_is_flown_from_the_hand_over_to_the_landing(spec):
     assert np.linalg.norm(flying[-1, 3:6] - HOME) < 0.3
 
 
-def test_a_slow_landing_is_not_a_hang(spec):
+def test_slow_landing_is_not_hang(spec):
     status, _ = fly_once(replace(spec, layers=(), scenario=Scenario(plant="fake_vehicle:slow_to_land")))
     assert status.end_reason == "landed"
     assert not status.hangs
@@ -85,7 +85,7 @@ def alone(spec):
     return replace(spec, layers=())
 
 
-def test_without_control_the_watchdog_lands_it(alone):
+def test_watchdog_lands_vehicle_without_control(alone):
     status, events = fly_once(alone, "control")
     rows = read_log(alone.folder / "flight.csv")
     assert status.end_reason == "landed"
@@ -93,13 +93,13 @@ def test_without_control_the_watchdog_lands_it(alone):
     assert any(event.note.startswith("watchdog: ") for event in events)
 
 
-def test_a_lost_link_ends_the_flight_and_keeps_the_log(alone):
+def test_lost_link_ends_flight_and_log_is_complete(alone):
     status, _ = fly_once(replace(alone, scenario=Scenario(plant="fake_vehicle:lost")))
     assert status.end_reason == "plant lost: the link has been silent"
     assert read_log(alone.folder / "flight.csv")[-1, 1] > 0.1
 
 
-def test_what_does_not_arm_never_flies(alone):
+def test_vehicle_that_refuses_to_arm_does_not_fly(alone):
     spec = replace(alone, scenario=Scenario(plant="fake_vehicle:unarmed"))
     with pytest.raises(PlantError, match=r"before it began: .*refuses to be armed; it said: no battery"), \
             DrillSupervisor(spec) as flight:  # fmt: skip
@@ -108,7 +108,7 @@ def test_what_does_not_arm_never_flies(alone):
     assert not flight.bus.folder.exists()
 
 
-def test_an_interrupt_on_the_ground_leaves_it_there(alone):
+def test_interrupt_before_take_off_leaves_vehicle_on_ground(alone):
     flight = DrillSupervisor(alone)
     with flight:
         for _ in flight.warm_up():
@@ -120,7 +120,7 @@ def test_an_interrupt_on_the_ground_leaves_it_there(alone):
     assert not log.exists() or not len(read_log(log))
 
 
-def test_a_fleet_of_vehicles_is_refused():
+def test_simulated_flight_of_real_vehicle_is_refused():
     preset = load("hover/retrim")
     with pytest.raises(ConfigError, match="use `retrim live`"):
         Fleet(preset, {0: None}, [Scenario(plant="mavlink")])
@@ -130,7 +130,7 @@ def status(*, flies, ticks):
     return Status(1.0, {}, {}, {}, {}, None, [], flies, ticks, None)
 
 
-def test_the_watchdog_that_flew_a_few_ticks_is_told_of():
+def test_short_flight_by_watchdog_is_reported():
     events = LiveEvents()
     for observation in [status(flies=False, ticks=0), status(flies=True, ticks=2), status(flies=False, ticks=3)]:
         events.take(observation)

@@ -10,7 +10,7 @@ from retrim.ros2.relay import publish_frames
 
 
 @given(st.lists(st.binary(max_size=300), max_size=8), st.integers(0, 4))
-def test_whole_messages_come_out_as_they_went_in(messages, lost):
+def test_whole_messages_are_published_unchanged(messages, lost):
     """A pipe that ends within a message loses this one only."""
     data = b"".join(frame(each) for each in messages)
     data, whole = (data[:-lost], messages[:-1]) if lost and messages else (data, messages)
