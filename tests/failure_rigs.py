@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from live_helpers import DrillSupervisor, holding, plan
+from live_helpers import DrillSupervisor, hover_source, plan
 from live_processes import DT, level, rotation
 from retrim import Scenario
 from retrim.live.processes import vehicle
@@ -121,7 +121,7 @@ class Rig:
             time.sleep(max(0.0, due - time.monotonic()))
 
 
-def fly_soon(plan):
+def run_link(plan):
     """The process of the link; it needs less time for the thrust at hover, since the peers hover without a wind."""
     for module in (crazyflie, offboard_plant, ros2):
         module.THRUST_S = 0.5
@@ -131,15 +131,15 @@ def fly_soon(plan):
 def spec_of(rig, folder, layers=()):
     start = folder / "start.safetensors"
     start.write_bytes(b"")
-    controller = holding(home=HOME)
+    controller = hover_source(home=HOME)
     return LiveSpec(
         controller, layers, start, None, Scenario(plant=rig.plant), "small", level(HOME), HOME,
-        plan(controller).limits, DT, 1, 50, 1e9, 0, folder, mains={"plant": "failure_rigs:fly_soon"} | STAND_INS,
+        plan(controller).limits, DT, 1, 50, 1e9, 0, folder, mains={"plant": "failure_rigs:run_link"} | STAND_INS,
     )  # fmt: skip
 
 
 @contextlib.contextmanager
-def more_roles():
+def add_roles():
     """Start stand-ins for the page and the identifier, too."""
     before = dict(ROLES)
     try:
@@ -168,7 +168,7 @@ def fly(spec, rig) -> Iterator[DrillSupervisor]:
 
 
 @contextlib.contextmanager
-def flying_alone(spec, rig, seconds=0.6):
+def start_supervised_flight(spec, rig, seconds=0.6):
     """A flight with a supervisor that can be killed; yield the processes by function once it has flown for a while."""
     rig.hover()
     supervisor = launch("live_helpers:supervise", spec, spec.folder / "supervisor.log")

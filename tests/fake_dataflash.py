@@ -54,15 +54,15 @@ def flight_messages(flight, start=3.0, *, without=(), events=True, every=2):
         rows += [(stamp[0] - 1, message("EV", stamp[0] - 1, 10)), (stamp[-1] + 1, message("EV", stamp[-1] + 1, 11))]
     for k, t in enumerate(stamp):
         yaw, pitch, roll = (int(np.round(100.0 * x)) for x in angles[k])
-        kept = []
+        entries = []
         if k % every == 0:
             state = (roll, pitch, yaw % 36000, *ned.v[k], 0.0, *ned.p[k])
-            kept += [("XKF1", t, 0, *state), ("XKF1", t, 1, *state[:3], *(np.array(state[3:]) + 100.0))]
+            entries += [("XKF1", t, 0, *state), ("XKF1", t, 1, *state[:3], *(np.array(state[3:]) + 100.0))]
         w = rates[k]
-        kept += [("RATE", t, w[0], w[0], 0.0, w[1], w[1], 0.0, w[2], w[2], 0.0, 0.0, 0.0, share[k])]
-        kept += [("IMU", t, i, *(w / DEG), *(force[k] + 50.0 * i)) for i in (0, 1)]
-        kept += [("RCOU", t, *[round(1000 + 800 * share[k])] * 4)]
-        rows += [(t, message(*each)) for each in kept if each[0] not in without]
+        entries += [("RATE", t, w[0], w[0], 0.0, w[1], w[1], 0.0, w[2], w[2], 0.0, 0.0, 0.0, share[k])]
+        entries += [("IMU", t, i, *(w / DEG), *(force[k] + 50.0 * i)) for i in (0, 1)]
+        entries += [("RCOU", t, *[round(1000 + 800 * share[k])] * 4)]
+        rows += [(t, message(*each)) for each in entries if each[0] not in without]
     return rows
 
 

@@ -10,7 +10,7 @@ class FakeNetwork:
     """Topics and the nodes that use them."""
 
     def __init__(self):
-        self.takers = defaultdict(list)
+        self.subscribers = defaultdict(list)
         self.ends = defaultdict(list)
 
     def node(self):
@@ -29,7 +29,7 @@ class FakeNode(Ros2Node):
         self._add(topic, kind, qos, publishes=True)
 
         def publish(data):
-            for node, take in self.network.takers[topic]:
+            for node, take in self.network.subscribers[topic]:
                 if node is not self and not node.closed:
                     take(data)
 
@@ -37,7 +37,7 @@ class FakeNode(Ros2Node):
 
     def subscribe(self, topic, kind, qos, take):
         self._add(topic, kind, qos, publishes=False)
-        self.network.takers[topic].append((self, take))
+        self.network.subscribers[topic].append((self, take))
 
     def endpoints(self, topic):
         return [end for node, end in self.network.ends[topic] if node is not self and not node.closed]
@@ -50,13 +50,13 @@ class FakeNode(Ros2Node):
         self.network.ends[topic].append((self, Endpoint(kind.name, kind.hash, publishes, qos.reliable)))
 
 
-class Talker:
+class RemoteNode:
     """The other end: it publishes messages, and stores those of other nodes."""
 
     def __init__(self, network):
-        self.node, self.publishers, self.kept = network.node(), {}, defaultdict(list)
+        self.node, self.publishers, self.messages = network.node(), {}, defaultdict(list)
 
-    def says(self, topic, name, fill=lambda x: None, release="newest", **values):
+    def publish(self, topic, name, fill=lambda x: None, release="newest", **values):
         kind = message_type(name, release)
         if topic not in self.publishers:
             self.publishers[topic] = self.node.advertise(topic, kind, SENSOR)
@@ -66,12 +66,12 @@ class Talker:
         fill(message)
         self.publishers[topic](kind.encode(message))
 
-    def hears(self, topic, name, take=None, release="newest"):
+    def subscribe(self, topic, name, take=None, release="newest"):
         kind = message_type(name, release)
 
         def keep(data):
             message = kind.decode(data)
-            self.kept[topic].append(message)
+            self.messages[topic].append(message)
             if take is not None:
                 take(message)
 

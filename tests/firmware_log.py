@@ -21,7 +21,7 @@ PLAIN = [
 LOGS = ["set blackbox_device = VIRTUAL", "set blackbox_sample_rate = 1/8"]
 
 
-def settings_say(path, model):
+def compute_response(path, model):
     """Lag [s] and damping ratio of roll and pitch from the P and D settings in a log's header, and hover throttle.
 
     Motors of time constant tau turn a body by A per throttle: A P / (tau s^2 + (1 + A D) s + A P).

@@ -27,8 +27,8 @@ TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "en
           "learner.policy": 8192}  # fmt: skip
 
 
-class Holds(AbstractController[Float[Array, ""]]):
-    """Holds HOME with four gains, and counts its ticks."""
+class HoverController(AbstractController[Float[Array, ""]]):
+    """HoverController HOME with four gains, and counts its ticks."""
 
     gains: Float[Array, "2"] = eqx.field(default_factory=lambda: jnp.array([4.0, 3.5]))
     home: tuple[float, ...] = eqx.field(default=tuple(HOME.tolist()), static=True)
@@ -53,11 +53,11 @@ def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, secon
     return ControlPlan(folder, controller, box, DT, delay_ticks, window, seconds, frozenset({0}), 20, parent)
 
 
-def holding(gains=(4.0, 3.5), *, fit_result=False, home=HOME):
+def hover_source(gains=(4.0, 3.5), *, fit_result=False, home=HOME):
     """Return the controller as programs; ``fit_result`` adds a fitted part without effect."""
     if not fit_result:
-        return plain_source(setup(), Holds(jnp.array(gains), tuple(map(float, home))))
-    arrays, fixed = eqx.partition(Holds(jnp.array(gains), tuple(map(float, home))), eqx.is_array)
+        return plain_source(setup(), HoverController(jnp.array(gains), tuple(map(float, home))))
+    arrays, fixed = eqx.partition(HoverController(jnp.array(gains), tuple(map(float, home))), eqx.is_array)
     parameters = {"policy": arrays, "residual": {"fit": jnp.array(0.0)}}
 
     def predict(parameters, inputs):

@@ -118,7 +118,7 @@ def answer(address: Address, topics: dict[str, int], topic: str, data: bytes) ->
     os._exit(0)
 
 
-class Left(SharedMemoryBus):
+class NetworkStandIn(SharedMemoryBus):
     """A bus in place of a network, which records that a process left it."""
 
     def close(self):
@@ -128,7 +128,7 @@ class Left(SharedMemoryBus):
 
 
 @dataclass(frozen=True)
-class Beside(Address):
+class LocalAddress(Address):
     """An address whose network is a bus of this machine."""
 
     folder: Path = Path()
@@ -136,4 +136,4 @@ class Beside(Address):
     def join(self, capacities, *, listen, writes=()):
         assert listen
         assert set(writes) == set(OUT)
-        return Left(self.folder)
+        return NetworkStandIn(self.folder)

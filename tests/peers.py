@@ -18,7 +18,7 @@ def start_process(*command):
         process.stdout.close()
 
 
-def peer(speaks, *words):
+def start_peer(protocol, *words):
     """Start a peer with the protocol of an autopilot."""
-    module = "retrim.ros1.peer" if speaks == "ros" else f"retrim.testing.{speaks}_peer"
+    module = "retrim.ros1.peer" if protocol == "ros" else f"retrim.testing.{protocol}_peer"
     return start_process(sys.executable, "-m", module, *words)

@@ -53,7 +53,7 @@ def policy_file(policy, setup, tmp_path_factory):
     return path
 
 
-class Said(Silent):
+class LineReporter(Silent):
     def __init__(self):
         self.lines = []
 
@@ -67,7 +67,7 @@ def test_every_format_equals_jax(to, policy, setup, policy_file, tmp_path):
         pytest.importorskip(name)
     if to == "c" and shutil.which("gcc") is None:
         pytest.skip("there is no C compiler")
-    text = Said()
+    text = LineReporter()
     paths = export(policy_file, to, tmp_path / f"p{FORMATS[to].suffix}", None, text)
     assert "µs a step" in text.lines[0]
     portable = portable_of(policy, setup)
@@ -85,9 +85,9 @@ def test_file_with_different_results_is_refused(policy_file, tmp_path):
     with np.load(tmp_path / "p.npz") as file:
         arrays = dict(file)
     arrays["w1"] = arrays["w1"] * 1.01
-    np.savez(tmp_path / "spoilt.npz", **arrays)
+    np.savez(tmp_path / "changed.npz", **arrays)
     with pytest.raises(ValueError, match="results deviate from the test vectors by"):
-        Runner(tmp_path / "spoilt.npz")
+        Runner(tmp_path / "changed.npz")
 
 
 @pytest.fixture(scope="module")

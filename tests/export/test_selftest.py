@@ -44,23 +44,23 @@ int main(void) {
 """
 
 
-def grown(policy):
+def enlarge_weights(policy):
     """The policy with weights large enough that commands move."""
     return policy.with_params(jax.tree.map(lambda leaf: jnp.asarray(6.0 * np.asarray(leaf)), policy.layers))
 
 
-def portable(preset):
+def make_portable(preset):
     setup = Setup.from_preset(preset)
-    return portable_of(grown(setup.new_policy(random.key(0))), setup)
+    return portable_of(enlarge_weights(setup.new_policy(random.key(0))), setup)
 
 
 @pytest.fixture(scope="module")
 def quad():
     """A policy with a step and a history of two commands."""
-    return portable(tiny_preset(command_history=2))
+    return make_portable(tiny_preset(command_history=2))
 
 
-def run(folder, policy, *, compiler="c99", main=MAIN, change=lambda text: text):
+def compile_and_run(folder, policy, *, compiler="c99", main=MAIN, change=lambda text: text):
     """Compile a header in a folder, and return the words that the program prints."""
     write_c(folder / "quad.h", policy)
     text = (folder / "quad.h").read_text()
@@ -73,7 +73,7 @@ def run(folder, policy, *, compiler="c99", main=MAIN, change=lambda text: text):
     return subprocess.run([folder / "main"], capture_output=True, text=True, check=True).stdout.split()
 
 
-def replaced(old, new, count=-1):
+def swap_text(old, new, count=-1):
     """A change of a header that is certain to take place."""
 
     def change(text):
@@ -85,9 +85,9 @@ def replaced(old, new, count=-1):
 
 @pytest.mark.parametrize("kind", PRESETS)
 def test_policy_of_every_kind_passes(kind, tmp_path):
-    policy = portable(changed(load(PRESETS[kind]), pretrain={"hidden_sizes": [16, 16]}))
+    policy = make_portable(changed(load(PRESETS[kind]), pretrain={"hidden_sizes": [16, 16]}))
     for compiler in ("c99", "fast-math", "c++"):
-        case, deviation = run(tmp_path, policy, compiler=compiler)
+        case, deviation = compile_and_run(tmp_path, policy, compiler=compiler)
         assert case == "0", compiler
         assert 0.0 < float(deviation) <= TOLERANCE, compiler
     assert (policy.observation is not None) == ("quad_step" in (tmp_path / "quad.h").read_text())
@@ -96,16 +96,16 @@ def test_policy_of_every_kind_passes(kind, tmp_path):
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(("history", "sizes"), [(0, [8]), (3, [32, 32, 32])])
 def test_every_history_and_depth_passes_with_every_compiler(history, sizes, compiler, tmp_path):
-    policy = portable(tiny_preset(command_history=history, pretrain={"hidden_sizes": sizes}))
+    policy = make_portable(tiny_preset(command_history=history, pretrain={"hidden_sizes": sizes}))
     assert len(policy.test_flight) == FLIGHT + history
-    assert run(tmp_path, policy, compiler=compiler)[0] == "0"
+    assert compile_and_run(tmp_path, policy, compiler=compiler)[0] == "0"
 
 
 def test_merged_delta_passes(tmp_path):
     setup = Setup.from_preset(tiny_preset(command_history=2))
-    low = LoraPolicy.of(grown(setup.new_policy(random.key(0))), key=random.key(1), ranks=(2, 2, 1))
+    low = LoraPolicy.of(enlarge_weights(setup.new_policy(random.key(0))), key=random.key(1), ranks=(2, 2, 1))
     low = low.with_params(jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + 0.1), low.delta))
-    assert run(tmp_path, portable_of(low.merged(), setup))[0] == "0"
+    assert compile_and_run(tmp_path, portable_of(low.merged(), setup))[0] == "0"
 
 
 EVERY_BIT = """
@@ -144,8 +144,8 @@ def test_wrong_bit_in_any_number_is_found(tmp_path):
     names = [f"{kind}{i}" for i in range(3) for kind in "wb"]
     names += ["low", "high", "y0", "test_observations", "test_commands", "test_states", "test_flight"]
     calls = "".join(f"missed += flip(quad_{name}, (int)(sizeof quad_{name} / sizeof(float)));" for name in names)
-    small = portable(tiny_preset(command_history=2, pretrain={"hidden_sizes": [8, 8]}))
-    assert run(tmp_path, small, main=EVERY_BIT.replace("FLIP", calls)) == ["0", "0"]
+    small = make_portable(tiny_preset(command_history=2, pretrain={"hidden_sizes": [8, 8]}))
+    assert compile_and_run(tmp_path, small, main=EVERY_BIT.replace("FLIP", calls)) == ["0", "0"]
 
 
 @pytest.mark.parametrize("row", range(TESTS))
@@ -153,7 +153,7 @@ def test_wrong_command_is_found_by_number(row, quad, tmp_path):
     """The checksum is right here, so that the comparison itself is tested."""
     wrong = quad.test_commands.copy()
     wrong[row:, row] += 3.0 * TOLERANCE * (quad.high - quad.low)[row]
-    case, deviation = run(tmp_path, dataclasses.replace(quad, test_commands=wrong))
+    case, deviation = compile_and_run(tmp_path, dataclasses.replace(quad, test_commands=wrong))
     assert int(case) == VECTORS + row
     assert 2.0 * TOLERANCE <= float(deviation) <= 4.0 * TOLERANCE
 
@@ -162,14 +162,16 @@ def test_wrong_command_is_found_by_number(row, quad, tmp_path):
 def test_wrong_tick_of_flight_is_found_by_number(tick, quad, tmp_path):
     wrong = quad.test_flight.copy()
     wrong[tick:, tick % 4] -= 3.0 * TOLERANCE * (quad.high - quad.low)[tick % 4]
-    assert int(run(tmp_path, dataclasses.replace(quad, test_flight=wrong))[0]) == TICKS + tick
+    assert int(compile_and_run(tmp_path, dataclasses.replace(quad, test_flight=wrong))[0]) == TICKS + tick
 
 
 @pytest.mark.parametrize("layer", range(3))
 def test_different_weights_are_found(layer, quad, tmp_path):
     layers = list(quad.layers)
     layers[layer] = (np.float32(1.01) * layers[layer][0], layers[layer][1])
-    assert VECTORS <= int(run(tmp_path, dataclasses.replace(quad, layers=tuple(layers)))[0]) < VECTORS + TESTS
+    assert (
+        VECTORS <= int(compile_and_run(tmp_path, dataclasses.replace(quad, layers=tuple(layers)))[0]) < VECTORS + TESTS
+    )
 
 
 RECIPROCAL = """
@@ -178,28 +180,28 @@ RECIPROCAL = """
 static float reciprocal(float a) { const float r = 1.0f / a; return r * (2.0f - a * r); }
 """
 STEEP = "if (exponent > 80.0f) exponent = 80.0f;"
-DIVISION = replaced("/ (1.0f + expf(exponent))", "* reciprocal(1.0f + expf(exponent))")
+DIVISION = swap_text("/ (1.0f + expf(exponent))", "* reciprocal(1.0f + expf(exponent))")
 OLD = "next.past[i] = next.past[i + 4]"
 WRONG = {
-    "an exponent without a limit": (LIMITS, lambda text: RECIPROCAL + DIVISION(replaced(STEEP, "")(text))),
-    "limits that are exchanged": (LIMITS, replaced("quad_low[j] + (quad_high[j]", "quad_high[j] + (quad_high[j]")),
-    "no test of bits": (OBSERVATION, replaced("u) return 0;\n    }", "u) return 1;\n    }")),
-    "a state that is not tested": (STATE, replaced("|| !quad_finite(v, 3)) return 0;", ") return 0;")),
-    "a memory of bad ticks": (STATE, replaced("next = *memory;", "next = *memory;\n    memory->past[4] += 1.0f;")),
-    "a history that does not move": (TICKS + 2, replaced(OLD, "next.past[i] = next.past[i]")),
-    "another origin": (TICKS, replaced("(p[2] - 1.0f)", "(p[2] - 1.1f)")),
-    "another gravity": (TICKS, replaced("i == 0 ? 9.81", "i == 0 ? 9.60")),
+    "an exponent without a limit": (LIMITS, lambda text: RECIPROCAL + DIVISION(swap_text(STEEP, "")(text))),
+    "limits that are exchanged": (LIMITS, swap_text("quad_low[j] + (quad_high[j]", "quad_high[j] + (quad_high[j]")),
+    "no test of bits": (OBSERVATION, swap_text("u) return 0;\n    }", "u) return 1;\n    }")),
+    "a state that is not tested": (STATE, swap_text("|| !quad_finite(v, 3)) return 0;", ") return 0;")),
+    "a memory of bad ticks": (STATE, swap_text("next = *memory;", "next = *memory;\n    memory->past[4] += 1.0f;")),
+    "a history that does not move": (TICKS + 2, swap_text(OLD, "next.past[i] = next.past[i]")),
+    "another origin": (TICKS, swap_text("(p[2] - 1.0f)", "(p[2] - 1.1f)")),
+    "another gravity": (TICKS, swap_text("i == 0 ? 9.81", "i == 0 ? 9.60")),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("wrong", WRONG)
 def test_code_with_different_results_is_found(wrong, quad, tmp_path):
     case, change = WRONG[wrong]
-    assert int(run(tmp_path, quad, change=change)[0]) == case
+    assert int(compile_and_run(tmp_path, quad, change=change)[0]) == case
 
 
 def test_reciprocal_of_fast_math_passes(quad, tmp_path):
-    assert run(tmp_path, quad, change=lambda text: RECIPROCAL + DIVISION(text))[0] == "0"
+    assert compile_and_run(tmp_path, quad, change=lambda text: RECIPROCAL + DIVISION(text))[0] == "0"
 
 
 def test_float_of_different_width_is_found(quad, tmp_path):
@@ -220,7 +222,7 @@ def test_damaged_number_in_file_is_found(name, quad, tmp_path):
         before, first, after = re.fullmatch(rf"(.* quad_{name}\[\d+\] = {{\n)([^,]+)f(,.*)", text, re.S).groups()
         return before + number(float(np.nextafter(np.float32(first), np.float32(np.inf)))) + after
 
-    assert int(run(tmp_path, quad, change=change)[0]) == DAMAGE
+    assert int(compile_and_run(tmp_path, quad, change=change)[0]) == DAMAGE
 
 
 FLY = """
@@ -246,7 +248,7 @@ int main(void) {
 
 
 def test_self_test_does_not_change_flight(quad, tmp_path):
-    assert run(tmp_path, quad, main=FLY.replace("QUAD_TICKS", str(len(quad.test_flight)))) == ["0"]
+    assert compile_and_run(tmp_path, quad, main=FLY.replace("QUAD_TICKS", str(len(quad.test_flight)))) == ["0"]
 
 
 def test_program_with_two_policies_must_name_self_test(quad, tmp_path):
@@ -256,7 +258,7 @@ def test_program_with_two_policies_must_name_self_test(quad, tmp_path):
     separate = (
         f'#include <stdio.h>\n{both}int main(void) {{ printf("%d", other_selftest() + quad_selftest()); return 0; }}'
     )
-    assert run(tmp_path, quad, main=separate) == ["0"]
+    assert compile_and_run(tmp_path, quad, main=separate) == ["0"]
     (tmp_path / "main.c").write_text(both + "int main(void) { return retrim_selftest(); }")
     compilation = subprocess.run(["gcc", *FLAGS, "main.c", "-lm"], cwd=tmp_path, capture_output=True, text=True)
     assert compilation.returncode != 0

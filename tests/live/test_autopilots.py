@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from peers import peer, start_process
+from peers import start_peer, start_process
 from px4_rig import ADDRESS, PX4, SIH, Changes
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
@@ -50,7 +50,7 @@ def live(policy, plant, out, *words, seconds=20):
 BUSY = 0.05  # share of the ticks that the watchdog may fly on a machine that is busy with something else
 
 
-def find(out):
+def read_results(out):
     """Figures of the flight, and its log."""
     results = json.loads((out / "results.json").read_text())
     return {row["metric"]: row["value"] for row in results["rows"]}, read_log(out / "flight.csv")
@@ -71,18 +71,18 @@ def error(rows, since=0.0, until=1e9, target=HOME):
 # ---- peers
 
 PEERS = {"mavlink": f"mavlink:udp:127.0.0.1:{PORT}", "crazyflie": f"crazyflie:udp:127.0.0.1:{PORT}"}
-each_peer = pytest.mark.parametrize("speaks", PEERS)
+each_peer = pytest.mark.parametrize("protocol", PEERS)
 
 
-def start_vehicle(speaks, *words):
-    return peer(speaks, "--port", PORT, *words)
+def start_vehicle(protocol, *words):
+    return start_peer(protocol, "--port", PORT, *words)
 
 
 @each_peer
-def test_flight_adapts_under_large_disturbance(speaks, small, tmp_path):
-    with start_vehicle(speaks, "--disturbance", "large"):
-        text = output_of(live(small, PEERS[speaks], tmp_path))
-    figures, rows = find(tmp_path)
+def test_flight_adapts_under_large_disturbance(protocol, small, tmp_path):
+    with start_vehicle(protocol, "--disturbance", "large"):
+        text = output_of(live(small, PEERS[protocol], tmp_path))
+    figures, rows = read_results(tmp_path)
     assert "flight over: landed" in text
     assert figures["policies"] > 10
     assert figures["fallback_ticks"] <= BUSY * len(rows)
@@ -91,11 +91,11 @@ def test_flight_adapts_under_large_disturbance(speaks, small, tmp_path):
 
 
 @each_peer
-def test_link_cut_for_one_second_ends_in_landing(speaks, small, tmp_path):
+def test_link_cut_for_one_second_ends_in_landing(protocol, small, tmp_path):
     """The guard sinks blindly, holds when it sees again, and lands; the log goes on."""
-    with start_vehicle(speaks, "--cut", "5", "1"):
-        text = output_of(live(small, PEERS[speaks], tmp_path))
-    _, rows = find(tmp_path)
+    with start_vehicle(protocol, "--cut", "5", "1"):
+        text = output_of(live(small, PEERS[protocol], tmp_path))
+    _, rows = read_results(tmp_path)
     modes = rows[:, -1]
     assert "blind: " in text
     assert "flight over: landed" in text
@@ -105,19 +105,19 @@ def test_link_cut_for_one_second_ends_in_landing(speaks, small, tmp_path):
 
 
 @each_peer
-def test_link_cut_for_five_seconds_ends_flight_and_log_is_complete(speaks, small, tmp_path):
+def test_link_cut_for_five_seconds_ends_flight_and_log_is_complete(protocol, small, tmp_path):
     """The vehicle is its autopilot's, which holds its place, or lets it fall; nobody takes it back."""
-    with start_vehicle(speaks, "--cut", "5", "5"):
-        text = output_of(live(small, PEERS[speaks], tmp_path), fails=True)
-    figures, rows = find(tmp_path)
+    with start_vehicle(protocol, "--cut", "5", "5"):
+        text = output_of(live(small, PEERS[protocol], tmp_path), fails=True)
+    figures, rows = read_results(tmp_path)
     assert "plant lost: the link has been silent for 2 s" in text
     assert 5.0 < rows[-1, 1] < 8.0
     assert "missed_ticks" in figures
 
 
-def kill_in_flight(speaks, policy, out):
+def kill_in_flight(protocol, policy, out):
     """Fly, kill the process of the link after two seconds, and return when all of retrim has ended."""
-    flight = live(policy, PEERS[speaks], out)
+    flight = live(policy, PEERS[protocol], out)
     while not (out / "flight.csv").exists() or len((out / "flight.csv").read_text().splitlines()) < 100:
         assert flight.poll() is None
         time.sleep(0.1)
@@ -181,7 +181,7 @@ def test_px4_compensates_load_and_weak_battery_within_three_seconds(tmp_path_fac
         finally:
             changes.link.close()
         text = output_of(flight)
-    figures, rows = find(tmp_path)
+    figures, rows = read_results(tmp_path)
     print(f"mean error [m] by 5 s: {[round(float(error(rows, t, t + 5).mean()), 3) for t in range(0, 90, 5)]}")
     assert "flight over: landed" in text
     # PX4's estimate is 4 to 5 cm off, and wanders: single windows of 5 s are 4 to 12 cm, as they are without a change.
@@ -197,7 +197,7 @@ def test_px4_follows_circle(tmp_path_factory, tmp_path):
     policy = train_policy(tmp_path_factory, "track", "--vehicle", SIH, "--reference", "circle")
     with start_process(sys.executable, "-m", "retrim.testing.px4", PX4):
         text = output_of(live(policy, ADDRESS, tmp_path, "--reference", "circle", seconds=30))
-    figures, rows = find(tmp_path)
+    figures, rows = read_results(tmp_path)
     flight = rows[(rows[:, 1] > 6.0) & (rows[:, -1] == Mode.POLICY)]
     print(f"steady error {figures['steady']:.3f} m")
     assert "flight over: landed" in text

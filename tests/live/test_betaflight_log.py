@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_log import LOGS, PLAIN, fly_random_rates, settings_say
+from firmware_log import LOGS, PLAIN, compute_response, fly_random_rates
 from retrim import Scenario
 from retrim.io.logs import read_log
 from retrim.io.logs.blackbox_frames import FrameDecoder
@@ -51,7 +51,7 @@ def fly(folder, monkeypatch, more, seconds=25.0):
 def test_identified_values_deviate_from_settings_by_at_most_10_percent(p, d, tmp_path, monkeypatch):
     gains = [f"set {name}_{axis} = {x}" for axis in ("roll", "pitch") for name, x in (("p", p), ("d", d))]
     path, model, sensors = fly(tmp_path, monkeypatch, [*PLAIN, *gains])
-    lag, damping, hover = settings_say(path, model)
+    lag, damping, hover = compute_response(path, model)
     log = read_log(path)
     result = identify_body(log)
     found = result.vehicle

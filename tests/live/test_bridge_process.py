@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bus_ends import await_message
-from live_processes import Beside
+from live_processes import LocalAddress
 from retrim.live.processes import bridge as bridge_process
 from retrim.live.processes.bridge import BridgePlan
 from retrim.onboard.launch import launch
@@ -23,7 +23,12 @@ def between():
     """The flight's bus, the network, the supervisor, and the plan of a bridge between them."""
     here, there = SharedMemoryBus.create(ROOM), SharedMemoryBus.create(ROOM)
     parent = subprocess.Popen(["sleep", "60"])
-    yield here, there, parent, BridgePlan(here.folder, Beside("zenoh", "127.0.0.1", 1, folder=there.folder), parent.pid)
+    yield (
+        here,
+        there,
+        parent,
+        BridgePlan(here.folder, LocalAddress("zenoh", "127.0.0.1", 1, folder=there.folder), parent.pid),
+    )
     parent.kill()
     parent.wait()
     Path(f"{there.folder}-left").unlink(missing_ok=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from peers import peer, start_process
+from peers import start_peer, start_process
 from retrim import Scenario, testing
 
 CFLIB = os.environ.get("RETRIM_CFLIB", "")
@@ -74,7 +74,7 @@ def port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         result = free.getsockname()[1]
-    with peer("crazyflie", "--plant", "simple", "--port", result):
+    with start_peer("crazyflie", "--plant", "simple", "--port", result):
         yield result
 
 

@@ -9,7 +9,7 @@ from subprocess import Popen
 import numpy as np
 import pytest
 
-from live_helpers import DrillSupervisor, holding, plan
+from live_helpers import DrillSupervisor, hover_source, plan
 from live_processes import DT, HOME, level
 from retrim.config import PRESETS, Scenario
 from retrim.config.loading import dump
@@ -28,10 +28,10 @@ SECONDS = 1.5
 
 @pytest.fixture(scope="module")
 def controller():
-    return holding()
+    return hover_source()
 
 
-def spec_in(folder, controller, **changes):
+def make_spec(folder, controller, **changes):
     start = folder / "start.safetensors"
     start.write_bytes(pack_arrays({}, kind="learnt", about={"preset": dump(PRESETS["hover/retrim"])}))
     setup = plan(controller)
@@ -76,7 +76,7 @@ def _first_fallback(bus, kill):
     return Setpoint.unpack(message.data).send_time - kill
 
 
-def whole_log(folder, status=None, until=None):
+def read_whole_log(folder, status=None, until=None):
     """Return the log, after asserting that it has every tick that was flown, and that every command is finite.
 
     Of a flight whose control process died, ``until`` is the time up to which its counts are known [s]: nobody counts
@@ -101,8 +101,8 @@ def whole_log(folder, status=None, until=None):
 
 
 def test_flight_without_faults_lands(tmp_path, controller):
-    status, events, *_ = fly_once(spec_in(tmp_path, controller))
-    rows = whole_log(tmp_path, status)
+    status, events, *_ = fly_once(make_spec(tmp_path, controller))
+    rows = read_whole_log(tmp_path, status)
     assert status.end_reason == "landed"
     assert rows[-1, -1] == Mode.LANDED
     assert rows[-1, 5] <= 0.1
@@ -118,8 +118,8 @@ def test_flight_survives_processes_killed_at_random_times(tmp_path, controller, 
     names = roles.split()
     kills = dict(zip(names, np.random.default_rng([seed, len(roles)]).uniform(0.0, SECONDS, len(names)), strict=True))
     at = kills[names[0]]
-    status, events, took, punctual = fly_once(spec_in(tmp_path, controller), kills)
-    rows = whole_log(tmp_path, status, at - 2 * DT if roles == "control" else None)
+    status, events, took, punctual = fly_once(make_spec(tmp_path, controller), kills)
+    rows = read_whole_log(tmp_path, status, at - 2 * DT if roles == "control" else None)
     if roles == "plant":
         assert status.end_reason.startswith("the plant process is gone")
         assert abs(rows[has_measurement(rows)][-1, 1] - at) < 0.3
@@ -141,9 +141,9 @@ def test_flight_survives_processes_killed_at_random_times(tmp_path, controller, 
 def test_hung_processes_are_detected_at_random_times(tmp_path, controller, roles, seed):
     names = roles.split()
     times = np.random.default_rng([seed, len(roles)]).uniform(0.0, 1.0, len(names))
-    stops, spec = dict(zip(names, times, strict=True)), spec_in(tmp_path, controller, seconds=4.0)
+    stops, spec = dict(zip(names, times, strict=True)), make_spec(tmp_path, controller, seconds=4.0)
     status, events, *_ = fly_once(spec, stops, seconds=4.0, number=signal.SIGSTOP)
-    rows = whole_log(tmp_path, status, times[0] - 2 * DT if roles == "control" else None)
+    rows = read_whole_log(tmp_path, status, times[0] - 2 * DT if roles == "control" else None)
     message = [event.note for event in events if "hung" in event.note]
     assert status.hangs == dict.fromkeys(stops, 1)
     assert sorted(note.split()[1] for note in message) == sorted(names)
@@ -163,7 +163,7 @@ def test_hung_processes_are_detected_at_random_times(tmp_path, controller, roles
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_vehicle_lands_without_supervisor_and_log_is_complete(tmp_path, controller, number):
-    spec = spec_in(tmp_path, controller, seconds=1.5 if number == signal.SIGKILL else 60.0)
+    spec = make_spec(tmp_path, controller, seconds=1.5 if number == signal.SIGKILL else 60.0)
     process: Popen[bytes] = launch("live_helpers:supervise", spec, tmp_path / "supervisor.log")
     log = tmp_path / "flight.csv"
     until = time.monotonic() + 30.0
@@ -174,7 +174,7 @@ def test_vehicle_lands_without_supervisor_and_log_is_complete(tmp_path, controll
         time.sleep(0.1)
     process.send_signal(signal.SIGCONT)  # who was suspended goes on, and sees the end
     assert process.wait(30.0) == (0 if number == signal.SIGSTOP else -number)
-    rows = whole_log(tmp_path)
+    rows = read_whole_log(tmp_path)
     assert rows[-1, -1] == Mode.LANDED
     assert Mode.DESCEND in rows[:, -1]
     assert np.isfinite(rows[:, COMMAND]).all()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from live.test_live_learner import Beside, start  # noqa: F401
+from live.test_live_learner import LearnerRig, start  # noqa: F401
 from retrim.adapt.batched_workers import room_for
 from retrim.config.setup import Setup
 from retrim.io.policies import load_learner_state, save_learner_state
@@ -32,7 +32,7 @@ def plan_of(start, layer, seed):  # noqa: F811
 
 @pytest.fixture
 def vehicles(start):  # noqa: F811
-    return {name: Beside(start) for name in "abc"}
+    return {name: LearnerRig(start) for name in "abc"}
 
 
 def fleet_for(vehicles, start, layer):  # noqa: F811
@@ -43,7 +43,7 @@ def fleet_for(vehicles, start, layer):  # noqa: F811
     return fleet
 
 
-def find(vehicle, layer):
+def read_parameters(vehicle, layer):
     return jax.tree.leaves(vehicle.parameters(layer).arrays)
 
 
@@ -54,14 +54,14 @@ def test_batched_updates_equal_separate_updates(start, vehicles, layer):  # noqa
         vehicle.fly(60 + 10 * i)
     assert fleet_for(vehicles, start, layer).step() == 3
     for name, vehicle in vehicles.items():
-        together = find(vehicle, layer) if vehicle.bus.latest(f"parameters.{layer}") else None
-        alone = Beside(start)
+        together = read_parameters(vehicle, layer) if vehicle.bus.latest(f"parameters.{layer}") else None
+        alone = LearnerRig(start)
         alone.fly(60 + 10 * list(SEEDS).index(name))
         loop = type(alone).learner(alone, layer)
         loop.plan = plan_of(start, layer, SEEDS[name])
         loop.worker = loop.new_worker()
         assert loop.step()
-        by_itself = find(alone, layer) if alone.bus.latest(f"parameters.{layer}") else None
+        by_itself = read_parameters(alone, layer) if alone.bus.latest(f"parameters.{layer}") else None
         assert (together is None) == (by_itself is None)
         for one, other in zip(together or (), by_itself or (), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-8)
@@ -69,7 +69,7 @@ def test_batched_updates_equal_separate_updates(start, vehicles, layer):  # noqa
 
 
 def test_late_vehicle_does_not_delay_others(start, vehicles):  # noqa: F811
-    vehicles["d"] = Beside(start)
+    vehicles["d"] = LearnerRig(start)
     fleet = fleet_for(vehicles, start, "residual")
     for name in "acd":
         vehicles[name].fly()
@@ -82,7 +82,7 @@ def test_late_vehicle_does_not_delay_others(start, vehicles):  # noqa: F811
 
 
 def test_learning_continues_after_vehicle_leaves(start, vehicles):  # noqa: F811
-    vehicles["d"] = Beside(start)
+    vehicles["d"] = LearnerRig(start)
     fleet = fleet_for(vehicles, start, "residual")
     fleet.drop("b")
     fleet.drop("nobody")
@@ -106,7 +106,7 @@ def test_low_rank_vehicles_share_base_until_rollback(start, tmp_path):  # noqa: 
     setup = Setup.from_preset(preset)
     state = setup.learner.init(setup.low_rank(setup.new_policy(random.key(0)), random.key(1)), random.key(2))
     save_learner_state(tmp_path / "start.safetensors", state, preset)
-    vehicles = {name: Beside((tmp_path / "start.safetensors", controller, state)) for name in "ab"}
+    vehicles = {name: LearnerRig((tmp_path / "start.safetensors", controller, state)) for name in "ab"}
     fleet = fleet_for(vehicles, (tmp_path / "start.safetensors", controller, state), "policy")
     for vehicle in vehicles.values():
         vehicle.fly()

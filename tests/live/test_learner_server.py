@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from live.test_faults import controller, spec_in, whole_log  # noqa: F401
+from live.test_faults import controller, make_spec, read_whole_log  # noqa: F401
 from live_helpers import DrillSupervisor
 from live_processes import HOME, DrillPlan, level
 from retrim.config import PRESETS, changed
@@ -69,7 +69,7 @@ def fly_while(gap, folder, controller):  # noqa: F811
     thread.start()
     events, complete = LiveEvents(), True
     try:
-        with DrillSupervisor(spec_in(folder, controller, **changes)) as drill:
+        with DrillSupervisor(make_spec(folder, controller, **changes)) as drill:
             for _ in drill.warm_up():
                 pass
             drill.take_off()
@@ -89,7 +89,7 @@ def fly_while(gap, folder, controller):  # noqa: F811
     finally:
         over.set()
         thread.join(20.0)
-    rows = whole_log(folder, status)
+    rows = read_whole_log(folder, status)
     assert status.end_reason == "landed"
     return status, events, rows[rows[:, 1] < SECONDS - 0.1, -1]
 
@@ -137,7 +137,7 @@ def test_wrong_or_missing_key_prevents_flight_and_both_ends_report_it(
     thread = threading.Thread(target=listen)
     thread.start()
     address = Address("zenoh", "127.0.0.1", port, shared=here)
-    with DrillSupervisor(spec_in(tmp_path, flight, learners=address)) as drill, pytest.raises(PlantError) as error:
+    with DrillSupervisor(make_spec(tmp_path, flight, learners=address)) as drill, pytest.raises(PlantError) as error:
         for _ in drill.warm_up():
             pass
     thread.join(20.0)

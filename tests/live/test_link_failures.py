@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import pytest
 
-from failure_rigs import HOME, Rig, fly, flying_alone, kill_all, more_roles, spec_of
+from failure_rigs import HOME, Rig, add_roles, fly, kill_all, spec_of, start_supervised_flight
 from helpers import tiny_preset
 from retrim import Scenario
 from retrim.config.setup import Setup
@@ -234,7 +234,7 @@ RESTARTED = {"watchdog": "watchdog", "recorder": "recorder", "a learner": "polic
 
 @asserts([f"{name} killed" for name in (*RESTARTED, "control")], ["every link"], fly_by=["mavlink"])
 def test_processes_are_killed_in_turn(rig, tmp_path):
-    with more_roles():
+    with add_roles():
         flight, steps = begin(rig, tmp_path, ("residual", "policy"))
         for name, role in RESTARTED.items():
             fault = time.monotonic()
@@ -259,7 +259,7 @@ def test_processes_are_killed_in_turn(rig, tmp_path):
 @asserts(["supervisor killed"], ["every link"], fly_by=["ros2:mavros"])
 def test_supervisor_is_killed(rig, tmp_path):
     key = "every link", "supervisor killed"
-    with flying_alone(spec_of(rig, tmp_path), rig) as processes:
+    with start_supervised_flight(spec_of(rig, tmp_path), rig) as processes:
         before, fault = read_log(tmp_path / "flight.csv")[-1, 1], time.monotonic()
         os.kill(processes["supervise"], signal.SIGKILL)
         ends = [Path(f"/proc/{processes[name]}") for name in ("control_process:fly", "recorder:record")]
@@ -288,7 +288,7 @@ def test_link_process_is_killed(rig, tmp_path):
 @asserts(["all processes killed"], LINKS, fly_by=["mavlink", "ros2:px4", "ros2:mavros", "crazyflie"])
 def test_all_processes_are_killed(rig, tmp_path):
     key = rig.name, "all processes killed"
-    with flying_alone(spec_of(rig, tmp_path), rig) as processes:
+    with start_supervised_flight(spec_of(rig, tmp_path), rig) as processes:
         assert len(processes) >= 5
         fault = time.monotonic()
         kill_all(processes)
@@ -302,7 +302,7 @@ def test_all_processes_are_killed_before_stack_that_holds_last_target(rig, tmp_p
     key = rig.name, "all processes killed, last target held"
     before, rig.peer.fresh = rig.peer.fresh, np.inf
     try:
-        with flying_alone(spec_of(rig, tmp_path), rig) as processes:
+        with start_supervised_flight(spec_of(rig, tmp_path), rig) as processes:
             rig.kick([1.0, 0.0, 0.0])
             time.sleep(0.08)
             fault = time.monotonic()

@@ -1,4 +1,4 @@
-"""A learner beside the flight: windows in, parameters out; it goes on from what is flown, not from what it wished."""
+"""A learner rig the flight: windows in, parameters out; it goes on from what is flown, not from what it wished."""
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ def start(tmp_path_factory):
         return path, adaptive_source(setup, state), state
 
 
-class Beside:
+class LearnerRig:
     """Loops of the layers on one bus; rows of a vehicle that hovers under a push that it does not feel."""
 
     def __init__(self, start, *layers):
@@ -60,7 +60,7 @@ class Beside:
         rows[:, COMMAND] = np.array([10.3, 0.0, 0.0, 0.0]) + 0.01 * np.sin(rows[:, :1])
         self.bus.publish("flight", FlightRows(rows).pack())
 
-    def says(self, newest, given_up=(), mode="policy"):
+    def report_status(self, newest, given_up=(), mode="policy"):
         note = pack_note("status", newest={"policy": newest}, given_up=list(given_up), mode=mode)
         self.bus.publish("status", note)
 
@@ -75,7 +75,7 @@ class Beside:
         return unpack_update(data[8:], self.state, source=layer)
 
 
-def improving(loop, meanwhile=lambda: None):
+def stub_learning(loop, meanwhile=lambda: None):
     """Let a loop learn a policy a little other than its last one, each time, at once."""
 
     def learn(window):
@@ -93,165 +93,163 @@ def weights(tree):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))])
 
 
-def base_of(loop):
+def starting_weights(loop):
     """The policy that the next update starts from."""
     return weights(loop.worker._policy.policy)
 
 
 def test_learner_publishes_parameters_from_window(start):
-    beside = Beside(start, "residual")
-    loop = beside.loops["residual"]
+    rig = LearnerRig(start, "residual")
+    loop = rig.loops["residual"]
     assert not loop.step()
-    beside.fly()
+    rig.fly()
     assert loop.step()
-    result = beside.parameters("residual")
+    result = rig.parameters("residual")
     assert (result.version, result.parent, result.computed_from) == (1, 0, pytest.approx(59 * DT))
     assert not loop.step()  # nothing new
-    beside.fly()
-    beside.now -= 99.99
+    rig.fly()
+    rig.now -= 99.99
     assert not loop.step()  # not time
-    beside.now += 99.99
+    rig.now += 99.99
     assert loop.step()
-    assert beside.parameters("residual", after=1).version == 2
+    assert rig.parameters("residual", after=1).version == 2
 
 
 def test_versions_continue_from_active_policy_on_new_bus(start):
-    beside = Beside(start, "policy")
-    loop = improving(beside.loops["policy"])
-    beside.says(57)
-    beside.fly()
+    rig = LearnerRig(start, "policy")
+    loop = stub_learning(rig.loops["policy"])
+    rig.report_status(57)
+    rig.fly()
     assert loop.step()
-    assert beside.parameters("policy").version == 58
+    assert rig.parameters("policy").version == 58
 
 
 def test_update_during_pause_is_not_published(start):
-    beside = Beside(start, "policy")
+    rig = LearnerRig(start, "policy")
     note = pack_note("learning", paused=True)
-    loop = improving(beside.loops["policy"], lambda: beside.bus.publish("learning", note))
-    beside.fly()
+    loop = stub_learning(rig.loops["policy"], lambda: rig.bus.publish("learning", note))
+    rig.fly()
     loop.step()
-    assert beside.bus.latest("parameters.policy") is None
+    assert rig.bus.latest("parameters.policy") is None
 
 
 def test_paused_or_descending_flight_starts_no_update(start):
-    beside = Beside(start, "residual")
-    loop = beside.loops["residual"]
-    beside.fly()
-    beside.bus.publish("learning", pack_note("learning", paused=True))
+    rig = LearnerRig(start, "residual")
+    loop = rig.loops["residual"]
+    rig.fly()
+    rig.bus.publish("learning", pack_note("learning", paused=True))
     assert not loop.step()
-    beside.bus.publish("learning", pack_note("learning", paused=False))
-    beside.says(0, mode="descend")
+    rig.bus.publish("learning", pack_note("learning", paused=False))
+    rig.report_status(0, mode="descend")
     assert not loop.step()
-    beside.says(0)
+    rig.report_status(0)
     assert loop.step()
 
 
 def test_policy_update_starts_from_active_policy(start):
-    beside = Beside(start, "policy")
-    loop = improving(beside.loops["policy"])
-    beside.fly()
+    rig = LearnerRig(start, "policy")
+    loop = stub_learning(rig.loops["policy"])
+    rig.fly()
     assert loop.step()
-    first = beside.update("policy", 1)
+    first = rig.update("policy", 1)
     assert isinstance(first, PolicyUpdate)
-    beside.fly()
-    beside.says(newest=1)
+    rig.fly()
+    rig.report_status(newest=1)
     assert loop.step()
-    np.testing.assert_array_equal(base_of(loop), weights(first.state.policy))
-    assert beside.parameters("policy", after=1).parent == 1
+    np.testing.assert_array_equal(starting_weights(loop), weights(first.state.policy))
+    assert rig.parameters("policy", after=1).parent == 1
     # The second one was flown and taken back: the next starts from the first again.
-    beside.says(newest=2)
+    rig.report_status(newest=2)
     loop.step()
-    np.testing.assert_array_equal(base_of(loop), weights(beside.update("policy", 2).state.policy))
-    beside.fly()
-    beside.says(newest=2, given_up=[2])
+    np.testing.assert_array_equal(starting_weights(loop), weights(rig.update("policy", 2).state.policy))
+    rig.fly()
+    rig.report_status(newest=2, given_up=[2])
     assert loop.step()
-    np.testing.assert_array_equal(base_of(loop), weights(first.state.policy))
-    assert beside.parameters("policy", after=2).parent == 1
+    np.testing.assert_array_equal(starting_weights(loop), weights(first.state.policy))
+    assert rig.parameters("policy", after=2).parent == 1
 
 
 def test_update_does_not_start_from_rolled_back_policy(start):
-    beside = Beside(start, "policy")
-    loop = improving(beside.loops["policy"])
-    beside.fly()
+    rig = LearnerRig(start, "policy")
+    loop = stub_learning(rig.loops["policy"])
+    rig.fly()
     assert loop.step()
-    beside.fly()
-    beside.says(newest=1, given_up=[1])
+    rig.fly()
+    rig.report_status(newest=1, given_up=[1])
     assert loop.step()
-    np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
+    np.testing.assert_array_equal(starting_weights(loop), weights(rig.state.policy.policy))
 
 
 def test_update_of_policy_rolled_back_during_training_is_discarded(start):
-    beside = Beside(start, "policy")
-    loop = improving(beside.loops["policy"])
-    beside.fly()
+    rig = LearnerRig(start, "policy")
+    loop = stub_learning(rig.loops["policy"])
+    rig.fly()
     assert loop.step()
-    beside.fly()
-    beside.says(newest=1)
-    improving(loop, lambda: beside.says(newest=1, given_up=[1]))
+    rig.fly()
+    rig.report_status(newest=1)
+    stub_learning(loop, lambda: rig.report_status(newest=1, given_up=[1]))
     assert loop.step()
-    assert beside.bus.latest("parameters.policy").version == 1
-    np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
+    assert rig.bus.latest("parameters.policy").version == 1
+    np.testing.assert_array_equal(starting_weights(loop), weights(rig.state.policy.policy))
 
 
 def test_learner_waits_for_report_about_slow_update(start):
-    beside = Beside(start, "policy")
-    loop = improving(beside.loops["policy"])
+    rig = LearnerRig(start, "policy")
+    loop = stub_learning(rig.loops["policy"])
 
     def seconds():
-        beside.now += 5.0
+        rig.now += 5.0
 
-    improving(loop, seconds)
-    beside.fly()
-    beside.says(newest=0)
+    stub_learning(loop, seconds)
+    rig.fly()
+    rig.report_status(newest=0)
     assert loop.step()
-    beside.now += 0.1
+    rig.now += 0.1
     assert not loop.step()
-    beside.says(newest=1)
+    rig.report_status(newest=1)
     loop.step()
-    np.testing.assert_array_equal(base_of(loop), weights(beside.update("policy", 1).state.policy))
+    np.testing.assert_array_equal(starting_weights(loop), weights(rig.update("policy", 1).state.policy))
 
 
 def test_learner_stops_waiting_for_unused_policy(start):
-    beside = Beside(start, "policy")
-    loop = improving(beside.loops["policy"])
-    beside.fly()
+    rig = LearnerRig(start, "policy")
+    loop = stub_learning(rig.loops["policy"])
+    rig.fly()
     assert loop.step()
-    beside.fly()
-    beside.says(newest=0)
+    rig.fly()
+    rig.report_status(newest=0)
     assert loop.step()
-    np.testing.assert_array_equal(base_of(loop), weights(beside.state.policy.policy))
+    np.testing.assert_array_equal(starting_weights(loop), weights(rig.state.policy.policy))
 
 
 def test_restarted_learner_continues_from_active_parameters(start):
-    beside = Beside(start, "residual", "policy")
-    beside.fly()
-    improving(beside.loops["policy"])
-    for loop in beside.loops.values():
+    rig = LearnerRig(start, "residual", "policy")
+    rig.fly()
+    stub_learning(rig.loops["policy"])
+    for loop in rig.loops.values():
         assert loop.step()
-    beside.bus.publish("said.policy", pack_update(Rejection(1.0, "policy", "worse")))
-    beside.says(newest=0)
-    unflown = beside.learner("policy")
+    rig.bus.publish("said.policy", pack_update(Rejection(1.0, "policy", "worse")))
+    rig.report_status(newest=0)
+    unflown = rig.learner("policy")
     unflown.catch_up()
-    np.testing.assert_array_equal(base_of(unflown), weights(beside.state.policy.policy))
-    beside.says(newest=1)
-    again = beside.learner("policy")
+    np.testing.assert_array_equal(starting_weights(unflown), weights(rig.state.policy.policy))
+    rig.report_status(newest=1)
+    again = rig.learner("policy")
     again.catch_up()
-    np.testing.assert_array_equal(weights(again.worker._residual), weights(beside.update("residual", 1).state))
-    np.testing.assert_array_equal(base_of(again), weights(beside.update("policy", 1).state.policy))
-    beside.fly()
-    assert improving(again).step()
-    assert beside.parameters("policy", after=1).parent == 1
+    np.testing.assert_array_equal(weights(again.worker._residual), weights(rig.update("residual", 1).state))
+    np.testing.assert_array_equal(starting_weights(again), weights(rig.update("policy", 1).state.policy))
+    rig.fly()
+    assert stub_learning(again).step()
+    assert rig.parameters("policy", after=1).parent == 1
 
 
 @pytest.mark.parametrize("given_up", [[], [5]])
 def test_active_update_remains_on_bus_despite_unused_updates(start, given_up):
     """A process that flew and hangs takes nothing any more."""
-    beside = Beside(start)
-    update = PolicyUpdate(0.0, 0.0, 0.0, beside.state.policy)
+    rig = LearnerRig(start)
+    update = PolicyUpdate(0.0, 0.0, 0.0, rig.state.policy)
     for version in range(1, 10):
         newest = min(version - 1, 5)
-        keep(
-            beside.bus, "policy", version, update, {"newest": {"policy": newest}, "given_up": given_up * (version > 5)}
-        )
-    result, _ = active_update(beside.bus, beside.state, "policy", {"newest": {"policy": 5}, "given_up": given_up})
+        keep(rig.bus, "policy", version, update, {"newest": {"policy": newest}, "given_up": given_up * (version > 5)})
+    result, _ = active_update(rig.bus, rig.state, "policy", {"newest": {"policy": 5}, "given_up": given_up})
     assert result == (4 if given_up else 5)

@@ -74,7 +74,7 @@ def fly_once(folder, out, what, seed, page=("--no-page",), seconds=SECONDS):
     return process.returncode, text
 
 
-def whole(path):
+def read_whole_log(path):
     """Return a log, which begins with the flight and ends with its landing."""
     rows = read_log(path)
     assert rows[0, 0] == 0
@@ -83,7 +83,7 @@ def whole(path):
     return rows
 
 
-def check_kept(folder):
+def check_saved_state(folder):
     """Assert that the learner state can be continued, and that its policy flies."""
     state, _ = load_learner_state(folder / "learner_state.safetensors")
     adapted_policy, _ = load_policy(folder / "adapted.safetensors")
@@ -105,8 +105,8 @@ def test_hung_processes_are_restarted_and_log_is_complete(folder, seed):
     for role in (*roles.values(), "residual", "policy"):
         assert f"restarted: the {role} process hung: it said nothing for 2 s and was ended" in text
     assert {row["metric"]: row["value"] for row in result["rows"]}["restarts"] == 5
-    assert len(whole(folder / out / "flight.csv")) > 50 * 14.0 - 25
-    check_kept(folder / out)
+    assert len(read_whole_log(folder / out / "flight.csv")) > 50 * 14.0 - 25
+    check_saved_state(folder / out)
 
 
 @pytest.mark.parametrize("seed", DRILLS)
@@ -123,7 +123,7 @@ def test_hung_plant_or_control_ends_flight_in_defined_way(folder, role, seed):
     steady = next(row for row in result["rows"] if row["metric"] == "steady")
     assert result["faults"] == []
     assert f"guard: the {role} process hung: it said nothing for 2 s and was ended" in text
-    check_kept(folder / out)
+    check_saved_state(folder / out)
     if role == "plant":
         height = rows[has_measurement(rows)][-1, TRUE][2]
         assert result["ended"].startswith(f"stopped without measurements at {height:.2f} m: the plant process hung")
@@ -141,8 +141,8 @@ def test_closed_terminal_lands_vehicle_and_results_are_written(folder, seed):
     result = results(folder / out)
     assert (code, result["interrupted"], result["ended"], result["faults"]) == (130, True, "landed", [])
     assert result["seconds"] < SECONDS - 0.5
-    whole(folder / out / "flight.csv")
-    check_kept(folder / out)
+    read_whole_log(folder / out / "flight.csv")
+    check_saved_state(folder / out)
 
 
 @pytest.mark.parametrize("seed", DRILLS)
@@ -155,8 +155,8 @@ def test_lost_folder_is_created_again_with_log_and_learner_state(folder, how, se
     assert f"log: {out.name}/flight.csv: No such file or directory; the log is written again" in text
     result = results(out)
     assert (result["ended"], result["faults"]) == ("landed", [])
-    assert len(whole(out / "flight.csv")) > 50 * SECONDS - 25
-    check_kept(out)
+    assert len(read_whole_log(out / "flight.csv")) > 50 * SECONDS - 25
+    check_saved_state(out)
 
 
 def elsewhere(text, name, reason):
@@ -179,8 +179,8 @@ def test_results_are_saved_elsewhere_if_file_replaces_folder(folder, seed):
     result = results(elsewhere(text, "results.json", "File exists"))
     assert result["ended"] == "landed"
     assert any(fault.startswith(f"{out.name}/flight.csv: ") for fault in result["faults"])
-    assert len(whole(place / "flight.csv")) > 50 * SECONDS - 25
-    check_kept(place)
+    assert len(read_whole_log(place / "flight.csv")) > 50 * SECONDS - 25
+    check_saved_state(place)
     shutil.rmtree(place)
 
 
@@ -205,8 +205,8 @@ def test_results_are_saved_elsewhere_if_disk_is_full(folder, small_disk, seed):
     result = results(elsewhere(text, "results.json", full))
     assert result["ended"] == "landed"
     assert len(result["faults"]) >= 4
-    assert len(whole(place / "flight.csv")) > 50 * SECONDS - 25
-    check_kept(place)
+    assert len(read_whole_log(place / "flight.csv")) > 50 * SECONDS - 25
+    check_saved_state(place)
     shutil.rmtree(place)
 
 
@@ -230,7 +230,7 @@ def test_learner_state_survives_loss_of_supervisor_and_recorder(folder, seed):
     code, _ = fly_once(folder, out.name, kill, seed)
     assert code == -signal.SIGKILL
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in flight))
-    check_kept(out)
+    check_saved_state(out)
     assert not (out / "results.json").exists()
     left = Path(bus[0])
     assert left.exists()

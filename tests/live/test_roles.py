@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from live_helpers import holding, plan
+from live_helpers import hover_source, plan
 from live_processes import DT, HOME, level
 from retrim import Scenario
 from retrim.live.operator.page import PagePlan
@@ -22,7 +22,7 @@ PAGE = PageSpec("localhost", 8080, "hover", np.zeros((1, 3)), (), 0.1, 0.7)
 
 @pytest.fixture(scope="module")
 def spec():
-    controller, place = holding(), Path("place")
+    controller, place = hover_source(), Path("place")
     return LiveSpec(
         controller, (), place / "start", None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])), HOME,
         plan(controller).limits, DT, 1, 150, 1.0, 0, place,

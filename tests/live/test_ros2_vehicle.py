@@ -38,7 +38,7 @@ PLACE = ("--place", "0.3", "-0.2", "1.5", "--yaw", str(HEADING))
 
 
 @pytest.fixture(autouse=True)
-def on_this_machine(monkeypatch):
+def limit_discovery(monkeypatch):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(20 + os.getpid() % 60))
     monkeypatch.setenv("PYTHONPATH", str(PACKAGES))
@@ -127,7 +127,7 @@ def output_of(flight, *, fails=False):
     return text
 
 
-def find(out):
+def read_results(out):
     """Figures of the flight, and its log."""
     rows = json.loads((out / "results.json").read_text())["rows"]
     return {row["metric"]: row["value"] for row in rows}, read_log(out / "flight.csv")
@@ -146,7 +146,7 @@ def error(rows, since):
 def test_flight_adapts_under_large_disturbance_as_in_lockstep(backend, dialect, policy, tmp_path):
     with vehicle(backend, dialect, "--disturbance", "large") as (_, address):
         text = output_of(fly(policy, address, tmp_path, backend=backend))
-    figures, rows = find(tmp_path)
+    figures, rows = read_results(tmp_path)
     print(f"{backend}, {dialect}: {error(rows, 15.0).mean():.4f} m, {figures['policies']} policies")
     assert "flight over: landed" in text
     assert figures["policies"] > 10
@@ -165,7 +165,7 @@ HABITS = {
 def test_flight_survives_irregular_messages(habit, policy, tmp_path):
     with vehicle("cyclonedds", "mavros", "--disturbance", "large", *HABITS[habit]) as (_, address):
         text = output_of(fly(policy, address, tmp_path))
-    figures, rows = find(tmp_path)
+    figures, rows = read_results(tmp_path)
     print(f"{habit}: {error(rows, 15.0).mean():.4f} m")
     assert "flight over: landed" in text
     assert figures["fallback_ticks"] <= BUSY * len(rows)
@@ -189,7 +189,7 @@ def test_killed_vehicle_ends_flight_and_successor_is_unaffected(policy, tmp_path
         wait_for_flight(tmp_path, 5.0)
         process.send_signal(signal.SIGKILL)
         text = output_of(flight, fails=True)
-    _, rows = find(tmp_path)
+    _, rows = read_results(tmp_path)
     assert "plant lost: no state has come for 1.5 s; the other pilot has control again" in text
     assert rows[-1, 1] < 12.0
     with vehicle("cyclonedds", "mavros") as (_, address):  # which is found although the killed one is still listed

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from peers import peer
+from peers import start_peer
 from retrim import PlantError, Scenario, testing
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
@@ -35,7 +35,7 @@ def test_targets_equal_those_of_mavros(master):
 @pytest.mark.parametrize("more", [(), ("--poses",)], ids=["odometry", "poses alone"])
 def test_link_conforms(master, more):
     place = (0.3, -0.2, 1.5)
-    with peer("ros", f"http://{master}", "--plant", "simple", "--place", *place, "--yaw", HEADING, *more):
+    with start_peer("ros", f"http://{master}", "--plant", "simple", "--place", *place, "--yaw", HEADING, *more):
         testing.check_vehicle(lambda: Scenario(plant=f"ros:{master}").make("small"), place=place)
 
 
@@ -50,7 +50,7 @@ def test_flight_adapts_under_large_disturbance(master, tmp_path):
     policy, flight = tmp_path / "policy", tmp_path / "flight"
     words = [*RETRIM, "pretrain", "hover", "--preset", "hover/retrim", "--out", str(policy)]
     subprocess.run(words, check=True, capture_output=True, timeout=300)
-    with peer("ros", f"http://{master}", "--disturbance", "large"):
+    with start_peer("ros", f"http://{master}", "--disturbance", "large"):
         words = [*RETRIM, "live", "--policy", str(policy), "--plant", f"ros:{master}", "--seconds", "20"]
         process = subprocess.run([*words, "--out", str(flight)], capture_output=True, text=True, timeout=240)
     assert process.returncode == 0, process.stdout

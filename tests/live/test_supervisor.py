@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from live.test_faults import controller, spec_in  # noqa: F401
+from live.test_faults import controller, make_spec  # noqa: F401
 from live_processes import DT
 from retrim.live import remote_learners
 from retrim.live.supervisor import Supervisor
@@ -36,7 +36,7 @@ def ground_of(folder, base, reply):
 @pytest.mark.parametrize("reason", ["landed", None])
 def test_remote_learners_receive_end_before_bridge_exits(tmp_path, controller, reason):  # noqa: F811
     reply = list[str]()
-    with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
+    with Supervisor(make_spec(tmp_path, controller, learners=ADDRESS)) as flight:
         ground = threading.Thread(target=ground_of, args=(flight.bus.folder, controller.base, reply))
         ground.start()
         while flight.bus.latest("ground") is None:
@@ -49,7 +49,7 @@ def test_remote_learners_receive_end_before_bridge_exits(tmp_path, controller, r
 
 def test_supervisor_does_not_wait_for_lost_remote_learners(tmp_path, controller, monkeypatch):  # noqa: F811
     monkeypatch.setattr(remote_learners, "PARTING", 1000.0)
-    with Supervisor(spec_in(tmp_path, controller, learners=ADDRESS)) as flight:
+    with Supervisor(make_spec(tmp_path, controller, learners=ADDRESS)) as flight:
         folder = flight.bus.folder
         flight.bus.publish("ground", pack_note("ground", base=controller.base, alive={"policy": True}))
         began = time.monotonic()
@@ -77,7 +77,7 @@ class Process:
 
 
 def test_control_has_time_to_publish_last_rows_after_plant_ends(tmp_path, controller):  # noqa: F811
-    with Supervisor(spec_in(tmp_path, controller)) as flight:
+    with Supervisor(make_spec(tmp_path, controller)) as flight:
         control = Process()
         flight.processes = {"recorder": Process(), "control": control, "plant": Process(runs=False)}
         began = time.monotonic()

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from live_helpers import DrillSupervisor, holding, plan
+from live_helpers import DrillSupervisor, hover_source, plan
 from live_processes import DT, HOME, level
 from retrim import ConfigError, PlantError, Scenario, load
 from retrim.evaluation import Fleet
@@ -24,7 +24,7 @@ SECONDS = 1.5
 
 @pytest.fixture(scope="module")
 def controller():
-    return holding()
+    return hover_source()
 
 
 @pytest.fixture

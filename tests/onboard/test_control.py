@@ -10,7 +10,7 @@ import pytest
 from jax import random
 
 from helpers import CheapModel
-from live_helpers import TOPICS, Holds, holding, plan, setup
+from live_helpers import TOPICS, HoverController, hover_source, plan, setup
 from live_processes import DT, HOME, level, move
 from retrim import PlantError
 from retrim.adapt.learner_state import LearnerState
@@ -105,7 +105,7 @@ def test_equals_lockstep_flight_tick_for_tick():
 
 @pytest.mark.parametrize("slow", [False, True])
 def test_only_fast_controller_is_rehearsed(monkeypatch, slow):
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     act, rehearsals = flight.loop.pilot.act, []
     monkeypatch.setattr(flight.loop.pilot, "act", lambda *argument: (time.sleep(0.1 * DT * slow), act(*argument))[1])
     monkeypatch.setattr(flight.loop.pilot, "rehearse", lambda *argument: rehearsals.append(argument))
@@ -122,7 +122,7 @@ def test_only_fast_controller_is_rehearsed(monkeypatch, slow):
 
 
 def test_swap_blends_commands():
-    flight = Flight(holding(), x=level(x=0.4))
+    flight = Flight(hover_source(), x=level(x=0.4))
     flight.step(3)
     before = flight.commands[-1]
     flight.bus.publish("parameters.policy", flight.parameters((1.0, 1.0), 1))
@@ -133,12 +133,12 @@ def test_swap_blends_commands():
     jumps = np.abs(np.diff([before, *result], axis=0)).max(1)
     assert jumps.max() < 0.45 * whole
     # After the blend, the command is that of the new controller.
-    fresh = Flight(holding((1.0, 1.0)), x=flight.x)
+    fresh = Flight(hover_source((1.0, 1.0)), x=flight.x)
     np.testing.assert_allclose(flight.step(), fresh.step(), atol=1e-12)
 
 
 def test_invalid_messages_are_refused_counted_and_reported():
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.step(2)
     good = flight.parameters((3.0, 3.0), 5)
     flight.bus.publish("parameters.policy", good)
@@ -162,7 +162,7 @@ def test_invalid_messages_are_refused_counted_and_reported():
 
 @pytest.mark.parametrize("topic", ["parameters.policy", "sample", "order"])
 def test_damaged_messages_and_random_bytes_are_refused(topic):
-    rng, flight = np.random.default_rng(7), Flight(holding())
+    rng, flight = np.random.default_rng(7), Flight(hover_source())
     flight.step(3)
     now = time.monotonic()
     whole = {
@@ -190,7 +190,7 @@ def test_damaged_messages_and_random_bytes_are_refused(topic):
 
 
 def test_clearly_worse_policy_is_rolled_back():
-    flight = Flight(holding(), push=(0.3, 0.0, 0.0))
+    flight = Flight(hover_source(), push=(0.3, 0.0, 0.0))
     flight.step(200)
     flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
     flight.step(120)
@@ -213,7 +213,7 @@ def test_clearly_worse_policy_is_rolled_back():
 
 
 def test_initial_policy_flies_while_learning_is_disabled():
-    flight, plain = Flight(holding(), x=level(x=0.4)), Flight(holding(), x=level(x=0.4))
+    flight, plain = Flight(hover_source(), x=level(x=0.4)), Flight(hover_source(), x=level(x=0.4))
     flight.bus.publish("parameters.policy", flight.parameters((6.0, 5.0), 1))
     flight.step(100)
     flight.bus.publish("learning", pack_note("learning", paused=True, flown=False))
@@ -233,7 +233,7 @@ def test_initial_policy_flies_while_learning_is_disabled():
 
 
 def test_policy_age_is_that_of_active_policy():
-    flight = Flight(holding(), push=(0.3, 0.0, 0.0), policy_age=5.0)
+    flight = Flight(hover_source(), push=(0.3, 0.0, 0.0), policy_age=5.0)
     flight.step(200)
     # a new policy, which is soon rolled back
     flight.bus.publish("parameters.policy", flight.parameters((-3.0, -1.0), 1))
@@ -241,7 +241,7 @@ def test_policy_age_is_that_of_active_policy():
     assert flight.status["given_up"] == [1]
     assert flight.loop.mode != Mode.POLICY  # the active policy is as old as the flight
     assert "the policy was learned" in flight.status["reason"]
-    late = Flight(holding())
+    late = Flight(hover_source())
     late.step(10)
     message = Parameters("policy", 1, late.loop.plan.controller.base, 1e9, {"gains": np.ones(2)}, 0)
     late.bus.publish("parameters.policy", message.pack())
@@ -250,7 +250,7 @@ def test_policy_age_is_that_of_active_policy():
 
 
 def test_rollback_while_fits_and_policies_arrive():
-    flight = Flight(holding(fit_result=True), push=(0.3, 0.0, 0.0))
+    flight = Flight(hover_source(fit_result=True), push=(0.3, 0.0, 0.0))
     flight.step(200)
     for i in range(1, 120):
         if i % 10 == 1:
@@ -268,7 +268,7 @@ def test_rollback_while_fits_and_policies_arrive():
 
 
 def test_second_swap_during_blend_is_continuous():
-    flight = Flight(holding(), x=level(x=0.4))
+    flight = Flight(hover_source(), x=level(x=0.4))
     flight.step(3)
     before = flight.commands[-1]
     for version, gains in ((1, (1.0, 1.0)), (2, (1.0, 1.0)), (3, (1.0, 1.0))):
@@ -281,7 +281,7 @@ def test_second_swap_during_blend_is_continuous():
 
 
 def test_controller_memory_has_clipped_command():
-    class RecordsAccepted(Holds):
+    class RecordsAccepted(HoverController):
         def init(self, x):
             return jnp.zeros_like(x.p)
 
@@ -298,7 +298,7 @@ def test_controller_memory_has_clipped_command():
 
 
 def test_policy_does_not_resume_after_silence():
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.step(20)
     flight.tick += 10
     flight.step(1)
@@ -308,7 +308,7 @@ def test_policy_does_not_resume_after_silence():
 
 
 def test_missed_tick_is_counted_without_row():
-    flight = Flight(holding(), x=level(x=0.4))
+    flight = Flight(hover_source(), x=level(x=0.4))
     flight.step(10)
     flight.tick += 2
     flight.accepted = flight.accepted + np.eye(4)[0]
@@ -324,14 +324,14 @@ def test_missed_tick_is_counted_without_row():
 
 
 def test_lands_after_time_limit():
-    flight = Flight(holding(), seconds=1.0)
+    flight = Flight(hover_source(), seconds=1.0)
     flight.step(52)
     assert flight.loop.mode != Mode.POLICY
     assert flight.status["reason"] == "landing"
 
 
 def test_disturbance_after_swap_causes_no_rollback():
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.step(100)
     flight.bus.publish("parameters.policy", flight.parameters((3.9, 3.4), 1))
     flight.step(5)
@@ -349,7 +349,7 @@ def test_disturbance_after_swap_causes_no_rollback():
     ],
 )
 def test_exceeded_limit_activates_fallback_and_lands(change, reason):
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.step(20)
     flight.step(1, change=change)
     assert flight.loop.mode == Mode.HOLD
@@ -361,7 +361,7 @@ def test_exceeded_limit_activates_fallback_and_lands(change, reason):
 
 
 def test_nonfinite_command_is_not_issued():
-    source = holding()
+    source = hover_source()
     flight = Flight(dataclasses.replace(source, parameters={"policy": {"gains": np.array([np.nan, 3.5])}}))
     flight.step(30)
     assert np.isfinite(flight.commands).all()
@@ -369,7 +369,7 @@ def test_nonfinite_command_is_not_issued():
 
 
 def test_nonfinite_target_is_replaced_by_last_target(monkeypatch):
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.step(20)
     monkeypatch.setattr(flight.loop.pilot, "target", lambda t: np.array([0.0, np.nan, 1.0]))
     flight.x = level(x=0.4)
@@ -384,7 +384,7 @@ def test_nonfinite_target_is_replaced_by_last_target(monkeypatch):
 
 
 def test_holds_position_without_target(monkeypatch):
-    flight = Flight(holding(), x=level(x=0.4))
+    flight = Flight(hover_source(), x=level(x=0.4))
     monkeypatch.setattr(flight.loop.pilot, "target", lambda t: np.full(3, np.inf))
     flight.step(50)
     np.testing.assert_array_equal(Setpoint.unpack(flight.bus.latest("setpoint").data).target, level(x=0.4)[:3])
@@ -392,7 +392,7 @@ def test_holds_position_without_target(monkeypatch):
 
 
 def test_refused_measurement_leads_to_level_descent():
-    flight = Flight(holding(), x=level(x=0.4))
+    flight = Flight(hover_source(), x=level(x=0.4))
     flight.step(20)
     now, modes = time.monotonic(), []
     for tick in range(20, 130):
@@ -415,7 +415,7 @@ def test_refused_measurement_leads_to_level_descent():
 
 
 def test_last_tick_before_crash_is_reported():
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.step(20)
     flight.x = level(np.array([0.0, 0.0, -1.0]))
     flight.bus.publish("sample", flight.measurement(time.monotonic()).pack())
@@ -431,7 +431,7 @@ def test_last_tick_before_crash_is_reported():
 
 
 def test_all_ticks_are_reported_before_final_command(monkeypatch):
-    flight, last = Flight(holding()), []
+    flight, last = Flight(hover_source()), []
     flight.step(20)
     flight.loop.land("landing")
     publish = flight.bus.publish
@@ -449,7 +449,7 @@ def test_all_ticks_are_reported_before_final_command(monkeypatch):
 
 
 def test_levels_then_lands_by_clock_without_measurements():
-    flight = Flight(holding(), state_age=0.1)
+    flight = Flight(hover_source(), state_age=0.1)
     flight.step(20)
     now = time.monotonic()
     result = [flight.loop.tick(now + 0.02 * i) for i in range(1, 140)]
@@ -468,14 +468,14 @@ def test_levels_then_lands_by_clock_without_measurements():
 
 
 def test_lost_sample_holds_command():
-    flight = Flight(holding(), x=level(x=0.4))
+    flight = Flight(hover_source(), x=level(x=0.4))
     flight.step(5)
     hold = flight.loop.tick(time.monotonic())
     np.testing.assert_array_equal(hold.u, flight.commands[-1])
 
 
 def test_report_has_last_ticks_and_accepted_commands():
-    flight = Flight(holding(), x=level(x=0.4), window=30)
+    flight = Flight(hover_source(), x=level(x=0.4), window=30)
     flight.step(20)
     flight.accepted = flight.accepted + np.eye(4)[0] / 2  # the plant accepted a different command
     flight.step(20)
@@ -487,7 +487,7 @@ def test_report_has_last_ticks_and_accepted_commands():
 
 @pytest.mark.parametrize("slow", ["act", "target"])
 def test_too_slow_controller_does_not_take_off(monkeypatch, slow):
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.loop.warm_up()
     part = getattr(flight.loop.pilot, slow)
     monkeypatch.setattr(flight.loop.pilot, slow, lambda *argument: time.sleep((SHARE - PHASE) * DT) or part(*argument))
@@ -496,7 +496,7 @@ def test_too_slow_controller_does_not_take_off(monkeypatch, slow):
 
 
 def test_land_command():
-    flight = Flight(holding())
+    flight = Flight(hover_source())
     flight.step(20)
     flight.bus.publish("order", pack_note("order", order="land"))
     flight.step(250)

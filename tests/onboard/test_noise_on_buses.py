@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bus_ends import LOCAL, NETWORK, await_message, two_ends
-from live_helpers import holding
+from live_helpers import hover_source
 from retrim.onboard.messages import Parameters
 from retrim.onboard.parameter_receiver import ParameterReceiver
 from retrim.onboard.pilot import LivePilot
@@ -14,7 +14,7 @@ EACH, FEWER = 1000, 200  # messages of a kind; the bus does not look into them, 
 
 @pytest.mark.parametrize("backend", [*LOCAL, *NETWORK])
 def test_mutated_parameters_and_random_bytes_are_refused(backend):
-    rng, source = np.random.default_rng(11), holding()
+    rng, source = np.random.default_rng(11), hover_source()
     count = 2 * (EACH if backend in LOCAL else FEWER)
     whole = Parameters("policy", 99, source.base, 0.0, {"gains": np.array([-9.0, -9.0])}).pack()
     room = {"parameters.policy": 10_000}

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from fake_ros2 import FakeNetwork, Talker
+from fake_ros2 import FakeNetwork, RemoteNode
 from retrim import ConfigError, PlantError, Scenario
 from retrim.plants.bridges import frames, ros2
 from retrim.plants.bridges.ros2_address import Ros2Address, address_of
@@ -34,8 +34,8 @@ def network():
 
 
 @pytest.fixture
-def talker(network):
-    return Talker(network)
+def remote(network):
+    return RemoteNode(network)
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def stamped(message, t):
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(1e9 * t), 10**9)
 
 
-def odometry(talker, t=1.0, p=(1.0, 2.0, 3.0), q=NORTH_IN_ROS, v=(0.4, 0.0, 0.0), rates=(0.1, 0.2, 0.3), child="base"):
+def odometry(remote, t=1.0, p=(1.0, 2.0, 3.0), q=NORTH_IN_ROS, v=(0.4, 0.0, 0.0), rates=(0.1, 0.2, 0.3), child="base"):
     def fill(m):
         stamped(m, t)
         m.header.frame_id, m.child_frame_id = "map", child
@@ -61,11 +61,11 @@ def odometry(talker, t=1.0, p=(1.0, 2.0, 3.0), q=NORTH_IN_ROS, v=(0.4, 0.0, 0.0)
         o = m.pose.pose.orientation
         o.x, o.y, o.z, o.w = q
 
-    talker.says(ODOM, ODOMETRY, fill)
+    remote.publish(ODOM, ODOMETRY, fill)
 
 
-def vehicle(talker, t=1.0, p=(1.0, 2.0, -3.0), q=NORTH, v=(0.4, 0.5, 0.6), rates=(0.1, 0.2, 0.3), frame=1, of_v=1):
-    talker.says(
+def vehicle(remote, t=1.0, p=(1.0, 2.0, -3.0), q=NORTH, v=(0.4, 0.5, 0.6), rates=(0.1, 0.2, 0.3), frame=1, of_v=1):
+    remote.publish(
         STATE, "px4_msgs/msg/VehicleOdometry", timestamp_sample=round(1e6 * t), pose_frame=frame, velocity_frame=of_v,
         position=np.array(p, np.float32), q=np.array(q, np.float32), velocity=np.array(v, np.float32),
         angular_velocity=np.array(rates, np.float32),
@@ -75,8 +75,8 @@ def vehicle(talker, t=1.0, p=(1.0, 2.0, -3.0), q=NORTH, v=(0.4, 0.5, 0.6), rates
 # ---- states
 
 
-def test_px4_state_is_converted_to_retrim_frames(talker, px4):
-    vehicle(talker)
+def test_px4_state_is_converted_to_retrim_frames(remote, px4):
+    vehicle(remote)
     x = px4.reading
     np.testing.assert_allclose(x.p, [2.0, 1.0, 3.0])  # east, north, up
     np.testing.assert_allclose(x.v, [0.5, 0.4, -0.6], rtol=1e-6)
@@ -84,16 +84,16 @@ def test_px4_state_is_converted_to_retrim_frames(talker, px4):
     assert frames.heading_of(x.R) == pytest.approx(math.pi / 2)  # counter-clockwise from east
 
 
-def test_px4_quaternions_begin_with_w(talker, px4):
-    vehicle(talker, q=(HALF, 0.0, 0.0, HALF))  # a quarter turn to the right, from north to east
+def test_px4_quaternions_begin_with_w(remote, px4):
+    vehicle(remote, q=(HALF, 0.0, 0.0, HALF))  # a quarter turn to the right, from north to east
     np.testing.assert_allclose(px4.reading.R, np.eye(3), atol=1e-6)
-    vehicle(talker, t=2.0, q=(math.cos(0.1), math.sin(0.1), 0.0, 0.0))  # right side down, nose to the north
+    vehicle(remote, t=2.0, q=(math.cos(0.1), math.sin(0.1), 0.0, 0.0))  # right side down, nose to the north
     up = px4.reading.R[:, 2]
     np.testing.assert_allclose(up, [math.sin(0.2), 0.0, math.cos(0.2)], atol=1e-6)  # the thrust points to the east
 
 
-def test_px4_velocity_may_be_in_body_frame(talker, px4):
-    vehicle(talker, q=(HALF, 0.0, 0.0, HALF), v=(1.0, 2.0, 3.0), of_v=3)  # nose to the east: forward, right, down
+def test_px4_velocity_may_be_in_body_frame(remote, px4):
+    vehicle(remote, q=(HALF, 0.0, 0.0, HALF), v=(1.0, 2.0, 3.0), of_v=3)  # nose to the east: forward, right, down
     np.testing.assert_allclose(px4.reading.v, [1.0, -2.0, -3.0], atol=1e-6)
 
 
@@ -101,14 +101,14 @@ def test_px4_velocity_may_be_in_body_frame(talker, px4):
     ({"frame": 0}, "in frame 0"), ({"of_v": 0}, "velocities in frame 0"), ({"p": (math.nan, 0, 0)}, "not finite"),
     ({"q": (0, 0, 0, 0)}, "without an attitude"), ({"rates": (0, math.inf, 0)}, "not finite"),
 ])  # fmt: skip
-def test_implausible_px4_states_are_ignored(talker, px4, bad, why):
-    vehicle(talker, **bad)
+def test_implausible_px4_states_are_ignored(remote, px4, bad, why):
+    vehicle(remote, **bad)
     assert (px4.reading, px4.ignored) == (None, 1)
     assert why in px4.notes[0]
 
 
-def test_mavros_has_retrim_frames_and_quaternions_end_with_w(talker, mavros):
-    odometry(talker)
+def test_mavros_has_retrim_frames_and_quaternions_end_with_w(remote, mavros):
+    odometry(remote)
     x = mavros.reading
     np.testing.assert_allclose(x.p, [1.0, 2.0, 3.0])
     np.testing.assert_allclose(x.R[:, 0], [0.0, 1.0, 0.0], atol=1e-9)  # the nose points to the north
@@ -117,13 +117,13 @@ def test_mavros_has_retrim_frames_and_quaternions_end_with_w(talker, mavros):
 
 
 @pytest.mark.parametrize("child", ["map", ""])
-def test_twist_in_world_frame_is_recognised(talker, mavros, child):
-    odometry(talker, child=child)
+def test_twist_in_world_frame_is_recognised(remote, mavros, child):
+    odometry(remote, child=child)
     np.testing.assert_allclose(mavros.reading.v, [0.4, 0.0, 0.0])
     np.testing.assert_allclose(mavros.reading.omega, [0.2, -0.1, 0.3], atol=1e-9)
 
 
-def test_px4_and_mavros_give_same_state(talker, network):
+def test_px4_and_mavros_give_same_state(remote, network):
     """One state, from PX4 and from mavros."""
     px4, mavros = Px4Link(network.node(), address_of("px4")), MavrosLink(network.node(), address_of("mavros"))
     rng = np.random.default_rng(3)
@@ -133,16 +133,16 @@ def test_px4_and_mavros_give_same_state(talker, network):
     R = frames.attitude_of(q)  # q of PX4
     from scipy.spatial.transform import Rotation
 
-    vehicle(talker, p=p, q=q, v=v, rates=rates)
+    vehicle(remote, p=p, q=q, v=v, rates=rates)
     odometry(
-        talker, p=frames.turned_world(p), q=Rotation.from_matrix(R).as_quat(), rates=frames.turned_body(rates),
+        remote, p=frames.turned_world(p), q=Rotation.from_matrix(R).as_quat(), rates=frames.turned_body(rates),
         v=R.T @ frames.turned_world(v),
     )  # fmt: skip
     for mine, other in zip(px4.reading[1:], mavros.reading[1:], strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-5)
 
 
-def test_velocities_follow_from_poses_without_odometry(talker, mavros):
+def test_velocities_follow_from_poses_without_odometry(remote, mavros):
     def pose(k):
         def fill(m):
             stamped(m, 100.0 + 0.01 * k)
@@ -152,30 +152,30 @@ def test_velocities_follow_from_poses_without_odometry(talker, mavros):
         return fill
 
     for k in range(40):
-        talker.says(POSES, POSE, pose(k))
+        remote.publish(POSES, POSE, pose(k))
         time.sleep(0.01)
     np.testing.assert_allclose(mavros.reading.v, [2.0, 0.0, 0.0], atol=0.4)  # the first times are those of arrival
     np.testing.assert_allclose(mavros.reading.omega, [0.0, 0.0, 1.0], atol=0.3)
-    odometry(talker, t=200.0)
-    talker.says(POSES, POSE, pose(60))
+    odometry(remote, t=200.0)
+    remote.publish(POSES, POSE, pose(60))
     np.testing.assert_allclose(mavros.reading.p, [1.0, 2.0, 3.0])  # odometry is recent
 
 
-def test_reordered_and_duplicate_states_are_ignored(talker, px4):
+def test_reordered_and_duplicate_states_are_ignored(remote, px4):
     for t, p in ((1.00, 0.0), (1.02, 2.0), (1.01, 1.0), (1.02, 9.0), (1.04, 4.0), (1.03, 3.0)):
-        vehicle(talker, t=t, p=(0.0, p, 0.0))
+        vehicle(remote, t=t, p=(0.0, p, 0.0))
         assert px4.reading.p[0] in (0.0, 2.0, 4.0)
     assert px4.reading.p[0] == 4.0
     assert px4.clock_jumps == 0
 
 
 @pytest.mark.parametrize("jump", [-3600.0, -0.2, 0.7, 3600.0])
-def test_adjusted_clock_is_followed_within_three_states(talker, px4, jump):
+def test_adjusted_clock_is_followed_within_three_states(remote, px4, jump):
     for k in range(20):
-        vehicle(talker, t=5000.0 + 0.01 * k)
+        vehicle(remote, t=5000.0 + 0.01 * k)
         time.sleep(0.01)
     for k in range(20, 26):
-        vehicle(talker, t=5000.0 + 0.01 * k + jump, p=(0.0, k, 0.0))
+        vehicle(remote, t=5000.0 + 0.01 * k + jump, p=(0.0, k, 0.0))
         time.sleep(0.01)
     now = time.monotonic()
     assert px4.clock_jumps == 1
@@ -184,58 +184,58 @@ def test_adjusted_clock_is_followed_within_three_states(talker, px4, jump):
     assert now - px4.last_message < 0.1
 
 
-def test_state_without_stamp_has_arrival_time(talker, mavros):
+def test_state_without_stamp_has_arrival_time(remote, mavros):
     for _ in range(3):
-        odometry(talker, t=0.0)
+        odometry(remote, t=0.0)
         assert 0.0 <= time.monotonic() - mavros.reading.stamp < 0.05
 
 
 # ---- setpoints
 
 
-def test_setpoints_are_converted_to_px4_frames(talker, px4):
+def test_setpoints_are_converted_to_px4_frames(remote, px4):
     rates, wish, place = (
         "/fmu/in/vehicle_rates_setpoint",
         "/fmu/in/offboard_control_mode",
         "/fmu/in/trajectory_setpoint",
     )
     for topic in (rates, wish, place):
-        talker.hears(topic, f"px4_msgs/msg/{TOPICS[topic.rpartition('/')[2]]}")
+        remote.subscribe(topic, f"px4_msgs/msg/{TOPICS[topic.rpartition('/')[2]]}")
     px4.fly_rates(0.3, np.array([0.1, 0.2, 0.4]))
-    (m,), (mode,) = talker.kept[rates], talker.kept[wish]
+    (m,), (mode,) = remote.messages[rates], remote.messages[wish]
     np.testing.assert_allclose([m.roll, m.pitch, m.yaw], [0.1, -0.2, -0.4], rtol=1e-6)
     np.testing.assert_allclose(m.thrust_body, [0.0, 0.0, -0.3], rtol=1e-6)  # upwards
     assert (mode.position, mode.body_rate, mode.attitude, mode.direct_actuator) == (False, True, False, False)
     assert abs(1e-6 * m.timestamp - time.time()) < 5.0
     px4.fly_to(np.array([1.0, 2.0, 3.0]), math.pi / 2)
-    (m,), mode = talker.kept[place], talker.kept[wish][-1]
+    (m,), mode = remote.messages[place], remote.messages[wish][-1]
     np.testing.assert_allclose(m.position, [2.0, 1.0, -3.0])
     assert m.yaw == pytest.approx(0.0, abs=1e-6)  # north
     assert all(np.isnan(each).all() for each in (m.velocity, m.acceleration, m.jerk, m.yawspeed))
     assert (mode.position, mode.body_rate) == (True, False)
 
 
-def test_vehicle_command_addresses_any_system(talker, px4):
-    talker.hears("/fmu/in/vehicle_command", "px4_msgs/msg/VehicleCommand")
+def test_vehicle_command_addresses_any_system(remote, px4):
+    remote.subscribe("/fmu/in/vehicle_command", "px4_msgs/msg/VehicleCommand")
     px4.command(176, 1.0, 6.0)
-    (m,) = talker.kept["/fmu/in/vehicle_command"]
+    (m,) = remote.messages["/fmu/in/vehicle_command"]
     assert (m.command, m.param1, m.param2, m.param3, m.from_external) == (176, 1.0, 6.0, 0.0, True)
     assert (m.target_system, m.target_component) == (0, 0)
 
 
-def test_mavros_target_has_rates_in_retrim_frame(talker, mavros):
-    talker.hears(ATTITUDE, TARGET)
+def test_mavros_target_has_rates_in_retrim_frame(remote, mavros):
+    remote.subscribe(ATTITUDE, TARGET)
     mavros.fly_rates(0.3, np.array([0.1, 0.2, 0.4]))
-    (m,) = talker.kept[ATTITUDE]
+    (m,) = remote.messages[ATTITUDE]
     assert (m.body_rate.x, m.body_rate.y, m.body_rate.z) == (0.1, 0.2, 0.4)
     assert m.thrust == pytest.approx(0.3)
     assert m.type_mask == 128  # ignore the attitude
     assert abs(m.header.stamp.sec - time.time()) < 5.0
 
 
-def test_mode_is_read(talker, px4):
+def test_mode_is_read(remote, px4):
     for armed, offboard in ((False, False), (True, False), (True, True)):
-        talker.says(
+        remote.publish(
             CONTROL, "px4_msgs/msg/VehicleControlMode", flag_armed=armed, flag_control_offboard_enabled=offboard
         )
         assert (px4.armed, px4.mode[0] == 6) == (armed, offboard)
@@ -250,37 +250,37 @@ def test_quality_of_service_equals_px4(px4, mavros):
 # ---- versions
 
 
-def answer_format_requests(talker, release="newest", known=True):
+def answer_format_requests(remote, release="newest", known=True):
     """Answer requests for the formats of PX4's inputs."""
 
     def answer(m):
         topic = bytes(m.topic_name).split(b"\0")[0].decode()
         value = px4_hash(f"px4_msgs/msg/{TOPICS[topic.rpartition('/')[2]]}", release)
-        talker.says(
+        remote.publish(
             "/fmu/out/message_format_response", "px4_msgs/msg/MessageFormatResponse", protocol_version=1,
             topic_name=m.topic_name, success=known, message_hash=value,
         )  # fmt: skip
 
-    talker.hears("/fmu/in/message_format_request", "px4_msgs/msg/MessageFormatRequest", answer)
+    remote.subscribe("/fmu/in/message_format_request", "px4_msgs/msg/MessageFormatRequest", answer)
 
 
-def test_formats_of_firmware_are_requested(talker, px4):
-    answer_format_requests(talker)
+def test_formats_of_firmware_are_requested(remote, px4):
+    answer_format_requests(remote)
     assert px4.format_fault() == ""
-    assert len(talker.kept["/fmu/in/message_format_request"]) == len(TOPICS)
+    assert len(remote.messages["/fmu/in/message_format_request"]) == len(TOPICS)
     assert px4.notes == []
 
 
-def test_firmware_of_other_release_is_refused(talker, px4, network):
-    answer_format_requests(talker, "1.14")
+def test_firmware_of_other_release_is_refused(remote, px4, network):
+    answer_format_requests(remote, "1.14")
     fault = px4.format_fault()
     assert "/fmu/in/vehicle_command: px4_msgs/msg/VehicleCommand is that of px4_msgs 1.14 (before 1.15)" in fault
     assert "in the firmware, and of px4_msgs 1.15 or later here" in fault
     assert Px4Link(network.node(), address_of("px4-1.14")).format_fault() == ""
 
 
-def test_missing_input_of_firmware_is_refused(talker, px4):
-    answer_format_requests(talker, known=False)
+def test_missing_input_of_firmware_is_refused(remote, px4):
+    answer_format_requests(remote, known=False)
     assert px4.format_fault().startswith("PX4 has no input /fmu/in/vehicle_rates_setpoint")
 
 
@@ -311,7 +311,7 @@ def connects(monkeypatch, network):
 
 
 @pytest.fixture
-def periodic(talker):
+def periodic(remote):
     """Return a context that repeats a call at 100 Hz or less."""
     over = threading.Event()
 
@@ -320,7 +320,7 @@ def periodic(talker):
             k = 0
             while not over.wait(1.0 / rate):
                 k += 1
-                say(talker, t=1000.0 + k / rate)
+                say(remote, t=1000.0 + k / rate)
 
         threading.Thread(target=go, daemon=True).start()
 
@@ -329,14 +329,14 @@ def periodic(talker):
     time.sleep(0.05)
 
 
-def subscribe_to_setpoints(talker, release="newest"):
+def subscribe_to_setpoints(remote, release="newest"):
     for topic, name in TOPICS.items():
-        talker.hears(f"/fmu/in/{topic}", f"px4_msgs/msg/{name}", release=release)
+        remote.subscribe(f"/fmu/in/{topic}", f"px4_msgs/msg/{name}", release=release)
 
 
-def test_available_vehicle_is_connected(connects, periodic, talker):
-    subscribe_to_setpoints(talker)
-    answer_format_requests(talker)
+def test_available_vehicle_is_connected(connects, periodic, remote):
+    subscribe_to_setpoints(remote)
+    answer_format_requests(remote)
     periodic(vehicle)
     assert connects("px4").notes == ()
 
@@ -349,24 +349,24 @@ def test_missing_vehicle_is_reported(connects):
 
 
 def test_states_of_other_release_are_refused(connects, periodic):
-    def old(talker, t):
-        talker.says(STATE, "px4_msgs/msg/VehicleOdometry", release="1.13")
+    def old(remote, t):
+        remote.publish(STATE, "px4_msgs/msg/VehicleOdometry", release="1.13")
 
     periodic(old)
     with pytest.raises(PlantError, match=r"px4_msgs 1\.13 \(before 1\.14\); this end has px4_msgs 1\.14 or"):
         connects("px4")
 
 
-def test_subscriber_of_other_release_is_refused(connects, periodic, talker):
-    subscribe_to_setpoints(talker, "1.14")
+def test_subscriber_of_other_release_is_refused(connects, periodic, remote):
+    subscribe_to_setpoints(remote, "1.14")
     periodic(vehicle)
     with pytest.raises(PlantError, match=r"VehicleCommand is that of px4_msgs 1\.14 .* use the same px4_msgs"):
         connects("px4")
 
 
-def test_connection_to_firmware_of_other_release_is_refused(connects, periodic, talker):
-    subscribe_to_setpoints(talker)
-    answer_format_requests(talker, "1.14")
+def test_connection_to_firmware_of_other_release_is_refused(connects, periodic, remote):
+    subscribe_to_setpoints(remote)
+    answer_format_requests(remote, "1.14")
     periodic(vehicle)
     with pytest.raises(PlantError, match=r"in the firmware, .* name the firmware's release, as in ros2:px4-1\.14"):
         connects("px4")
@@ -378,15 +378,15 @@ def test_setpoints_without_subscriber_are_refused(connects, periodic):
         connects("px4")
 
 
-def test_rare_states_are_refused(connects, periodic, talker):
-    subscribe_to_setpoints(talker)
+def test_rare_states_are_refused(connects, periodic, remote):
+    subscribe_to_setpoints(remote)
     periodic(vehicle, rate=5.0)
     with pytest.raises(PlantError, match=r"states come at \d Hz; at least 15 Hz are needed on /fmu/out"):
         connects("px4")
 
 
-def test_two_publishers_of_state_are_refused(connects, periodic, talker, network):
-    subscribe_to_setpoints(talker)
+def test_two_publishers_of_state_are_refused(connects, periodic, remote, network):
+    subscribe_to_setpoints(remote)
     periodic(vehicle)
     network.node().advertise(STATE, message_type("px4_msgs/msg/VehicleOdometry"), SENSOR)
     with pytest.raises(PlantError, match="several nodes publish /fmu/out/vehicle_odometry"):
@@ -425,20 +425,20 @@ def test_wrong_address_is_refused_before_flight(text):
 
 
 @pytest.mark.parametrize("reports", [False, True])
-def test_thrust_scale_is_from_autopilot_or_vehicle_file(network, talker, reports):
+def test_thrust_scale_is_from_autopilot_or_vehicle_file(network, remote, reports):
     vehicle = Scenario(plant="simple").make_vehicle("small")
     strongest = float(vehicle.thrust_max / vehicle.mass)
     plant = Scenario(plant="ros2:px4").make("small")
     plant._link = link = Px4Link(network.node(), address_of("px4"))
     for _ in range(10 * reports):
-        talker.says(
+        remote.publish(
             "/fmu/out/vehicle_thrust_setpoint", "px4_msgs/msg/VehicleThrustSetpoint",
             xyz=np.array([0.0, 0.0, -0.4], np.float32),
         )  # fmt: skip
     plant._learn_thrust()
     assert plant.thrust.hover == pytest.approx(0.4 if reports else 9.81 / strongest, rel=1e-3)
-    talker.hears("/fmu/in/vehicle_rates_setpoint", "px4_msgs/msg/VehicleRatesSetpoint")
+    remote.subscribe("/fmu/in/vehicle_rates_setpoint", "px4_msgs/msg/VehicleRatesSetpoint")
     accepted = plant.send(np.array([9.81, 0.0, 0.0, 0.0]))
     assert accepted[0] == pytest.approx(9.81)
-    assert talker.kept["/fmu/in/vehicle_rates_setpoint"][0].thrust_body[2] == pytest.approx(-plant.thrust.hover)
+    assert remote.messages["/fmu/in/vehicle_rates_setpoint"][0].thrust_body[2] == pytest.approx(-plant.thrust.hover)
     link.close()

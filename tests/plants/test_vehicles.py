@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from peers import peer
+from peers import start_peer
 from retrim import Command, ConfigError, PlantError, Scenario, State, testing
 from retrim.config.plants import find_plant, is_vehicle
 from retrim.plants.bridges import crazyflie, mavlink
@@ -20,15 +20,15 @@ PORT = 24560
 against_the_clock = pytest.mark.slow
 
 
-def start_vehicle(speaks="mavlink", *words, port=PORT):
+def start_vehicle(protocol="mavlink", *words, port=PORT):
     """Start a process that simulates an autopilot and its vehicle."""
-    if speaks == "mavlink" and importlib.util.find_spec("pymavlink") is None:
+    if protocol == "mavlink" and importlib.util.find_spec("pymavlink") is None:
         pytest.skip("the extra mavlink is not installed")
-    return peer(speaks, "--plant", "simple", "--port", port, *words)
+    return start_peer(protocol, "--plant", "simple", "--port", port, *words)
 
 
-def link(port=PORT, speaks="mavlink", **changes):
-    return Scenario(plant=f"{speaks}:udp:127.0.0.1:{port}", **changes).make("small")
+def link(port=PORT, protocol="mavlink", **changes):
+    return Scenario(plant=f"{protocol}:udp:127.0.0.1:{port}", **changes).make("small")
 
 
 @against_the_clock

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_log import settings_say
+from firmware_log import compute_response
 from retrim import Scenario
 from retrim.errors import LogError
 from retrim.io.logs import read_log
@@ -31,7 +31,7 @@ def test_board_log_is_read_to_its_end(log):
 
 def test_values_are_within_a_tenth_of_settings(log, monkeypatch):
     monkeypatch.setattr(body_identification, "DRAWS", 8)
-    lag, _, hover = settings_say(LOG, Scenario(plant="betaflight").make("small")._model)
+    lag, _, hover = compute_response(LOG, Scenario(plant="betaflight").make("small")._model)
     result = identify_body(log)
     assert result.vehicle.rate_lag.value == pytest.approx(lag, rel=TENTH)
     assert result.vehicle.rate_gain.value == pytest.approx(1.0, rel=TENTH)

@@ -21,7 +21,7 @@ TARGET = "mavros_msgs/msg/AttitudeTarget"
 
 
 @pytest.fixture(autouse=True)
-def on_this_machine(monkeypatch):
+def limit_discovery(monkeypatch):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_DOMAIN_ID", "77")
 
@@ -54,14 +54,14 @@ def until(condition, again=lambda: None, patience=15.0):
 @pytest.mark.parametrize("qos", [SENSOR, COMMAND], ids=["sensor", "command"])
 def test_messages_arrive_unchanged(nodes, name, qos):
     here, there = nodes
-    kind, kept = message_type(name), []
+    kind, messages = message_type(name), []
     message = kind.new()
     if name == TARGET:
         message.thrust, message.header.frame_id = 0.25, "map"
     publish = here.advertise("/quad1/topic", kind, qos)
-    there.subscribe("/quad1/topic", kind, SENSOR, kept.append)
-    until(lambda: kept, lambda: publish(kind.encode(message)))
-    assert kind.encode(kind.decode(kept[0])) == kind.encode(message)
+    there.subscribe("/quad1/topic", kind, SENSOR, messages.append)
+    until(lambda: messages, lambda: publish(kind.encode(message)))
+    assert kind.encode(kind.decode(messages[0])) == kind.encode(message)
 
 
 def test_other_ends_are_found_with_type_and_hash(nodes):
