@@ -1,4 +1,4 @@
-"""Exported policies survive numbers that are not finite, as the controller in JAX does, tick by tick."""
+"""Exported policies treat invalid numbers like the controller in JAX, tick by tick."""
 
 import shutil
 import subprocess
@@ -51,14 +51,14 @@ def setup():
 
 @pytest.fixture(scope="module")
 def policy(setup):
-    """Weights large enough that commands move."""
+    """Return a policy with large weights, so that commands change."""
     fresh = setup.new_policy(random.key(0))
     return fresh.with_params(jax.tree.map(lambda leaf: jnp.asarray(12.0 * np.asarray(leaf)), fresh.layers))
 
 
 @pytest.fixture(scope="module")
 def folder(policy, setup, tmp_path_factory):
-    """The policy in every format."""
+    """Return a folder with the policy in every format."""
     place = tmp_path_factory.mktemp("formats")
     save_policy(place / "policy.safetensors", policy, setup.preset)
     for to, name in (("npz", "quad.npz"), ("c", "quad.h")):
@@ -69,7 +69,7 @@ def folder(policy, setup, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def good():
-    """Rows of p, R, v."""
+    """Return valid rows of p, R, v."""
     rng = np.random.default_rng(5)
     p, v, phi = (0.5 * rng.normal(size=(BEFORE + AFTER, 3)) for _ in range(3))
     R = np.asarray(jax.jit(jax.vmap(exp))(phi)).reshape(-1, 9)
@@ -77,7 +77,7 @@ def good():
 
 
 def sequence(good, kind, ticks, place):
-    """Good ticks, bad ones, good ones again; and which ticks are good."""
+    """Return valid, bad and again valid ticks, and a flag of validity for each."""
     bad = np.repeat(good[BEFORE - 1 : BEFORE], ticks, axis=0)
     frozen = NUMBERS[kind] is None
     if not frozen:
@@ -120,8 +120,8 @@ CASES = [(kind, ticks, place) for kind in NUMBERS for ticks, place in ((1, 0), (
 @pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
 def test_jax_controller_ignores_bad_ticks(kind, ticks, place, plain, good):
     rows, fine = sequence(good, kind, ticks, place)
-    result, message = commands(FiniteController(plain), rows)
-    np.testing.assert_array_equal(message, fine)
+    result, flags = commands(FiniteController(plain), rows)
+    np.testing.assert_array_equal(flags, fine)
     expected, _ = commands(plain, rows[fine])
     np.testing.assert_allclose(result[fine], expected, rtol=1e-12)
     for tick in np.flatnonzero(~fine):
@@ -130,7 +130,7 @@ def test_jax_controller_ignores_bad_ticks(kind, ticks, place, plain, good):
 
 @pytest.mark.parametrize(("kind", "ticks", "place"), CASES)
 def test_c_and_numpy_equal_jax(kind, ticks, place, plain, good, folder, programs, setup):
-    """Also under -ffast-math, and without a word of the sanitizers."""
+    """This includes a program with -ffast-math and one with sanitizers, which report no fault."""
     rows, fine = sequence(good, kind, ticks, place)
     expected, _ = commands(FiniteController(plain), rows)
     low, high = (np.asarray(u.vector()) for u in (plain.policy.u_min, plain.policy.u_max))
@@ -157,7 +157,7 @@ def test_finite_controller_conforms(plain):
 
 
 def test_flight_may_begin_with_bad_ticks(plain, good, folder, programs):
-    """Hover is the last command then."""
+    """Hover is then the last command."""
     rows = np.concatenate([np.full((2, 15), np.nan), good[:3]])
     expected, _ = commands(FiniteController(plain), rows)
     np.testing.assert_allclose(expected[:2], [[9.81, 0.0, 0.0, 0.0]] * 2)

@@ -1,6 +1,6 @@
-"""The companion computer of the examples flies an exported policy, and gives up when it must not go on.
+"""The companion program of the examples flies an exported policy, and exits after a fault.
 
-The flights need real time, so they are slow.
+The flights run in real time, so they are slow.
 """
 
 import os
@@ -93,7 +93,7 @@ def test_messages_equal_pymavlink(untrained):
     out = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
     stranger = mavlink.MAVLink(None, srcSystem=8, srcComponent=1)
     nan = [float("nan")] * 21
-    turned = [0.5**0.5, 0.0, 0.0, 0.5**0.5]  # the nose to the east
+    turned = [0.5**0.5, 0.0, 0.0, 0.5**0.5]  # nose to the east
 
     def odometry(sender, north, frame=1):
         message = sender.odometry_encode(1, frame, 1, north, 2.0, -3.0, turned, 0.1, 0.2, -0.3, 0, 0, 0, nan, nan)
@@ -134,13 +134,13 @@ def test_messages_equal_pymavlink(untrained):
 
 
 class Flight:
-    """Start a pilot, the autopilot of a peer, and the program."""
+    """A pilot, the autopilot of a peer, and the program."""
 
     def __init__(self, peer, process):
         self.peer, self.process = peer, process
 
     def run(self, seconds):
-        """Fly on; return the largest distance from the goal."""
+        """Continue the flight; return the largest distance from the goal."""
         began, worst = time.monotonic(), 0.0
         for tick in range(1, round(100 * seconds) + 1):
             self.peer.step()
@@ -149,7 +149,7 @@ class Flight:
         return worst
 
     def hand_over(self):
-        """Take off to the goal by the autopilot, and select offboard mode."""
+        """Take off to the goal with the autopilot, and select offboard mode."""
         self.peer._place, self.peer._yaw = GOAL, EAST
         self.peer.armed = True
         self.run(7.0)
@@ -201,7 +201,7 @@ def test_program_hovers_before_and_after_pilot_takes_over(flight):
 @pytest.mark.slow
 @pytest.mark.parametrize("cause", ["no state", "a pause of the program"])
 def test_watchdog_ends_flight(cause, flight):
-    """PX4 falls back by itself, and the program does not return."""
+    """PX4 leaves offboard mode, and the program does not continue."""
     flight.hand_over()
     if cause == "no state":
         flight.peer.cut = True
@@ -224,14 +224,14 @@ SIH = Path(__file__).parents[2] / "examples" / "px4_sih.toml"
 
 
 class Px4Pilot:
-    """Fly PX4's simulation with position setpoints, and send the poses of a motion capture system."""
+    """A pilot of PX4's simulation with position setpoints and a motion capture system."""
 
     def __init__(self):
         self.cameras = MotionCapture()
         self.link = self.cameras.link
 
     def run(self, seconds, *, place=None):
-        """Fly on; return the true positions every 0.1 s."""
+        """Continue the flight; return the true positions every 0.1 s."""
         positions = []
         for _ in range(round(10 * seconds)):
             if place is not None:

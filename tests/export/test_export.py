@@ -1,4 +1,4 @@
-"""An exported policy computes what JAX computes, in every format, and says so; one that does not is refused."""
+"""An exported policy equals JAX in every format; a file with different results is refused."""
 
 import ast
 import shutil
@@ -40,7 +40,7 @@ def setup():
 
 @pytest.fixture(scope="module")
 def policy(setup):
-    """Weights large enough that commands reach their limits."""
+    """Return a policy with large weights, so that commands reach their limits."""
     fresh = setup.new_policy(random.key(0))
     growth = jax.tree.map(lambda leaf: jnp.asarray(6.0 * np.asarray(leaf)), fresh.layers)
     return fresh.with_params(growth)
@@ -67,17 +67,17 @@ def test_every_format_equals_jax(to, policy, setup, policy_file, tmp_path):
         pytest.importorskip(name)
     if to == "c" and shutil.which("gcc") is None:
         pytest.skip("there is no C compiler")
-    text = LineReporter()
-    paths = export(policy_file, to, tmp_path / f"p{FORMATS[to].suffix}", None, text)
-    assert "µs a step" in text.lines[0]
+    reporter = LineReporter()
+    paths = export(policy_file, to, tmp_path / f"p{FORMATS[to].suffix}", None, reporter)
+    assert "µs a step" in reporter.lines[0]
     portable = portable_of(policy, setup)
     rows = 2.0 * observations(portable.sizes[0], 500, seed=3)
     expected = commands(policy, rows)
     assert np.all(np.ptp(expected, axis=0) > 0.1 * (portable.high - portable.low))  # commands of all sizes
     result = FORMATS[to].check(paths[0], portable, rows, expected)
     assert result.worst <= PARITY
-    shift_check = FORMATS[to].check(paths[0], portable, rows, expected + 1e-3 * (portable.high - portable.low))
-    assert shift_check.worst > 9e-4
+    shifted_result = FORMATS[to].check(paths[0], portable, rows, expected + 1e-3 * (portable.high - portable.low))
+    assert shifted_result.worst > 9e-4
 
 
 def test_file_with_different_results_is_refused(policy_file, tmp_path):
@@ -92,7 +92,7 @@ def test_file_with_different_results_is_refused(policy_file, tmp_path):
 
 @pytest.fixture(scope="module")
 def states():
-    """Positions, attitudes and velocities of a dozen ticks."""
+    """Return positions, attitudes and velocities of twelve ticks."""
     rng = np.random.default_rng(5)
     p, v, phi = (0.5 * rng.normal(size=(12, 3)) for _ in range(3))
     return p + np.array([[0.0, 0.0, 1.0]]), np.asarray(jax.jit(jax.vmap(exp))(phi)), v
@@ -100,7 +100,7 @@ def states():
 
 @pytest.fixture(scope="module")
 def sample_flight(policy, setup, states):
-    """What the controller of a flight commands, tick by tick."""
+    """Return the commands of the controller, tick by tick."""
 
     @eqx.filter_jit
     def fly(controller, p, R, v):
@@ -118,7 +118,7 @@ def sample_flight(policy, setup, states):
 def test_runner_equals_controller(setup, policy_file, states, sample_flight, tmp_path):
     export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     loaded_policy = Runner(tmp_path / "p.npz")
-    for _ in range(2):  # the second flight begins as the first
+    for _ in range(2):  # the second flight begins like the first
         result = np.array([loaded_policy.step(*(x[k] for x in states)) for k in range(12)])
         np.testing.assert_allclose(result, sample_flight, atol=2e-4)
         loaded_policy.reset()
@@ -198,7 +198,7 @@ def test_invalid_options_are_named(to, out, delta, text, policy_file, tmp_path, 
 
 
 def test_foreign_runner_file_is_not_overwritten(policy_file, tmp_path):
-    """One's own is written again."""
+    """An existing runner of this project is written again."""
     export(policy_file, "npz", tmp_path / "p.npz", None, Silent())
     export(policy_file, "npz", tmp_path / "q.npz", None, Silent())
     (tmp_path / "runner.py").write_text("print('mine')\n")

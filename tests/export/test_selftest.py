@@ -1,4 +1,4 @@
-"""The self-test of an exported header passes on a sound target, and names the first case that fails on any other."""
+"""The self-test of an exported header passes on a correct target, and returns the first case that fails otherwise."""
 
 import dataclasses
 import re
@@ -45,7 +45,7 @@ int main(void) {
 
 
 def enlarge_weights(policy):
-    """The policy with weights large enough that commands move."""
+    """Return the policy with larger weights, so that commands change."""
     return policy.with_params(jax.tree.map(lambda leaf: jnp.asarray(6.0 * np.asarray(leaf)), policy.layers))
 
 
@@ -56,7 +56,7 @@ def make_portable(preset):
 
 @pytest.fixture(scope="module")
 def quad():
-    """A policy with a step and a history of two commands."""
+    """Return a policy with a step function and a history of two commands."""
     return make_portable(tiny_preset(command_history=2))
 
 
@@ -74,7 +74,7 @@ def compile_and_run(folder, policy, *, compiler="c99", main=MAIN, change=lambda 
 
 
 def swap_text(old, new, count=-1):
-    """A change of a header that is certain to take place."""
+    """Return a function that replaces a text, which a header must contain."""
 
     def change(text):
         assert old in text
@@ -140,7 +140,7 @@ int main(void) {
 
 
 def test_wrong_bit_in_any_number_is_found(tmp_path):
-    """Also in the last bit of a weight, which hardly moves a command."""
+    """This includes the last bit of a weight, which hardly changes a command."""
     names = [f"{kind}{i}" for i in range(3) for kind in "wb"]
     names += ["low", "high", "y0", "test_observations", "test_commands", "test_states", "test_flight"]
     calls = "".join(f"missed += flip(quad_{name}, (int)(sizeof quad_{name} / sizeof(float)));" for name in names)
@@ -150,7 +150,7 @@ def test_wrong_bit_in_any_number_is_found(tmp_path):
 
 @pytest.mark.parametrize("row", range(TESTS))
 def test_wrong_command_is_found_by_number(row, quad, tmp_path):
-    """The checksum is right here, so that the comparison itself is tested."""
+    """The checksum is correct, so that only the comparison fails."""
     wrong = quad.test_commands.copy()
     wrong[row:, row] += 3.0 * TOLERANCE * (quad.high - quad.low)[row]
     case, deviation = compile_and_run(tmp_path, dataclasses.replace(quad, test_commands=wrong))
@@ -216,7 +216,7 @@ def test_float_of_different_width_is_found(quad, tmp_path):
 
 @pytest.mark.parametrize("name", ["w0", "test_commands", "test_flight"])
 def test_damaged_number_in_file_is_found(name, quad, tmp_path):
-    """The neighbour of a number deviates less than the tolerance."""
+    """The next representable number deviates by less than the tolerance."""
 
     def change(text):
         before, first, after = re.fullmatch(rf"(.* quad_{name}\[\d+\] = {{\n)([^,]+)f(,.*)", text, re.S).groups()
@@ -252,7 +252,7 @@ def test_self_test_does_not_change_flight(quad, tmp_path):
 
 
 def test_program_with_two_policies_must_name_self_test(quad, tmp_path):
-    """The common name would test one of them only."""
+    """The common name would test only one of them."""
     write_c(tmp_path / "other.h", quad)
     both = '#include "other.h"\n#include "quad.h"\n'
     separate = (

@@ -1,6 +1,6 @@
-"""Whole live flights through an autopilot: peers that speak MAVLink and CRTP, and PX4's simulation where it is.
+"""Live flights through an autopilot: peers with MAVLink and CRTP, and PX4's simulation if it is installed.
 
-PX4 listens on every address of the machine: run its tests in a network namespace (`make test-px4` makes one).
+PX4 listens on every address of the machine, so its tests need a network namespace (`make test-px4` makes one).
 """
 
 import json
@@ -47,11 +47,11 @@ def live(policy, plant, out, *words, seconds=20):
     return subprocess.Popen([*command, "--out", str(out), *words], stdout=subprocess.PIPE, text=True)
 
 
-BUSY = 0.05  # share of the ticks that the watchdog may fly on a machine that is busy with something else
+BUSY = 0.05  # largest share of ticks of the watchdog on a machine with other work
 
 
 def read_results(out):
-    """Figures of the flight, and its log."""
+    """Return the figures and the log of a flight."""
     results = json.loads((out / "results.json").read_text())
     return {row["metric"]: row["value"] for row in results["rows"]}, read_log(out / "flight.csv")
 
@@ -63,7 +63,7 @@ def output_of(flight, *, fails=False):
 
 
 def error(rows, since=0.0, until=1e9, target=HOME):
-    """True distance from a place at each tick that the policy flew [m]."""
+    """Return the true distance from a position at each tick of the policy [m]."""
     flight = rows[(rows[:, 1] >= since) & (rows[:, 1] < until) & (rows[:, -1] == Mode.POLICY)]
     return np.linalg.norm(flight[:, TRUE] - target, axis=1)
 
@@ -92,7 +92,7 @@ def test_flight_adapts_under_large_disturbance(protocol, small, tmp_path):
 
 @each_peer
 def test_link_cut_for_one_second_ends_in_landing(protocol, small, tmp_path):
-    """The guard sinks blindly, holds when it sees again, and lands; the log goes on."""
+    """The guard sinks without measurements, holds after the next one, and lands; the log continues."""
     with start_vehicle(protocol, "--cut", "5", "1"):
         text = output_of(live(small, PEERS[protocol], tmp_path))
     _, rows = read_results(tmp_path)
@@ -106,7 +106,7 @@ def test_link_cut_for_one_second_ends_in_landing(protocol, small, tmp_path):
 
 @each_peer
 def test_link_cut_for_five_seconds_ends_flight_and_log_is_complete(protocol, small, tmp_path):
-    """The vehicle is its autopilot's, which holds its place, or lets it fall; nobody takes it back."""
+    """The autopilot holds the position of the vehicle or stops its motors; retrim does not take it back."""
     with start_vehicle(protocol, "--cut", "5", "5"):
         text = output_of(live(small, PEERS[protocol], tmp_path), fails=True)
     figures, rows = read_results(tmp_path)
@@ -116,12 +116,12 @@ def test_link_cut_for_five_seconds_ends_flight_and_log_is_complete(protocol, sma
 
 
 def kill_in_flight(protocol, policy, out):
-    """Fly, kill the process of the link after two seconds, and return when all of retrim has ended."""
+    """Fly, kill the link process after two seconds, and wait until retrim has ended."""
     flight = live(policy, PEERS[protocol], out)
     while not (out / "flight.csv").exists() or len((out / "flight.csv").read_text().splitlines()) < 100:
         assert flight.poll() is None
         time.sleep(0.1)
-    os.kill(bridge_of(flight.pid), signal.SIGKILL)
+    os.kill(find_link_process(flight.pid), signal.SIGKILL)
     assert "the plant process is gone" in output_of(flight, fails=True)
 
 
@@ -132,7 +132,7 @@ def test_autopilot_holds_vehicle_after_link_process_is_killed(small, tmp_path):
         listener = MavlinkLink(UdpEndpoint("127.0.0.1", PORT))
         try:
             until = time.monotonic() + 10.0
-            # hold: PX4's answer where setpoints stop; mode and state come in messages of their own
+            # hold: PX4's reaction to missing setpoints; separate messages contain mode and state
             while (listener.mode != (4, 3) or listener.reading is None) and time.monotonic() < until:
                 listener.pump(time.monotonic() + 0.1)
             assert listener.mode == (4, 3)
@@ -143,7 +143,7 @@ def test_autopilot_holds_vehicle_after_link_process_is_killed(small, tmp_path):
 
 
 def test_guardian_lands_crazyflie_after_link_process_is_killed(small, tmp_path):
-    """Without a guardian, its motors would stop after two seconds without a setpoint, and it would lock itself."""
+    """Without a guardian, the firmware would stop and lock the motors after two seconds without a setpoint."""
     with start_vehicle("crazyflie"):
         kill_in_flight("crazyflie", small, tmp_path)
         listener = CrazyflieLink(UdpEndpoint("127.0.0.1", 0), ("127.0.0.1", PORT))
@@ -156,12 +156,12 @@ def test_guardian_lands_crazyflie_after_link_process_is_killed(small, tmp_path):
             listener.close()
 
 
-def bridge_of(supervisor):
-    """The process of the vehicle's link among the children of a flight."""
+def find_link_process(supervisor):
+    """Return the link process among the children of a flight."""
     for child in map(int, Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()):
         if b"processes.vehicle" in Path(f"/proc/{child}/cmdline").read_bytes():
             return child
-    raise AssertionError("no process of a vehicle")
+    raise AssertionError("the flight has no link process")
 
 
 # ---- PX4
@@ -184,7 +184,7 @@ def test_px4_compensates_load_and_weak_battery_within_three_seconds(tmp_path_fac
     figures, rows = read_results(tmp_path)
     print(f"mean error [m] by 5 s: {[round(float(error(rows, t, t + 5).mean()), 3) for t in range(0, 90, 5)]}")
     assert "flight over: landed" in text
-    # PX4's estimate is 4 to 5 cm off, and wanders: single windows of 5 s are 4 to 12 cm, as they are without a change.
+    # PX4's estimate has an error of 4 to 5 cm, which drifts: windows of 5 s have 4 to 12 cm, with or without a change.
     spans = [error(rows, since, until).mean() for since, until in ((0.0, 30.0), (33.0, 60.0), (63.0, 90.0))]
     print(f"mean error [m] before, and from 3 s after each change: {np.round(spans, 3).tolist()}")
     assert max(spans) < 0.10

@@ -1,6 +1,6 @@
-"""Flights with Betaflight's firmware as the rate controller, in real time. `make test-betaflight` installs and runs it.
+"""Real-time flights with Betaflight's firmware as the rate controller. `make test-betaflight` installs and runs it.
 
-The board listens at fixed ports on every address: the tests run in a network namespace of their own.
+The board listens at fixed ports on every address, so the tests run in a separate network namespace.
 """
 
 import json
@@ -20,11 +20,11 @@ from retrim.testing import check_vehicle
 pytestmark = [pytest.mark.slow, pytest.mark.betaflight]
 RETRIM = [sys.executable, "-m", "retrim.cli"]
 STEP = 1.0  # [rad/s]
-LOST, GAP = 0.1, 0.02  # [s] of simulation lost, between two looks: from here on the machine is what a flight measures
+LOST, GAP = 0.1, 0.02  # [s] limits of lost simulation time and of the sampling interval: beyond, the machine is busy
 
 
 def skip_if_late(loss, gap=0.0):
-    """Skip what is left of a test: board, world and test were not on time, so nothing is said of the firmware."""
+    """Skip the test if board, simulation or test were late: the results then do not describe the firmware."""
     if loss > LOST or gap > GAP:
         pytest.skip(f"the machine is busy: the simulation lost {loss:.2f} s, the test {gap:.3f} s")
 
@@ -34,7 +34,7 @@ def test_link_conforms():
 
 
 def test_rates_follow_commands_on_every_axis():
-    """Wrong signs of the gyroscope diverge."""
+    """With wrong signs of the gyroscope, the rates diverge."""
     plant = Scenario(plant="betaflight").make("small")
     try:
         plant.connect()
@@ -70,8 +70,8 @@ def policy(tmp_path_factory):
     return folder
 
 
-def real_time():
-    """Whether the system lets a process be on time; without that a busy machine decides how the firmware flies."""
+def has_realtime_priority():
+    """Return whether the system permits real-time scheduling; without it, other processes delay the firmware."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -81,7 +81,7 @@ def real_time():
     return True
 
 
-@pytest.mark.skipif(not real_time(), reason="SCHED_FIFO is refused here")
+@pytest.mark.skipif(not has_realtime_priority(), reason="SCHED_FIFO is refused here")
 @pytest.mark.parametrize(("disturbance", "allowance"), [("none", 0.03), ("small", 0.03), ("large", 0.05)])
 def test_flight_adapts_in_real_time(policy, disturbance, allowance, tmp_path):
     words = ["live", "--policy", str(policy), "--plant", "betaflight", "--disturbance", disturbance, "--no-page"]

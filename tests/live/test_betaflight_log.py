@@ -1,6 +1,6 @@
-"""Logs that Betaflight's firmware writes in flight: signs, settings and rates. `make test-betaflight` runs it.
+"""Logs of Betaflight's firmware: signs, settings and rates. `make test-betaflight` runs the tests.
 
-The board listens at fixed ports on every address: the tests run in a network namespace of their own.
+The board listens at fixed ports on every address, so the tests run in a separate network namespace.
 """
 
 import time
@@ -19,7 +19,7 @@ from retrim.replay.body_identification import identify_body
 
 pytestmark = [pytest.mark.slow, pytest.mark.betaflight]
 TENTH = 0.1
-LOST = 0.5  # [s] of simulation lost: from here on a flight measures the machine
+LOST = 0.5  # [s] limit of lost simulation time; beyond, the machine is busy
 
 
 def fly(folder, monkeypatch, more, seconds=25.0):
@@ -56,7 +56,7 @@ def test_identified_values_deviate_from_settings_by_at_most_10_percent(p, d, tmp
     result = identify_body(log)
     found = result.vehicle
     print(
-        f"P {p}, D {d}: lag {1000 * found.rate_lag.value:.1f} ms, settings say {1000 * lag:.1f} ms; damping "
+        f"P {p}, D {d}: lag {1000 * found.rate_lag.value:.1f} ms, from settings {1000 * lag:.1f} ms; damping "
         f"{found.rate_damping.value if found.rate_damping else float('inf'):.2f}, {damping:.2f}; gain "
         f"{found.rate_gain.value:.3f}; hover {result.hover.value:.3f}, {hover:.3f}; "
         f"delay {1000 * found.delay.value:.1f} ms"
@@ -65,19 +65,19 @@ def test_identified_values_deviate_from_settings_by_at_most_10_percent(p, d, tmp
     assert found.rate_gain.value == pytest.approx(1.0, rel=TENTH)
     assert result.hover.value == pytest.approx(hover, rel=TENTH)
     for axis in range(3):  # the signs of all axes are those of the simulated world
-        assert best_match(log, log.rates[:, axis], sensors, 1 + axis) > 0.95
-    assert best_match(log, log.specific_force[:, 2], sensors, 6) > 0.9
+        assert best_correlation(log, log.rates[:, axis], sensors, 1 + axis) > 0.95
+    assert best_correlation(log, log.specific_force[:, 2], sensors, 6) > 0.9
 
 
-def best_match(log, values, sensors, column):
-    """The correlation of a logged quantity with a simulated sensor, at the best shift of the clocks."""
+def best_correlation(log, values, sensors, column):
+    """Return the largest correlation of a logged quantity and a simulated sensor over shifts of the clocks."""
     t = sensors[:, 0] - sensors[0, 0]
     result = [np.interp(log.t + shift, t, sensors[:, column])[log.valid] for shift in np.arange(-1.0, 12.0, 0.01)]
     return max(np.corrcoef(each, values[log.valid])[0, 1] for each in result if np.std(each) > 0.0)
 
 
 def test_high_resolution_log_has_stick_rates(tmp_path, monkeypatch):
-    """In tenths of a degree per second; full stick is the rate in the settings."""
+    """The unit is a tenth of a degree per second; full stick is the rate in the settings."""
     path, model, _ = fly(tmp_path, monkeypatch, ["set blackbox_high_resolution = ON"], seconds=12.0)
     data = path.read_bytes()
     header = read_header(path, data, 0)

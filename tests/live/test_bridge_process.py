@@ -1,4 +1,4 @@
-"""The process between a flight and its learners elsewhere: it carries the end of a flight, and leaves the network."""
+"""The process between a flight and remote learners: it forwards the end of the flight and leaves the network."""
 
 import subprocess
 import time
@@ -19,8 +19,8 @@ ROOM = dict.fromkeys((*OUT, *INTO, "sample", "ready.bridge"), 1000)
 
 
 @pytest.fixture
-def between():
-    """The flight's bus, the network, the supervisor, and the plan of a bridge between them."""
+def bridge_plan():
+    """Return the bus of a flight, the network, the supervisor, and the plan of a bridge."""
     here, there = SharedMemoryBus.create(ROOM), SharedMemoryBus.create(ROOM)
     parent = subprocess.Popen(["sleep", "60"])
     yield (
@@ -37,9 +37,9 @@ def between():
 
 
 @pytest.fixture
-def bridge_case(between, tmp_path):
-    """The same, with the bridge in place of its plan; it carries already."""
-    here, there, parent, plan = between
+def bridge_case(bridge_plan, tmp_path):
+    """Return the same with a running bridge instead of its plan."""
+    here, there, parent, plan = bridge_plan
     bridge = launch("retrim.live.processes.bridge:carry", plan, tmp_path / "bridge.log")
     await_message(here, "ready.bridge", patience=30.0)
     yield here, there, parent, bridge
@@ -52,18 +52,18 @@ def test_bridge_reports_end_of_flight_without_supervisor(bridge_case):
     here.publish("sample", b"flies")
     parent.kill()
     parent.wait()
-    time.sleep(0.5)  # the vehicle goes on, and lands
+    time.sleep(0.5)  # the flight continues, and the vehicle lands
     here.publish("sample", b"flies still")
     assert bridge.poll() is None
     here.publish("ended", pack_note("ended", reason="landed"))
     await_message(there, "ended")
     assert last_note(there, "ended") == {"reason": "landed"}
-    assert bridge.wait(bridge_process.SILENCE) == 0  # nobody is left to end it
+    assert bridge.wait(bridge_process.SILENCE) == 0  # no supervisor can end it
     assert Path(f"{there.folder}-left").exists()
 
 
-def test_bridge_without_supervisor_and_flight_exits(between, monkeypatch):
-    _, there, parent, plan = between
+def test_bridge_without_supervisor_and_flight_exits(bridge_plan, monkeypatch):
+    _, there, parent, plan = bridge_plan
     monkeypatch.setattr(bridge_process, "SILENCE", 0.2)
     monkeypatch.setattr(bridge_process.signal, "signal", lambda *_: None)
     parent.kill()

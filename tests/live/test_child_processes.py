@@ -1,4 +1,4 @@
-"""A flight is watched and landed whatever the terminal does."""
+"""A flight is observed and landed regardless of the terminal."""
 
 import inspect
 import threading
@@ -12,8 +12,8 @@ from retrim.live.status import Status
 from retrim.runtime.events import Event
 
 
-class Flying:
-    """Ends a moment after it was told to land."""
+class FakeFlight:
+    """A flight that ends 0.2 s after the command to land."""
 
     def __init__(self):
         self.began, self.landing_time, self.finished = time.monotonic(), None, False
@@ -38,8 +38,8 @@ class Flying:
         return Status(t, control, {}, {}, {}, "landed" if over else None, [], False, 0, None)
 
 
-def show_for(show, seconds=0.3, stop=None):
-    flight, stop = Flying(), stop or threading.Event()
+def run_with(show, seconds=0.3, stop=None):
+    flight, stop = FakeFlight(), stop or threading.Event()
     status = inspect.unwrap(watch_flight)(flight, seconds, LiveEvents(), show, stop)
     assert flight.finished
     assert status.end_reason == "landed"
@@ -47,28 +47,28 @@ def show_for(show, seconds=0.3, stop=None):
 
 
 def test_events_and_end_are_shown_once():
-    observation, times = list[Event](), []
+    events, reasons = list[Event](), []
 
     def show(status, new):
-        observation.extend(new)
-        times.append(status.end_reason)
+        events.extend(new)
+        reasons.append(status.end_reason)
 
-    show_for(show)
-    assert [event.kind for event in observation] == ["policy"]
-    assert times[-1] == "landed"
+    run_with(show)
+    assert [event.kind for event in events] == ["policy"]
+    assert reasons[-1] == "landed"
 
 
 def test_new_swaps_are_added_without_reading_earlier_ones():
-    class Unread(list):
+    class UnreadableList(list):
         def __iter__(self):
-            raise AssertionError("all swaps so far are looked at")
+            raise AssertionError("the function reads earlier swaps")
 
     def status(first):
-        swaps = [[0.1 * i, half, i, 0.1] for i in range(first, first + 50) for half in ("policy", "residual")]
+        swaps = [[0.1 * i, part, i, 0.1] for i in range(first, first + 50) for part in ("policy", "residual")]
         return Status(1.0, {"swaps": swaps}, {}, {}, {}, None, [], False, 0, None)
 
     events = LiveEvents()
-    events.swaps = Unread()
+    events.swaps = UnreadableList()
     for first in (1, 1, 11, 41):
         events.take(status(first))
     assert [event.kind for event in events.all] == ["policy", "residual"] * 90
@@ -89,7 +89,7 @@ def test_blocked_terminal_does_not_delay_landing():
     threading.Timer(0.3, stop.set).start()
     began = time.monotonic()
     try:
-        flight, _ = show_for(lambda status, new: blocker.wait(30.0), seconds=1000.0, stop=stop)
+        flight, _ = run_with(lambda status, new: blocker.wait(30.0), seconds=1000.0, stop=stop)
         assert 0.2 < flight.landing_time - began < 1.0
         assert time.monotonic() - began < 5.0
     finally:
@@ -101,6 +101,6 @@ def test_closed_output_lands_vehicle(error):
     def show(status, new):
         raise error
 
-    flight, stop = show_for(show, seconds=1000.0)
+    flight, stop = run_with(show, seconds=1000.0)
     assert stop.is_set()
     assert flight.landing

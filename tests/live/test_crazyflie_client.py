@@ -1,6 +1,6 @@
-"""The peer that stands in for a Crazyflie is one to Bitcraze's own client. `make test-crazyflie` installs and runs it.
+"""Bitcraze's client library flies the simulated Crazyflie. `make test-crazyflie` installs and runs it.
 
-RETRIM_CFLIB names a Python that has cflib, which asks for other versions of libraries than our tools do.
+RETRIM_CFLIB names a Python with cflib, which needs other versions of libraries than the tools of this project.
 """
 
 import json
@@ -55,12 +55,12 @@ with SyncCrazyflie(sys.argv[1], cf=Crazyflie(rw_cache=None)) as connected:
     time.sleep(4.0)
     found["place"], found["quat"] = [state(name) for name in "xyz"], state("quat")
     for axis, name in enumerate(["rateRoll", "ratePitch", "rateYaw"]):
-        told = [0.0, 0.0, 0.0]
-        told[axis] = 20.0
-        manual(*told, 0.3)
+        rates = [0.0, 0.0, 0.0]
+        rates[axis] = 20.0
+        manual(*rates, 0.3)
         found[name] = state(name)
-        told[axis] = -20.0
-        manual(*told, 0.3)
+        rates[axis] = -20.0
+        manual(*rates, 0.3)
     cf.commander.send_notify_setpoint_stop()
     cf.high_level_commander.land(0.0, 2.0)
     time.sleep(6.0)
@@ -91,12 +91,12 @@ def test_genuine_client_connects_logs_arms_and_flies_peer(port):
     assert result["is armed"]
     assert result["place"] == pytest.approx([500, 200, 1200], abs=150)  # [mm]
     rates = [result[name] for name in ("rateRoll", "ratePitch", "rateYaw")]
-    # Its client's pitch is nose down, as ours about y, and its log's is nose up.
-    assert rates == pytest.approx([349, -349, 349], abs=120)  # [mrad/s] of 20 deg/s, after .3 s
+    # Positive pitch is nose down in the client and in retrim, and nose up in the log of the firmware.
+    assert rates == pytest.approx([349, -349, 349], abs=120)  # [mrad/s], 0.3 s after a command of 20 deg/s
     assert result["landed"]
 
 
 def test_link_through_radio_script_conforms(port):
-    ours = port + 1 if port < 65_000 else port - 1
-    with start_process(CFLIB, RADIO, f"udp://127.0.0.1:{port}", ours):
-        testing.check_vehicle(lambda: Scenario(plant=f"crazyflie:udp:127.0.0.1:{ours}").make("small"))
+    other = port + 1 if port < 65_000 else port - 1
+    with start_process(CFLIB, RADIO, f"udp://127.0.0.1:{port}", other):
+        testing.check_vehicle(lambda: Scenario(plant=f"crazyflie:udp:127.0.0.1:{other}").make("small"))

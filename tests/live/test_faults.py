@@ -1,4 +1,4 @@
-"""The fault drill: any process may die at any time; the flight goes on, or ends in the defined fallback."""
+"""Drills: any process may die at any time; the flight continues, or ends in the defined fallback."""
 
 import os
 import signal
@@ -45,8 +45,12 @@ def make_spec(folder, controller, **changes):
 
 
 def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
-    """Fly, and kill processes on the way, each at its time; return the last status, the events, how long the watchdog
-    took, and whether the system allowed real-time scheduling, without which a loaded machine is late."""
+    """Fly, and kill processes at given times.
+
+    Returns:
+        The last status, the events, the time until the watchdog's first command [s], and whether the system allowed
+        real-time scheduling: without it, a busy machine is late.
+    """
     events, took, kills = LiveEvents(), None, dict(kills or {})
     with DrillSupervisor(spec) as drill:
         for _ in drill.warm_up():
@@ -58,7 +62,7 @@ def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
             for role in [role for role, at in kills.items() if status.t >= at]:
                 del kills[role]
                 os.kill(drill.processes[role].pid, number)
-                took = _first_fallback(drill.bus, time.monotonic()) if role == "control" else None
+                took = _fallback_delay(drill.bus, time.monotonic()) if role == "control" else None
             if status.t > seconds:
                 drill.land()
             time.sleep(0.02)
@@ -70,32 +74,34 @@ def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
     return status, events.all, took, not any(drill.refusals.values())
 
 
-def _first_fallback(bus, kill):
+def _fallback_delay(bus, kill):
+    """Return the time from the kill to the watchdog's first command [s]."""
     while (message := bus.latest("fallback")) is None and time.monotonic() < kill + 1.0:
         time.sleep(1e-3)
     return Setpoint.unpack(message.data).send_time - kill
 
 
 def read_whole_log(folder, status=None, until=None):
-    """Return the log, after asserting that it has every tick that was flown, and that every command is finite.
+    """Return the log after asserting that it has every tick of the flight and that every command is finite.
 
-    Of a flight whose control process died, ``until`` is the time up to which its counts are known [s]: nobody counts
-    the ticks that are lost while the watchdog takes over.
+    ``until`` is the time up to which missed ticks are counted [s]: if control dies, no process counts the ticks that
+    are lost until the watchdog takes over.
     """
     rows = read_log(folder / "flight.csv")
     assert len(rows) > 10
-    answers = rows[has_measurement(rows)]  # other rows are of commands that answer nothing
-    ticks = answers[:, 0]
+    measured = rows[has_measurement(rows)]  # other rows contain commands without a measurement
+    ticks = measured[:, 0]
     assert ticks[0] == 0
     assert (np.diff(ticks) >= 1).all()
-    # A tick whose sample came too late, or that was missed, is counted and has no row. Where nobody is left who counted
-    # them, one in twenty: other tests run beside this one.
+    # A missed tick, or one with a late sample, is counted and has no row. Without a count, one tick in twenty may be
+    # missing, because other tests run at the same time.
     if status is not None:
-        last = answers[answers[:, -1] == Mode.POLICY][-1, 1] if until is None else until  # no landing is counted
-        count = ticks[: np.searchsorted(answers[:, 1], last)]
+        # the count excludes the landing
+        last = measured[measured[:, -1] == Mode.POLICY][-1, 1] if until is None else until
+        count = ticks[: np.searchsorted(measured[:, 1], last)]
         assert np.sum(np.diff(count) - 1) <= status.control["missed"] + 1
-    error = 0 if status is None else status.control["missed"]
-    assert ticks[-1] + 1 - len(ticks) <= error + max(2, ticks[-1] // 20)
+    missed = 0 if status is None else status.control["missed"]
+    assert ticks[-1] + 1 - len(ticks) <= missed + max(2, ticks[-1] // 20)
     assert np.isfinite(rows).all()
     return rows
 
@@ -111,10 +117,10 @@ def test_flight_without_faults_lands(tmp_path, controller):
     assert np.linalg.norm(rows[rows[:, 1] > 1.2][0, 3:6] - HOME) < 0.2
 
 
-@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` flies four
+@pytest.mark.parametrize("seed", range(int(os.environ.get("RETRIM_DRILLS", "1"))))  # `make drill` uses four
 @pytest.mark.parametrize("roles", ["control", "plant", "watchdog recorder residual policy"])
 def test_flight_survives_processes_killed_at_random_times(tmp_path, controller, roles, seed):
-    """What nobody flies by is killed in one flight, each at its own time, and comes back."""
+    """One flight loses all processes that it does not need; each is restarted."""
     names = roles.split()
     kills = dict(zip(names, np.random.default_rng([seed, len(roles)]).uniform(0.0, SECONDS, len(names)), strict=True))
     at = kills[names[0]]
@@ -144,16 +150,16 @@ def test_hung_processes_are_detected_at_random_times(tmp_path, controller, roles
     stops, spec = dict(zip(names, times, strict=True)), make_spec(tmp_path, controller, seconds=4.0)
     status, events, *_ = fly_once(spec, stops, seconds=4.0, number=signal.SIGSTOP)
     rows = read_whole_log(tmp_path, status, times[0] - 2 * DT if roles == "control" else None)
-    message = [event.note for event in events if "hung" in event.note]
+    notes = [event.note for event in events if "hung" in event.note]
     assert status.hangs == dict.fromkeys(stops, 1)
-    assert sorted(note.split()[1] for note in message) == sorted(names)
+    assert sorted(note.split()[1] for note in notes) == sorted(names)
     if roles == "plant":
-        observation = rows[has_measurement(rows)]
-        height = f"{observation[-1, TRUE][2]:.2f}"
+        measured = rows[has_measurement(rows)]
+        height = f"{measured[-1, TRUE][2]:.2f}"
         assert status.end_reason.startswith(f"stopped without measurements at {height} m: the plant process hung")
-        assert abs(observation[-1, 1] - times[0]) < 0.3
-        assert np.isin(rows[len(observation) :, -1], (Mode.BLIND, Mode.DROP)).all()
-        assert rows[-1, 1] > times[0] + 1.5  # what was commanded for nobody
+        assert abs(measured[-1, 1] - times[0]) < 0.3
+        assert np.isin(rows[len(measured) :, -1], (Mode.BLIND, Mode.DROP)).all()
+        assert rows[-1, 1] > times[0] + 1.5  # commands that no plant received
         return
     assert status.end_reason == "landed"
     assert np.abs(rows[:, 3:5]).max() < 0.3
@@ -172,7 +178,7 @@ def test_vehicle_lands_without_supervisor_and_log_is_complete(tmp_path, controll
     process.send_signal(number)
     while time.monotonic() < until and (not len(read_log(log)) or read_log(log)[-1, -1] != Mode.LANDED):
         time.sleep(0.1)
-    process.send_signal(signal.SIGCONT)  # who was suspended goes on, and sees the end
+    process.send_signal(signal.SIGCONT)  # a suspended supervisor continues and detects the end
     assert process.wait(30.0) == (0 if number == signal.SIGSTOP else -number)
     rows = read_whole_log(tmp_path)
     assert rows[-1, -1] == Mode.LANDED

@@ -1,4 +1,4 @@
-"""One process that learns for many: each vehicle gets what its own learner would learn, and none is waited for."""
+"""One process learns for many vehicles: each gets the result of a separate learner and delays no other one."""
 
 import pickle
 import subprocess
@@ -49,21 +49,21 @@ def read_parameters(vehicle, layer):
 
 @pytest.mark.parametrize("layer", ["residual", "policy"])
 def test_batched_updates_equal_separate_updates(start, vehicles, layer):  # noqa: F811
-    """Together, to rounding: of three, whose program is one for four."""
+    """The results are equal up to rounding; a batch of three uses the program for four."""
     for i, vehicle in enumerate(vehicles.values()):
         vehicle.fly(60 + 10 * i)
     assert fleet_for(vehicles, start, layer).step() == 3
     for name, vehicle in vehicles.items():
         together = read_parameters(vehicle, layer) if vehicle.bus.latest(f"parameters.{layer}") else None
-        alone = LearnerRig(start)
-        alone.fly(60 + 10 * list(SEEDS).index(name))
-        loop = type(alone).learner(alone, layer)
+        single = LearnerRig(start)
+        single.fly(60 + 10 * list(SEEDS).index(name))
+        loop = type(single).learner(single, layer)
         loop.plan = plan_of(start, layer, SEEDS[name])
         loop.worker = loop.new_worker()
         assert loop.step()
-        by_itself = read_parameters(alone, layer) if alone.bus.latest(f"parameters.{layer}") else None
-        assert (together is None) == (by_itself is None)
-        for one, other in zip(together or (), by_itself or (), strict=True):
+        separate = read_parameters(single, layer) if single.bus.latest(f"parameters.{layer}") else None
+        assert (together is None) == (separate is None)
+        for one, other in zip(together or (), separate or (), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-8)
     assert any(vehicle.bus.latest(f"parameters.{layer}") for vehicle in vehicles.values())
 
@@ -85,7 +85,7 @@ def test_learning_continues_after_vehicle_leaves(start, vehicles):  # noqa: F811
     vehicles["d"] = LearnerRig(start)
     fleet = fleet_for(vehicles, start, "residual")
     fleet.drop("b")
-    fleet.drop("nobody")
+    fleet.drop("unknown")
     for vehicle in vehicles.values():
         vehicle.fly()
     assert fleet.step() == 3
@@ -114,25 +114,25 @@ def test_low_rank_vehicles_share_base_until_rollback(start, tmp_path):  # noqa: 
     (base,) = fleet._bases.values()
     admitted = [vehicle for vehicle in vehicles.values() if vehicle.bus.latest("parameters.policy") is not None]
     shift = np.abs(np.asarray(base.policy.layers[0].weight - state.policy.policy.base.layers[0].weight)).max() > 0
-    assert shift == bool(admitted)  # a step that nobody admits is taken back
+    assert shift == bool(admitted)  # a step without an accepted update is undone
     fleet.loops["a"].rolled_back += 1
-    was = id(base)
+    before = id(base)
     for vehicle in vehicles.values():
         vehicle.fly()
         fleet.loops["a"]._pending = fleet.loops["b"]._pending = None
     vehicles["a"].now += 100.0
     fleet.step()
-    assert id(next(iter(fleet._bases.values()))) != was
+    assert id(next(iter(fleet._bases.values()))) != before
 
 
 def test_warm_up_compiles_program_for_each_batch_size(start, vehicles, monkeypatch):  # noqa: F811
-    learner_state = []
-    monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: learner_state.append(len(workers)))
+    sizes = []
+    monkeypatch.setattr(fleet_learner, "learn_together", lambda workers, windows: sizes.append(len(workers)))
     fleet = fleet_for(vehicles, start, "residual")
     fleet.warm_up()
-    assert learner_state == [1, 2, 4]
+    assert sizes == [1, 2, 4]
     fleet.warm_up()
-    assert learner_state == [1, 2, 4]
+    assert sizes == [1, 2, 4]
     assert [room_for(n) for n in (1, 2, 3, 4, 5, 16, 17)] == [1, 2, 4, 4, 8, 16, 32]
 
 
@@ -162,7 +162,7 @@ def test_fleet_process_follows_added_and_removed_plans(start, vehicles, tmp_path
     bad = process.start("residual", replace(plan, start=tmp_path / "nothing"), tmp_path / "bad")
     monkeypatch.setattr(fleet_process, "SharedMemoryBus", lambda folder: buses["000003-residual"])
     fleet_process._look(fleet, tmp_path, done)
-    assert bad.poll() == 1  # a ground station sees a process that died
+    assert bad.poll() == 1  # the ground station is informed of a failed process
     assert set(fleet.loops) == {"000003-residual"}
     process.close()
     assert [seat.poll() for seat in seats] == [-9] * 3

@@ -1,4 +1,4 @@
-"""Identification beside a live flight: rows of flight in, the vehicle out, and a controller that follows it."""
+"""Identification during a live flight: it reads rows of the flight and publishes the vehicle for the controller."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ def setup(as_a_user):
 
 @pytest.fixture(scope="module")
 def rows(setup):
-    """A vehicle with 40 ms of delay, 80 ms of lag and four fifths of the thrust, flown by a geometric controller."""
+    """Return a flight of a geometric controller: 40 ms of delay, 80 ms of lag, 80 % of the thrust."""
     vehicle = VehicleSpec(
         name="slow", mass=1.0, inertia=(0.01, 0.01, 0.02), arm=(0.1, 0.1), thrust_max=40.0,
         rates_max=(6.0, 6.0, 4.0), motor_tau=0.03, rate_lag=(0.08, 0.08, 0.08), rate_damping=(1.0, 1.0, 1.0),
@@ -56,7 +56,7 @@ def bus():
 
 
 def feed(loop, rows, every=7):
-    """Publish rows as control does: the last ones again and again, some of them new."""
+    """Publish rows as control does: each message repeats earlier rows."""
     for end in range(every, len(rows) + 1, every):
         loop.bus.publish("flight", FlightRows(rows[max(0, end - 150) : end]).pack())
         assert loop.step()
@@ -65,7 +65,7 @@ def feed(loop, rows, every=7):
 
 
 @pytest.fixture(scope="module")
-def vehicle_notes(setup, rows):
+def identifier(setup, rows):
     loop = IdentifierLoop(setup.preset, BASE, bus())
     feed(loop, rows)
     return loop
@@ -76,10 +76,10 @@ def parameters(loop, expected, after=0):
     return Parameters.unpack(data, expected, half=VEHICLE, base=BASE, after=after)
 
 
-def test_vehicle_is_identified(setup, vehicle_notes):
+def test_vehicle_is_identified(setup, identifier):
     controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
     expected = plain_source(setup, controller).parameters[VEHICLE]
-    result = parameters(vehicle_notes, expected)
+    result = parameters(identifier, expected)
     centre, half_width, gain = (np.asarray(a) for a in result.arrays.values())
     family = setup.env.family
     path = family.path(jnp.asarray(centre))
@@ -90,25 +90,25 @@ def test_vehicle_is_identified(setup, vehicle_notes):
     assert 1.0 < result.computed_from <= 6.0  # an unchanged vehicle is not sent again
 
 
-def test_identification_is_reported_after_one_and_five_seconds(vehicle_notes):
-    reports = last_note(vehicle_notes.bus, "identified")["reports"]
+def test_identification_is_reported_after_one_and_five_seconds(identifier):
+    reports = last_note(identifier.bus, "identified")["reports"]
     assert [t for t, _ in reports] == [pytest.approx(1.0, abs=0.2), pytest.approx(5.0, abs=0.2)]
     assert all(text.startswith("thrust gain 0.") and "rate delay" in text for _, text in reports)
 
 
-def test_estimate_does_not_depend_on_length_of_messages(setup, rows, vehicle_notes):
+def test_estimate_does_not_depend_on_length_of_messages(setup, rows, identifier):
     other = IdentifierLoop(setup.preset, BASE, bus())
     feed(other, rows, every=50)
     (centre, width, gain), (centre_50, width_50, gain_50) = (
-        tuple(map(np.asarray, parameters(loop, _shapes(setup)).arrays.values())) for loop in (vehicle_notes, other)
+        tuple(map(np.asarray, parameters(loop, _shapes(setup)).arrays.values())) for loop in (identifier, other)
     )
     assert (np.abs(centre - centre_50) < width + width_50).all()
     assert abs(gain - gain_50) < 0.02
 
 
-def test_restarted_identifier_continues_versions(setup, rows, vehicle_notes):
-    before = vehicle_notes.bus.latest(f"parameters.{VEHICLE}").version
-    again = IdentifierLoop(setup.preset, BASE, vehicle_notes.bus)
+def test_restarted_identifier_continues_versions(setup, rows, identifier):
+    before = identifier.bus.latest(f"parameters.{VEHICLE}").version
+    again = IdentifierLoop(setup.preset, BASE, identifier.bus)
     again.bus.publish("flight", FlightRows(rows[-150:]).pack())
     while again.step():
         pass
@@ -116,19 +116,19 @@ def test_restarted_identifier_continues_versions(setup, rows, vehicle_notes):
 
 
 def test_warm_up_compiles_all_programs(setup, rows):
-    """A process that compiles in flight is silent, and is ended for it."""
-    loop, program = IdentifierLoop(setup.preset, BASE, bus()), list[str]()
+    """The supervisor would kill a process that compiles in flight, since it sends no heartbeat."""
+    loop, programs = IdentifierLoop(setup.preset, BASE, bus()), list[str]()
 
-    def note(name, seconds, **about):
+    def record(name, seconds, **about):
         if name.endswith("backend_compile_duration"):
-            program.append(name)
+            programs.append(name)
 
     jax.clear_caches()
     loop.warm_up()
-    jax.monitoring.register_event_duration_secs_listener(note)
+    jax.monitoring.register_event_duration_secs_listener(record)
     feed(loop, rows[:140])
-    jax.monitoring.unregister_event_duration_listener(note)
-    assert program == []
+    jax.monitoring.unregister_event_duration_listener(record)
+    assert programs == []
 
 
 def test_damaged_rows_are_ignored(setup):
@@ -143,10 +143,10 @@ def test_preset_for_one_vehicle_is_refused():
 
 
 def test_excitation_in_live_flight_is_refused(setup):
-    excitation = Setup.from_preset(changed(setup.preset, family={"excitation": True}))
-    controller = excitation.pilot(excitation.new_policy(jax.random.key(0)), "base-id").controller
+    exciting = Setup.from_preset(changed(setup.preset, family={"excitation": True}))
+    controller = exciting.pilot(exciting.new_policy(jax.random.key(0)), "base-id").controller
     with pytest.raises(ConfigError, match=r"family\.excitation: a live flight does not excite its vehicle"):
-        plain_source(excitation, controller)
+        plain_source(exciting, controller)
 
 
 def test_only_identifying_controller_has_vehicle_parameters(setup):
@@ -167,7 +167,7 @@ def test_controller_follows_slowly_and_keeps_vehicle_after_restart(setup):
     after = [pilot.act(0.02 * k, 0.0, AT_REST) for k in range(50, 100)]
     steps = np.abs(np.diff([steady, *after], axis=0))[:, 0]
     assert steps.max() < 0.1 * 9.81  # [m/s^2]
-    assert after[-1][0] > 1.5 * steady[0]  # half of the thrust: twice the command
+    assert after[-1][0] > 1.5 * steady[0]  # half the thrust per command: twice the command
     pilot.restart()
     assert pilot.versions[VEHICLE] == 1
     assert pilot.act(2.0, 0.0, AT_REST)[0] > 1.5 * steady[0]

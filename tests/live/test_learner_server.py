@@ -1,4 +1,4 @@
-"""Learners on another machine: a flight gets their policies, and goes on when they, their bus or a viewer are gone."""
+"""Learners on another machine: a flight uses their policies and survives the loss of learners, bridge or page."""
 
 import os
 import signal
@@ -38,15 +38,15 @@ KEY, OTHER = SharedKey(b"k" * 32), SharedKey(b"o" * 32)
 
 
 class DrillGround(LearnerServer):
-    """Its learners are those of the drill."""
+    """A ground station with the learners of a drill."""
 
     def _start(self, layer):
         plan = DrillPlan(self._bus.folder, os.getpid(), layer, level(), self._mission.base)
         self.processes[layer] = launch("live_processes:learner", plan, self.folder / f"{layer}.log")
 
 
-def station(address, over):
-    """A ground station in a thread, until ``over`` is set."""
+def run_station(address, over):
+    """Run a ground station until ``over`` is set."""
     with DrillGround(address) as ground:
         for _ in ground.wait():
             time.sleep(0.02)
@@ -59,15 +59,18 @@ def station(address, over):
                 return
 
 
-def fly_while(gap, folder, controller):  # noqa: F811
-    """Fly with learners at a ground station, and lose ``gap`` after a second; return the last status, the events, and
-    who flew at each tick before the landing."""
+def fly_with_loss(gap, folder, controller):  # noqa: F811
+    """Fly with learners at a ground station, and end ``gap`` after a second.
+
+    Returns:
+        The last status, the events, and the mode at each tick before the landing.
+    """
     address, over = Address("zenoh", "127.0.0.1", unused_port(), shared=KEY), threading.Event()
     page = PageSpec("127.0.0.1", free_port("127.0.0.1", 18180), "drill", HOME[None].repeat(2, 0), (), 0.06, 0.19)
     changes = {"learners": address, "seconds": SECONDS, "page": page if gap == "bridge and page" else None}
-    thread = threading.Thread(target=station, args=(address, over))
+    thread = threading.Thread(target=run_station, args=(address, over))
     thread.start()
-    events, complete = LiveEvents(), True
+    events, intact = LiveEvents(), True
     try:
         with DrillSupervisor(make_spec(folder, controller, **changes)) as drill:
             for _ in drill.warm_up():
@@ -75,8 +78,8 @@ def fly_while(gap, folder, controller):  # noqa: F811
             drill.take_off()
             while (status := drill.watch()).end_reason is None and status.t < 20.0:
                 events.take(status)
-                if status.t > 1.0 and complete:
-                    complete = False
+                if status.t > 1.0 and intact:
+                    intact = False
                     if gap == "ground":
                         over.set()
                     else:
@@ -97,10 +100,10 @@ def fly_while(gap, folder, controller):  # noqa: F811
 @pytest.mark.parametrize("gap", ["ground", "bridge and page"])
 def test_flight_uses_remote_learners(tmp_path, controller, gap):  # noqa: F811
     pytest.importorskip("zenoh")
-    for attempt in ("first", "second", "third"):  # a busy machine may hold a process back until the guard takes over
+    for attempt in ("first", "second", "third"):  # on a busy machine, control may be late, and the watchdog takes over
         (tmp_path / attempt).mkdir()
-        status, events, start_vehicle = fly_while(gap, tmp_path / attempt, controller)
-        if (share := np.mean(start_vehicle == Mode.POLICY)) > 0.9:
+        status, events, modes = fly_with_loss(gap, tmp_path / attempt, controller)
+        if (share := np.mean(modes == Mode.POLICY)) > 0.9:
             break
     assert share > 0.9
     swaps = [at for at, half, *_ in events.swaps if half == "policy"]
@@ -116,33 +119,36 @@ def test_flight_uses_remote_learners(tmp_path, controller, gap):  # noqa: F811
 
 
 @pytest.mark.parametrize(
-    ("here", "there", "said_here", "said_there"),
+    ("here", "there", "error_here", "error_there"),
     [(KEY, OTHER, FOREIGN, FOREIGN), (None, KEY, MISSING, UNSIGNED), (KEY, None, UNSIGNED, MISSING)],
     ids=("another", "none here", "none there"),
 )
 def test_wrong_or_missing_key_prevents_flight_and_both_ends_report_it(
-    tmp_path, monkeypatch, request, here, there, said_here, said_there
+    tmp_path, monkeypatch, request, here, there, error_here, error_there
 ):
     pytest.importorskip("zenoh")
     for module in (ground, remote_learners):
         monkeypatch.setattr(module, "DISTRUST", 0.5)
-    port, reply, flight = unused_port(), [], request.getfixturevalue("controller")
+    port, errors, source = unused_port(), [], request.getfixturevalue("controller")
 
     def listen():
         try:
-            station(Address("zenoh", "127.0.0.1", port, shared=there), threading.Event())
+            run_station(Address("zenoh", "127.0.0.1", port, shared=there), threading.Event())
         except ConfigError as error:
-            reply.append(str(error))
+            errors.append(str(error))
 
     thread = threading.Thread(target=listen)
     thread.start()
     address = Address("zenoh", "127.0.0.1", port, shared=here)
-    with DrillSupervisor(make_spec(tmp_path, flight, learners=address)) as drill, pytest.raises(PlantError) as error:
+    with (
+        DrillSupervisor(make_spec(tmp_path, source, learners=address)) as drill,
+        pytest.raises(PlantError) as error,
+    ):
         for _ in drill.warm_up():
             pass
     thread.join(20.0)
-    assert str(error.value) == f"zenoh:127.0.0.1:{port}: {said_here}"
-    assert reply == [f"zenoh:127.0.0.1:{port}: {said_there}"]
+    assert str(error.value) == f"zenoh:127.0.0.1:{port}: {error_here}"
+    assert errors == [f"zenoh:127.0.0.1:{port}: {error_there}"]
 
 
 @pytest.mark.parametrize(
@@ -158,37 +164,37 @@ def test_incompatible_addresses_are_refused(addresses, why):
         learn_for([Address.of(each) for each in addresses], threading.Event())
 
 
-def learner_state_of(preset):
+def pack_learner_state(preset):
     return pack_arrays({}, kind="learnt", about={"preset": dump(preset)})
 
 
-def mission_in(folder, base, number=1, start=None, reference=None):
-    (folder / "start").write_bytes(start or learner_state_of(PRESETS["hover/retrim"]))
+def make_mission(folder, base, number=1, start=None, reference=None):
+    (folder / "start").write_bytes(start or pack_learner_state(PRESETS["hover/retrim"]))
     capacities = dict.fromkeys((*OUT, *INTO), 10_000)
     return LearnerMission.of(number, reference, 0, base, ("residual", "policy"), 0, capacities, folder / "start").pack()
 
 
 def test_new_flight_replaces_learners(tmp_path, monkeypatch):
-    network, start_time = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
+    network, starts = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
-    class NotingServer(LearnerServer):
+    class RecordingServer(LearnerServer):
         def _start(self, layer):
-            start_time.append((self._mission.base, self._mission.number, layer))
+            starts.append((self._mission.base, self._mission.number, layer))
             self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
 
-    with NotingServer(Address("zenoh", "127.0.0.1", 1)) as ground:
+    with RecordingServer(Address("zenoh", "127.0.0.1", 1)) as ground:
         network.publish("mission", b"noise")
         assert not ground._look()
-        network.publish("mission", mission_in(tmp_path, "first"))
+        network.publish("mission", make_mission(tmp_path, "first"))
         assert ground._look()
         first = ground._bus.folder
-        network.publish("mission", mission_in(tmp_path, "first", 2))  # another way of learning
+        network.publish("mission", make_mission(tmp_path, "first", 2))  # another method of learning
         ground._look()
-        assert start_time == [("first", 1, "residual"), ("first", 1, "policy"), ("first", 2, "policy")]
-        network.publish("mission", mission_in(tmp_path, "second"))
+        assert starts == [("first", 1, "residual"), ("first", 1, "policy"), ("first", 2, "policy")]
+        network.publish("mission", make_mission(tmp_path, "second"))
         ground._look()
-        assert start_time[3:] == [("second", 1, "residual"), ("second", 1, "policy")]
+        assert starts[3:] == [("second", 1, "residual"), ("second", 1, "policy")]
         assert not first.exists()
         network.publish("status", b"whatever")
         assert "compiling" in next(ground.learn())
@@ -200,31 +206,31 @@ def test_hung_learner_is_restarted(tmp_path, monkeypatch):
     network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
     with DrillGround(Address("zenoh", "127.0.0.1", 1)) as ground:
-        network.publish("mission", mission_in(tmp_path, "first"))
+        network.publish("mission", make_mission(tmp_path, "first"))
         assert ground._look()
-        suspension, until = ground.processes["policy"], time.monotonic() + 30.0
+        learner, until = ground.processes["policy"], time.monotonic() + 30.0
         while ground._bus.latest("beat.policy") is None and time.monotonic() < until:
             time.sleep(0.01)
-        os.kill(suspension.pid, signal.SIGSTOP)
+        os.kill(learner.pid, signal.SIGSTOP)
         while not ground.restarts and time.monotonic() < until:
             ground._beat()
             time.sleep(0.1)
         assert ground.restarts == {"policy": 1}
-        assert suspension.poll() == -signal.SIGKILL
+        assert learner.poll() == -signal.SIGKILL
         assert ground.processes["policy"].poll() is None
 
 
 @pytest.fixture
 def bus_case(tmp_path, monkeypatch):
-    """A network, and a ground station at it whose learners do nothing."""
+    """Return a network, and a ground station whose learners do nothing."""
     network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
-    class Idle(LearnerServer):
+    class IdleServer(LearnerServer):
         def _start(self, layer):
             self.processes[layer] = launch("live_processes:nothing", None, tmp_path / "log")
 
-    with Idle(Address("zenoh", "127.0.0.1", 1), trust=("mine:trusted",)) as ground:
+    with IdleServer(Address("zenoh", "127.0.0.1", 1), trust=("mine:trusted",)) as ground:
         yield network, ground
 
 
@@ -242,64 +248,64 @@ def bus_case(tmp_path, monkeypatch):
 )
 def test_mission_with_code_or_file_names_is_refused_and_reported(bus_case, tmp_path, changes, reference, why):
     network, ground = bus_case
-    start = learner_state_of(changed(PRESETS["hover/retrim"], **changes))
-    network.publish("mission", mission_in(tmp_path, "first", start=start, reference=reference))
+    start = pack_learner_state(changed(PRESETS["hover/retrim"], **changes))
+    network.publish("mission", make_mission(tmp_path, "first", start=start, reference=reference))
     assert why in next(ground.wait())
     assert not ground.processes
     text = last_note(network, "ground")
     assert text["base"] == "first"
     assert why in text["failed"]
-    network.publish("mission", mission_in(tmp_path, "second", start=learner_state_of(PRESETS["hover/retrim"])))
+    network.publish("mission", make_mission(tmp_path, "second", start=pack_learner_state(PRESETS["hover/retrim"])))
     assert list(ground.wait()) == []
 
 
 def test_trusted_name_is_accepted(bus_case, tmp_path):
     network, ground = bus_case
-    start = learner_state_of(changed(PRESETS["hover/retrim"], adapt={"residual": "mine:trusted"}))
-    network.publish("mission", mission_in(tmp_path, "first", start=start))
+    start = pack_learner_state(changed(PRESETS["hover/retrim"], adapt={"residual": "mine:trusted"}))
+    network.publish("mission", make_mission(tmp_path, "first", start=start))
     assert list(ground.wait()) == []
 
 
 def test_new_flight_gets_only_own_messages(bus_case, tmp_path):
     network, ground = bus_case
-    network.publish("learning", b"paused before anybody was here")
-    network.publish("mission", mission_in(tmp_path, "first"))
-    stands = ground.learn()
-    next(stands)
-    assert ground._bus.latest("learning").data == b"paused before anybody was here"
+    network.publish("learning", b"before the flight")
+    network.publish("mission", make_mission(tmp_path, "first"))
+    steps = ground.learn()
+    next(steps)
+    assert ground._bus.latest("learning").data == b"before the flight"
     for topic in ("flight", "status", "parameters.reference"):
         network.publish(topic, b"of the first")
-    next(stands)
+    next(steps)
     assert ground._bus.latest("flight").data == b"of the first"
-    network.publish("learning", b"of the second")  # it may come before the mission is looked at
-    network.publish("mission", mission_in(tmp_path, "second"))
-    next(stands)
+    network.publish("learning", b"of the second")  # it may arrive before the ground reads the mission
+    network.publish("mission", make_mission(tmp_path, "second"))
+    next(steps)
     result = {topic: ground._bus.latest(topic) for topic in ("flight", "status", "parameters.reference")}
     assert result == dict.fromkeys(result)
     assert ground._bus.latest("learning").data == b"of the second"
     network.publish("flight", b"of the second")
-    next(stands)
+    next(steps)
     assert ground._bus.latest("flight").data == b"of the second"
 
 
 def test_ground_confirms_end_of_flight(bus_case, tmp_path):
     network, ground = bus_case
-    network.publish("mission", mission_in(tmp_path, "first"))
-    stands = ground.learn()
-    next(stands)
+    network.publish("mission", make_mission(tmp_path, "first"))
+    steps = ground.learn()
+    next(steps)
     text = last_note(network, "ground")
     assert (text["base"], text["over"]) == ("first", False)
     network.publish("ended", pack_note("ended", reason="landed"))
-    assert list(stands) == ["flight over: landed"]
+    assert list(steps) == ["flight over: landed"]
     text = last_note(network, "ground")
     assert (text["base"], text["over"]) == ("first", True)
 
 
 def test_failure_is_reported_at_once_and_raised_at_end(monkeypatch):
     monkeypatch.setattr(Address, "join", lambda *_, **__: InProcessBus({}))
-    message = threading.Event()
+    reported = threading.Event()
 
-    class Other(LearnerServer):
+    class FakeServer(LearnerServer):
         def wait(self):
             return iter(())
 
@@ -307,17 +313,17 @@ def test_failure_is_reported_at_once_and_raised_at_end(monkeypatch):
             if self.address.key == "a":
                 raise OSError("no room")
             until = time.monotonic() + 10.0
-            while not message.is_set() and time.monotonic() < until:
+            while not reported.is_set() and time.monotonic() < until:
                 yield "learnt: policy 7"
 
-    def tell(text):
+    def report(text):
         if text == "zenoh:127.0.0.1:1/a: failed: OSError('no room'); zenoh:127.0.0.1:1/b: learnt: policy 7":
-            message.set()
+            reported.set()
 
-    monkeypatch.setattr(ground, "LearnerServer", Other)
+    monkeypatch.setattr(ground, "LearnerServer", FakeServer)
     with pytest.raises(OSError, match="no room"):
-        learn_for([Address.of("zenoh:127.0.0.1:1/a"), Address.of("zenoh:127.0.0.1:1/b")], threading.Event(), tell)
-    assert message.is_set()
+        learn_for([Address.of("zenoh:127.0.0.1:1/a"), Address.of("zenoh:127.0.0.1:1/b")], threading.Event(), report)
+    assert reported.is_set()
 
 
 def test_mission_survives_round_trip_and_damaged_bytes_are_refused(tmp_path):
@@ -327,7 +333,7 @@ def test_mission_survives_round_trip_and_damaged_bytes_are_refused(tmp_path):
     mission = LearnerMission.of(3, "circle", 7, "abc", ("residual", "policy"), 5, capacities, start)
     result = LearnerMission.unpack(mission.pack())
     assert result == mission
-    assert result.capacities == {"flight": 1000, "parameters.policy": 5000}  # knobs stay where the flight is
+    assert result.capacities == {"flight": 1000, "parameters.policy": 5000}  # the bridge does not forward knobs
     rng, whole = np.random.default_rng(1), mission.pack()
     for _ in range(300):
         data = bytearray(whole)

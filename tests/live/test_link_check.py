@@ -1,4 +1,4 @@
-"""The check of a link without propellers: derivatives that agree, wrong signs, and too little motion."""
+"""The check of a link without propellers: consistent derivatives, wrong signs, and small motion."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from retrim.plants.bridges.vehicle_state import VehicleState
 
 
 def states(v_sign=1.0, omega_signs=(1.0, 1.0, 1.0), size=1.0):
-    """A vehicle that is carried around in a circle and turned about all axes."""
+    """Return the states of a vehicle that a person carries in a circle and turns about all axes."""
     result = []
     for t in np.arange(0.0, 6.0, 0.02):
         p = size * np.array([np.cos(t), np.sin(t), 0.3 * np.sin(2.0 * t)])

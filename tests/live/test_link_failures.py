@@ -1,6 +1,6 @@
-"""The table of failures on its page: a flight for each row, whose peer is observed while processes or links fail.
+"""Flights for each row of the table of failures: the tests observe a peer while processes or links fail.
 
-The words at the start of the cells for retrim and for the vehicle, and the numbers of seconds, are what is asserted.
+The tests assert the first words of the cells for retrim and the vehicle, and the numbers of seconds.
 """
 
 import contextlib
@@ -33,8 +33,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "failures.md"
 PORT = 24610
 AUTOPILOTS, PILOTED = ("mavlink", "ros2:px4"), ("ros2:mavros", "ros")
 LINKS = (*AUTOPILOTS, *PILOTED, "crazyflie")
-LATE_S = 0.8  # [s]: the peer, the flight and other programs share the cores
-MODES = {Mode.BLIND, Mode.HOLD, Mode.DESCEND, Mode.LANDED, Mode.WATCHDOG}  # the last one if control was late
+LATE_S = 0.8  # [s], since the peer, the flight and other programs share the cores
+MODES = {Mode.BLIND, Mode.HOLD, Mode.DESCEND, Mode.LANDED, Mode.WATCHDOG}  # WATCHDOG if control was late
 
 
 class Row(NamedTuple):
@@ -63,8 +63,8 @@ ROWS = read_page()
 CHECKED: dict[tuple[str, str], str] = {}
 
 
-def asserts(failures, links, *, fly_by=None):
-    """Note the rows that a test asserts, and fly it once by some of their links; links in one cell share their code."""
+def check_rows(failures, links, *, fly_by=None):
+    """Record the rows that a test checks, and run it with some of their links; links in one cell share code."""
 
     def mark(function):
         CHECKED.update({(link, failure): function.__name__ for link in links for failure in failures})
@@ -82,46 +82,46 @@ def test_rows_of_page_correspond_to_tests():
 # ---- peers
 
 
-def mavlink(port=PORT):
+def mavlink_rig(port=PORT):
     pytest.importorskip("pymavlink")
     from retrim.testing.mavlink_peer import HOLD, MavlinkPeer
 
-    def rest(peer):
+    def reset(peer):
         peer.mode, peer.armed, peer.failsafes, peer._rates = HOLD, True, 0, None
         peer._place, peer._yaw = HOME, 0.0
 
-    return Rig(MavlinkPeer(Scenario(plant="simple"), port=port), f"mavlink:udp:127.0.0.1:{port}", rest)
+    return Rig(MavlinkPeer(Scenario(plant="simple"), port=port), f"mavlink:udp:127.0.0.1:{port}", reset)
 
 
-def crazyflie():
+def crazyflie_rig():
     from retrim.testing.crazyflie_peer import CrazyfliePeer
 
-    def rest(peer):
+    def reset(peer):
         peer.armed, peer.locked, peer._lands = True, False, False
         peer._setpoint, peer._place, peer._yaw = None, HOME, 0.0
 
-    return Rig(CrazyfliePeer(Scenario(plant="simple"), port=PORT + 1), f"crazyflie:udp:127.0.0.1:{PORT + 1}", rest)
+    return Rig(CrazyfliePeer(Scenario(plant="simple"), port=PORT + 1), f"crazyflie:udp:127.0.0.1:{PORT + 1}", reset)
 
 
 def wait_for_pilot(peer):
     peer._place, peer._yaw, peer._target_time, peer._last_command_time = HOME, 0.0, -np.inf, -np.inf
 
 
-def by_ros2(dialect):
+def ros2_rig(dialect):
     pytest.importorskip("cyclonedds")
     from retrim.ros2.backends import open_node
     from retrim.testing import ros2_px4_peer
     from retrim.testing.ros2_peer import make_peer, parse
 
-    def rest(peer):
+    def reset(peer):
         peer.mode, peer.armed, peer._rates, peer._place, peer._yaw = ros2_px4_peer.HOLD, True, None, HOME, 0.0
 
     peer = make_peer(open_node("cyclonedds", ()), parse([dialect, "--plant", "simple"]))
-    return Rig(peer, f"ros2:cyclonedds:{dialect}", rest if dialect == "px4" else wait_for_pilot)
+    return Rig(peer, f"ros2:cyclonedds:{dialect}", reset if dialect == "px4" else wait_for_pilot)
 
 
 @contextlib.contextmanager
-def by_ros1():
+def ros1_rig():
     from retrim_paper.latency import rosmaster
 
     with rosmaster() as address:
@@ -141,24 +141,24 @@ def rig(request):
         patch.setenv("ROS_DOMAIN_ID", str(20 + os.getpid() % 60))
         dialect = request.param.removeprefix("ros2:")
         if request.param == "ros":
-            result = stack.enter_context(by_ros1())
+            result = stack.enter_context(ros1_rig())
         else:
-            result = {"mavlink": mavlink, "crazyflie": crazyflie}.get(dialect, lambda: by_ros2(dialect))()
+            result = {"mavlink": mavlink_rig, "crazyflie": crazyflie_rig}.get(dialect, lambda: ros2_rig(dialect))()
         result.name = request.param
         yield result
         result.close()
 
 
-# ---- the vehicle's reactions, by the words on the page
+# ---- reactions of the vehicle, by the words on the page
 
 
-def flies_on(views, row, fault):
+def check_flight_continues(views, row, fault):
     assert all(view.follows for view in views)
     assert max(np.linalg.norm(view.p - HOME) for view in views) < 0.4
 
 
-def holds(views, row, fault):
-    """It no longer follows commands, and is near the place that it had then."""
+def check_hold(views, row, fault):
+    """The vehicle does not follow commands, and remains near its position at that time."""
     last = max(view.at for view in views if view.follows)
     assert row.after - 0.3 < last - fault < row.after + LATE_S
     rest = [view for view in views if view.at > last + 1.5]
@@ -167,51 +167,57 @@ def holds(views, row, fault):
     assert np.linalg.norm(rest[-1].v) < 0.3
 
 
-def lands(views, row, fault):
+def check_landing(views, row, fault):
     assert views[-1].p[2] < 0.25
     assert max(np.linalg.norm(view.p[:2]) for view in views) < 0.6
-    assert min(view.v[2] for view in views) > -2.0  # a fall from the start would end with 4 m/s
+    assert min(view.v[2] for view in views) > -2.0  # a fall from the initial height would end with 4 m/s
 
 
-def falls(views, row, fault):
+def check_fall(views, row, fault):
     off = next(view.at for view in views if not view.thrust)
     assert row.after - 0.1 < off - fault < row.after + LATE_S
     assert not any(view.flies for view in views if view.at > off + 1.0)
 
 
-def sinks(views, row, fault):
-    """It is level and sinks, however it moved before."""
+def check_level_descent(views, row, fault):
+    """The vehicle is level and sinks, regardless of its motion before."""
     late = [view for view in views if view.at > fault + row.after + 1.2]
     assert min(view.upright for view in late) > np.cos(0.15)
     assert late[-1].v[2] < late[0].v[2] < 0.1
     assert np.linalg.norm(late[-1].p[:2] - views[0].p[:2]) < 1.5 * (late[-1].at - views[0].at)
 
 
-REACTIONS = {"flies on": flies_on, "holds its position": holds, "lands": lands, "falls": falls, "sinks": sinks}
-DEEDS = {"restarts it": "", "lands the vehicle": "landed", "ends the flight": "plant", "is dead": "", "exits": ""}
-"""First words about retrim, and those of the reason for the end of the flight."""
+REACTIONS = {
+    "flies on": check_flight_continues,
+    "holds its position": check_hold,
+    "lands": check_landing,
+    "falls": check_fall,
+    "sinks": check_level_descent,
+}
+END_REASONS = {"restarts it": "", "lands the vehicle": "landed", "ends the flight": "plant", "is dead": "", "exits": ""}
+"""First words of the cell for retrim, and first words of the reason for the end of the flight."""
 
 
-def only(words, cell):
+def find_by_prefix(words, cell):
     (result,) = [value for word, value in words.items() if cell.strip("*").startswith(word)]
     return result
 
 
 def check(rig, key, fault):
     views = rig.since(fault)
-    for view in views[::20]:  # shown if the check fails
+    for view in views[::20]:  # pytest shows it if the check fails
         print(f"{view.at - fault:5.2f} s {view.p.round(2)} m {view.v.round(2)} m/s {view.follows} {view.thrust:.2f}")
-    only(REACTIONS, ROWS[key].vehicle)(views, ROWS[key], fault)
+    find_by_prefix(REACTIONS, ROWS[key].vehicle)(views, ROWS[key], fault)
 
 
 def check_end(key, reason):
-    """Assert the words of the page about retrim."""
-    expected = only(DEEDS, ROWS[key].retrim)
+    """Compare the end of the flight with the cell for retrim."""
+    expected = find_by_prefix(END_REASONS, ROWS[key].retrim)
     assert (reason or "") == expected or (expected != "landed" and (reason or "").startswith(expected))
 
 
 def fly_until(flight, condition, seconds=15.0):
-    """Go on with a flight until a condition holds."""
+    """Continue a flight until a condition is true."""
     until = time.monotonic() + seconds
     for step in flight:
         if condition(step):
@@ -220,8 +226,8 @@ def fly_until(flight, condition, seconds=15.0):
     return None
 
 
-def begin(rig, folder, layers=()):
-    """Return a flight that has flown for a while, and its steps."""
+def start_flight(rig, folder, layers=()):
+    """Start a flight, and return it and its steps after 0.7 s."""
     steps = fly(spec_of(rig, folder, layers), rig)
     return fly_until(steps, lambda flight: flight.status.t > 0.7, 120.0), steps
 
@@ -232,10 +238,10 @@ RESTARTED = {"watchdog": "watchdog", "recorder": "recorder", "a learner": "polic
              "page": "page"}  # fmt: skip
 
 
-@asserts([f"{name} killed" for name in (*RESTARTED, "control")], ["every link"], fly_by=["mavlink"])
+@check_rows([f"{name} killed" for name in (*RESTARTED, "control")], ["every link"], fly_by=["mavlink"])
 def test_processes_are_killed_in_turn(rig, tmp_path):
     with add_roles():
-        flight, steps = begin(rig, tmp_path, ("residual", "policy"))
+        flight, steps = start_flight(rig, tmp_path, ("residual", "policy"))
         for name, role in RESTARTED.items():
             fault = time.monotonic()
             os.kill(flight.processes[role].pid, signal.SIGKILL)
@@ -256,7 +262,7 @@ def test_processes_are_killed_in_turn(rig, tmp_path):
     check(rig, key, fault)
 
 
-@asserts(["supervisor killed"], ["every link"], fly_by=["ros2:mavros"])
+@check_rows(["supervisor killed"], ["every link"], fly_by=["ros2:mavros"])
 def test_supervisor_is_killed(rig, tmp_path):
     key = "every link", "supervisor killed"
     with start_supervised_flight(spec_of(rig, tmp_path), rig) as processes:
@@ -272,10 +278,10 @@ def test_supervisor_is_killed(rig, tmp_path):
     check(rig, key, fault)
 
 
-@asserts(["link process killed"], LINKS, fly_by=["mavlink", "ros2:mavros", "crazyflie"])
+@check_rows(["link process killed"], LINKS, fly_by=["mavlink", "ros2:mavros", "crazyflie"])
 def test_link_process_is_killed(rig, tmp_path):
     key = rig.name, "link process killed"
-    flight, steps = begin(rig, tmp_path)
+    flight, steps = start_flight(rig, tmp_path)
     fault = time.monotonic()
     os.kill(flight.processes["plant"].pid, signal.SIGKILL)
     fly_until(steps, lambda flight: False)
@@ -285,7 +291,7 @@ def test_link_process_is_killed(rig, tmp_path):
     check(rig, key, fault)
 
 
-@asserts(["all processes killed"], LINKS, fly_by=["mavlink", "ros2:px4", "ros2:mavros", "crazyflie"])
+@check_rows(["all processes killed"], LINKS, fly_by=["mavlink", "ros2:px4", "ros2:mavros", "crazyflie"])
 def test_all_processes_are_killed(rig, tmp_path):
     key = rig.name, "all processes killed"
     with start_supervised_flight(spec_of(rig, tmp_path), rig) as processes:
@@ -296,9 +302,9 @@ def test_all_processes_are_killed(rig, tmp_path):
         check(rig, key, fault)
 
 
-@asserts(["all processes killed, last target held"], PILOTED)
+@check_rows(["all processes killed, last target held"], PILOTED)
 def test_all_processes_are_killed_before_stack_that_holds_last_target(rig, tmp_path):
-    """The last target is one that turns the vehicle: it has just been pushed."""
+    """The vehicle has just been pushed, so the last target contains body rates."""
     key = rig.name, "all processes killed, last target held"
     before, rig.peer.fresh = rig.peer.fresh, np.inf
     try:
@@ -317,7 +323,7 @@ def test_all_processes_are_killed_before_stack_that_holds_last_target(rig, tmp_p
 
 
 def cut_for(rig, seconds):
-    """Cut the link in both directions; return the instant."""
+    """Cut the link in both directions, and return the time of the cut."""
     fault = time.monotonic()
     rig.peer.cut = True
     wait_until(fault + seconds)
@@ -325,11 +331,11 @@ def cut_for(rig, seconds):
     return fault
 
 
-@asserts(["cut for 0.3 s", "cut for 1 s"], LINKS, fly_by=["mavlink", "ros2:mavros", "crazyflie"])
+@check_rows(["cut for 0.3 s", "cut for 1 s"], LINKS, fly_by=["mavlink", "ros2:mavros", "crazyflie"])
 def test_link_is_cut_twice_for_short_times(rig, tmp_path):
-    flight, steps = begin(rig, tmp_path)
+    flight, steps = start_flight(rig, tmp_path)
     cuts = []
-    for seconds in (0.3, 1.0):  # the second one comes while the guard holds the vehicle after the first one
+    for seconds in (0.3, 1.0):  # the second cut begins while the guard holds the vehicle after the first one
         cuts.append(time.monotonic())
         rig.peer.cut = True
         fly_until(steps, lambda flight: time.monotonic() > cuts[-1] + seconds)  # noqa: B023
@@ -348,10 +354,10 @@ def test_link_is_cut_twice_for_short_times(rig, tmp_path):
         check(rig, key, fault)
 
 
-@asserts(["cut for 5 s", "cut for ever"], LINKS, fly_by=["ros2:px4", "ros", "crazyflie"])
+@check_rows(["cut for 5 s", "cut for ever"], LINKS, fly_by=["ros2:px4", "ros", "crazyflie"])
 def test_link_is_cut_for_long_time(rig, tmp_path):
-    """After 5 s the vehicle is in the state in which it stays, and a link that comes back does not change it."""
-    flight, steps = begin(rig, tmp_path)
+    """After 5 s the state of the vehicle is final; a restored link does not change it."""
+    flight, steps = start_flight(rig, tmp_path)
     fault = time.monotonic()
     rig.peer.cut = True
     fly_until(steps, lambda flight: False, 30.0)
@@ -374,7 +380,7 @@ def wait_until(instant):
 
 @pytest.fixture(scope="module")
 def companion(tmp_path_factory):
-    """The companion computer in C with a policy that hovers, and the autopilot of a peer."""
+    """Return a peer and the companion program in C with a hover policy."""
     if shutil.which("gcc") is None:
         pytest.skip("there is no C compiler")
     folder = tmp_path_factory.mktemp("companion")
@@ -383,14 +389,14 @@ def companion(tmp_path_factory):
         write_c(folder / "policy.h", portable_of(setup.pretrained(), setup))
     shutil.copy(PAGE.parents[2] / "examples" / "companion.c", folder)
     subprocess.run(["gcc", *FLAGS, "companion.c", "-o", "companion", "-lm"], cwd=folder, check=True)
-    result = mavlink(port=PORT + 2)
+    result = mavlink_rig(port=PORT + 2)
     result.program = folder / "companion"
     yield result
     result.close()
 
 
 @contextlib.contextmanager
-def companion_flies(rig):
+def fly_companion(rig):
     rig.hover()
     share = 9.81 / rig.peer.vehicle.thrust_max
     process = subprocess.Popen([rig.program, str(PORT + 2), f"{share:.6f}"], stdout=subprocess.DEVNULL)
@@ -406,31 +412,32 @@ def companion_flies(rig):
         process.wait()
 
 
-@asserts(["all processes killed"], ["companion.c"], fly_by=())
+@check_rows(["all processes killed"], ["companion.c"], fly_by=())
 def test_companion_computer_is_killed(companion):
-    with companion_flies(companion) as process:
+    with fly_companion(companion) as process:
         fault = time.monotonic()
         process.kill()
         companion.settle(3.5)
         check(companion, ("companion.c", "all processes killed"), fault)
 
 
-@asserts([f"cut for {time}" for time in ("0.3 s", "1 s", "5 s", "ever")], ["companion.c"], fly_by=())
+@check_rows([f"cut for {time}" for time in ("0.3 s", "1 s", "5 s", "ever")], ["companion.c"], fly_by=())
 def test_link_of_companion_computer_is_cut(companion):
     for seconds in (0.3, 1.0, 5.0):
         key = "companion.c", f"cut for {seconds:g} s"
-        with companion_flies(companion) as process:
+        with fly_companion(companion) as process:
             fault = cut_for(companion, seconds)
             assert process.wait(LATE_S) == 3
             check_end(key, "")
             companion.settle(fault + 3.5 - time.monotonic())
             check(companion, key, fault)
-    check(companion, ("companion.c", "cut for ever"), fault)  # the vehicle was in this state when the link came back
+    # the vehicle was in this state before the link was restored
+    check(companion, ("companion.c", "cut for ever"), fault)
 
 
-@asserts(["link process killed", "all processes killed"], ["betaflight"], fly_by=())
+@check_rows(["link process killed", "all processes killed"], ["betaflight"], fly_by=())
 def test_simulated_board_ends_with_link_process():
-    """A program stands in for the board: the kernel kills it."""
+    """A program replaces the board; the kernel kills it."""
     words = f"[sys.executable, '-c', {TIED!r}, '/bin/sleep', '60']"
     code = f"import subprocess, sys, time; print(subprocess.Popen({words}).pid, flush=True); time.sleep(60)"
     link = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)

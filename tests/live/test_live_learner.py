@@ -1,4 +1,4 @@
-"""A learner rig the flight: windows in, parameters out; it goes on from what is flown, not from what it wished."""
+"""Learners during a live flight: they read windows, publish parameters, and continue from the active policy."""
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory):
-    """A file with what was learnt before the flight, and the controller that flies."""
+    """Return the file of a learner state, the controller of the flight, and the state."""
     with jax.numpy_dtype_promotion("standard"):
         preset = tiny_preset()
         setup = Setup.from_preset(preset)
@@ -35,7 +35,7 @@ def start(tmp_path_factory):
 
 
 class LearnerRig:
-    """Loops of the layers on one bus; rows of a vehicle that hovers under a push that it does not feel."""
+    """Learner loops of some layers on one bus, and rows of a vehicle that hovers under a push without moving."""
 
     def __init__(self, start, *layers):
         self.path, self.controller, self.state = start
@@ -76,13 +76,13 @@ class LearnerRig:
 
 
 def stub_learning(loop, meanwhile=lambda: None):
-    """Let a loop learn a policy a little other than its last one, each time, at once."""
+    """Replace the training of a loop: each update shifts the last policy a little, without delay."""
 
     def learn(window):
         meanwhile()
-        was = loop.worker._policy
-        nudge = jax.tree.map(lambda leaf: leaf + 0.01, was.policy.params)
-        state = PolicyState(was.policy.with_params(nudge), was.optimiser)
+        before = loop.worker._policy
+        nudge = jax.tree.map(lambda leaf: leaf + 0.01, before.policy.params)
+        state = PolicyState(before.policy.with_params(nudge), before.optimiser)
         return PolicyUpdate(float(window.t[-1]), 1.0, 2.0, state)
 
     loop.worker.learn = learn
@@ -94,7 +94,7 @@ def weights(tree):
 
 
 def starting_weights(loop):
-    """The policy that the next update starts from."""
+    """Return the weights from which the next update starts."""
     return weights(loop.worker._policy.policy)
 
 
@@ -106,10 +106,10 @@ def test_learner_publishes_parameters_from_window(start):
     assert loop.step()
     result = rig.parameters("residual")
     assert (result.version, result.parent, result.computed_from) == (1, 0, pytest.approx(59 * DT))
-    assert not loop.step()  # nothing new
+    assert not loop.step()  # there are no new rows
     rig.fly()
     rig.now -= 99.99
-    assert not loop.step()  # not time
+    assert not loop.step()  # the interval has not ended
     rig.now += 99.99
     assert loop.step()
     assert rig.parameters("residual", after=1).version == 2
@@ -158,7 +158,7 @@ def test_policy_update_starts_from_active_policy(start):
     assert loop.step()
     np.testing.assert_array_equal(starting_weights(loop), weights(first.state.policy))
     assert rig.parameters("policy", after=1).parent == 1
-    # The second one was flown and taken back: the next starts from the first again.
+    # After a rollback of the second policy, the next update starts from the first one again.
     rig.report_status(newest=2)
     loop.step()
     np.testing.assert_array_equal(starting_weights(loop), weights(rig.update("policy", 2).state.policy))
@@ -197,10 +197,10 @@ def test_learner_waits_for_report_about_slow_update(start):
     rig = LearnerRig(start, "policy")
     loop = stub_learning(rig.loops["policy"])
 
-    def seconds():
+    def take_seconds():
         rig.now += 5.0
 
-    stub_learning(loop, seconds)
+    stub_learning(loop, take_seconds)
     rig.fly()
     rig.report_status(newest=0)
     assert loop.step()
@@ -230,22 +230,22 @@ def test_restarted_learner_continues_from_active_parameters(start):
         assert loop.step()
     rig.bus.publish("said.policy", pack_update(Rejection(1.0, "policy", "worse")))
     rig.report_status(newest=0)
-    unflown = rig.learner("policy")
-    unflown.catch_up()
-    np.testing.assert_array_equal(starting_weights(unflown), weights(rig.state.policy.policy))
+    earlier = rig.learner("policy")
+    earlier.catch_up()
+    np.testing.assert_array_equal(starting_weights(earlier), weights(rig.state.policy.policy))
     rig.report_status(newest=1)
-    again = rig.learner("policy")
-    again.catch_up()
-    np.testing.assert_array_equal(weights(again.worker._residual), weights(rig.update("residual", 1).state))
-    np.testing.assert_array_equal(starting_weights(again), weights(rig.update("policy", 1).state.policy))
+    later = rig.learner("policy")
+    later.catch_up()
+    np.testing.assert_array_equal(weights(later.worker._residual), weights(rig.update("residual", 1).state))
+    np.testing.assert_array_equal(starting_weights(later), weights(rig.update("policy", 1).state.policy))
     rig.fly()
-    assert stub_learning(again).step()
+    assert stub_learning(later).step()
     assert rig.parameters("policy", after=1).parent == 1
 
 
 @pytest.mark.parametrize("given_up", [[], [5]])
 def test_active_update_remains_on_bus_despite_unused_updates(start, given_up):
-    """A process that flew and hangs takes nothing any more."""
+    """A controller that hangs accepts no further updates."""
     rig = LearnerRig(start)
     update = PolicyUpdate(0.0, 0.0, 0.0, rig.state.policy)
     for version in range(1, 10):

@@ -1,4 +1,4 @@
-"""Knobs: what a person does to a simulated vehicle is what acts on it, and what cannot act is refused."""
+"""Knobs: an operator disturbs a simulated vehicle; the plant refuses effects that it does not have."""
 
 import json
 
@@ -47,9 +47,9 @@ def test_invalid_knobs_are_refused(fields):
 
 
 def test_push_accelerates_vehicle_until_knob_is_reset():
-    plant, still = add_knobs(), add_knobs()
+    plant, plain = add_knobs(), add_knobs()
     plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
-    with_push = speeds(plant, 10) - speeds(still, 10)
+    with_push = speeds(plant, 10) - speeds(plain, 10)
     np.testing.assert_allclose(with_push[-1], [0.2, 0.0, 0.0], atol=0.01)
     plant.turn(ManualDisturbance())
     after = speeds(plant, 10)[:, 0]
@@ -64,14 +64,14 @@ def test_knobs_add_to_disturbance():
 
 
 def test_kick_is_short_and_acts_once():
-    plant, still = add_knobs(), add_knobs()
+    plant, plain = add_knobs(), add_knobs()
     kick = ManualDisturbance(kick=(8.0, 0.0, 0.0), kicks=1)
     plant.turn(kick)
-    gain = (speeds(plant, 30) - speeds(still, 30))[:, 0]
-    assert abs(int(np.argmax(gain)) - (round(KICK_S / 0.02) - 1)) <= 1  # from then on, drag slows it down
+    gain = (speeds(plant, 30) - speeds(plain, 30))[:, 0]
+    assert abs(int(np.argmax(gain)) - (round(KICK_S / 0.02) - 1)) <= 1  # afterwards, drag reduces the speed
     np.testing.assert_allclose(gain.max(), 8.0 * KICK_S, rtol=0.1)
     before = speeds(plant, 1)[0, 0]
-    plant.turn(kick)  # the same message again, as after another knob was turned
+    plant.turn(kick)  # the same message again, as after a change of another knob
     assert abs(speeds(plant, 5)[-1, 0] - before) < 0.2
 
 
@@ -79,19 +79,19 @@ def test_kick_is_short_and_acts_once():
     "knobs", [ManualDisturbance(load=0.05), ManualDisturbance(rotor=0.7), ManualDisturbance(wind=(4.0, 0.0, 0.0))]
 )
 def test_every_knob_moves_vehicle(knobs):
-    plant, still = add_knobs(), add_knobs()
+    plant, plain = add_knobs(), add_knobs()
     plant.turn(knobs)
-    assert np.abs(speeds(plant, 15) - speeds(still, 15)).max() > 0.02
+    assert np.abs(speeds(plant, 15) - speeds(plain, 15)).max() > 0.02
 
 
 def test_plant_without_effect_flies_on_and_refuses_it():
-    plant, still = add_knobs("rotorpy"), add_knobs("rotorpy")
+    plant, plain = add_knobs("rotorpy"), add_knobs("rotorpy")
     plant.turn(ManualDisturbance(load=0.1, push=(1.0, 0.0, 0.0)))
-    np.testing.assert_array_equal(speeds(plant, 5), speeds(still, 5))
+    np.testing.assert_array_equal(speeds(plant, 5), speeds(plain, 5))
     assert "cannot carry a load" in plant.refusal
     plant.turn(ManualDisturbance(push=(1.0, 0.0, 0.0)))
     assert plant.refusal == ""
-    assert speeds(plant, 5)[-1, 0] - speeds(still, 5)[-1, 0] > 0.05
+    assert speeds(plant, 5)[-1, 0] - speeds(plain, 5)[-1, 0] > 0.05
 
 
 def test_plant_without_knobs_refuses_them_and_raises_own_errors():

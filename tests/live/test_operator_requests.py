@@ -1,4 +1,4 @@
-"""What a person asks for in flight is done, once, and told."""
+"""Requests of an operator in flight are executed once and reported."""
 
 import dataclasses
 import time
@@ -16,7 +16,7 @@ from retrim.config.setup import Setup
 from retrim.control.lora import LoraPolicy
 from retrim.io.policies import load_learner_state
 from retrim.learn.bptt import PolicyState
-from retrim.live.operator import requests as wishes
+from retrim.live.operator import requests as request_module
 from retrim.live.operator.manual_disturbance import ManualDisturbance
 from retrim.live.operator.requests import OperatorRequests
 from retrim.live.processes.published_updates import keep
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
 class RecordingSupervisor(Supervisor):
-    """Has no processes; it notes what it is told."""
+    """A supervisor without processes, which records its calls."""
 
     def __init__(self, spec):
         super().__init__(spec)
@@ -62,26 +62,26 @@ def status(**control):
     return Status(1.0, control, {}, {}, {}, None, [], False, 0, None)
 
 
-def wish(calls, **fields):
-    calls._supervisor.bus.publish("wish", pack_note("wish", **fields))
-    return [f"{event.kind}: {event.note}" for event in calls.obey(status())]
+def send_wish(requests, **fields):
+    requests._supervisor.bus.publish("wish", pack_note("wish", **fields))
+    return [f"{event.kind}: {event.note}" for event in requests.obey(status())]
 
 
 def test_landing_request_lands_vehicle(requests):
-    assert wish(requests, land=True) == ["asked: land"]
+    assert send_wish(requests, land=True) == ["asked: land"]
     assert requests._supervisor.messages == ["land"]
     assert requests.obey(status()) == []
 
 
 def test_pause_keeps_learned_parameters_and_none_removes_them(requests):
-    assert wish(requests, method="full", paused=False) == []
-    assert wish(requests, method="full", paused=True) == ["asked: method full, paused"]
-    assert wish(requests, method="none", paused=False) == ["asked: method none"]
-    assert wish(requests, method="full", paused=False) == ["asked: method full"]
+    assert send_wish(requests, method="full", paused=False) == []
+    assert send_wish(requests, method="full", paused=True) == ["asked: method full, paused"]
+    assert send_wish(requests, method="none", paused=False) == ["asked: method none"]
+    assert send_wish(requests, method="full", paused=False) == ["asked: method full"]
     assert requests._supervisor.messages == [(True, True), (True, False), (False, True)]
-    assert wish(requests, method="magic") == ["refused: method 'magic': there are full, lora, none"]
-    assert wish(requests, method=1, land=True) == []
-    assert wish(requests, method="full", paused="yes") == []
+    assert send_wish(requests, method="magic") == ["refused: method 'magic': there are full, lora, none"]
+    assert send_wish(requests, method=1, land=True) == []
+    assert send_wish(requests, method="full", paused="yes") == []
     assert "land" not in requests._supervisor.messages
 
 
@@ -105,7 +105,7 @@ def test_other_method_continues_from_active_policy(requests):
 
 
 def test_settled_knobs_give_one_event(requests, monkeypatch):
-    monkeypatch.setattr(wishes, "SETTLED_S", 0.0)
+    monkeypatch.setattr(request_module, "SETTLED_S", 0.0)
     requests._supervisor.bus.publish("knobs", b"noise")
     assert requests.obey(status()) == []
     requests._supervisor.bus.publish("knobs", ManualDisturbance(load=0.05, push=(1.0, 0.0, 0.0)).pack())
@@ -114,17 +114,17 @@ def test_settled_knobs_give_one_event(requests, monkeypatch):
 
 
 def test_knobs_event_states_change_and_time(requests, monkeypatch):
-    def turned(**knobs):
+    def turn(**knobs):
         requests._supervisor.bus.publish("knobs", ManualDisturbance(**knobs).pack())
-        monkeypatch.setattr(wishes, "SETTLED_S", 60.0)
+        monkeypatch.setattr(request_module, "SETTLED_S", 60.0)
         assert requests.obey(dataclasses.replace(status(), t=3.0)) == []
-        monkeypatch.setattr(wishes, "SETTLED_S", 0.0)
+        monkeypatch.setattr(request_module, "SETTLED_S", 0.0)
         return [tuple(event) for event in requests.obey(dataclasses.replace(status(), t=3.5))]
 
     push, kick = {"push": (1.0, 0.0, 0.0)}, {"kick": (8.0, 0.0, 0.0), "kicks": 1}
-    assert turned(**push) == [(3.0, "knobs", "push 1 0 0 m/s²")]
-    assert turned(**push) == []
-    assert turned(**push, rotor=0.8) == [(3.0, "knobs", "rotor 0.8")]
-    assert turned(**push, rotor=0.8, **kick) == [(3.0, "knobs", "kick 8 0 0 m/s²")]
-    assert turned(**kick) == [(3.0, "knobs", "all added effects removed")]
-    assert turned(kick=kick["kick"], kicks=2) == [(3.0, "knobs", "kick 8 0 0 m/s²")]
+    assert turn(**push) == [(3.0, "knobs", "push 1 0 0 m/s²")]
+    assert turn(**push) == []
+    assert turn(**push, rotor=0.8) == [(3.0, "knobs", "rotor 0.8")]
+    assert turn(**push, rotor=0.8, **kick) == [(3.0, "knobs", "kick 8 0 0 m/s²")]
+    assert turn(**kick) == [(3.0, "knobs", "all added effects removed")]
+    assert turn(kick=kick["kick"], kicks=2) == [(3.0, "knobs", "kick 8 0 0 m/s²")]

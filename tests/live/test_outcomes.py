@@ -1,6 +1,6 @@
-"""Whole flights that lose their terminal, folder or supervisor keep and report the learned state.
+"""Flights that lose their terminal, folder or supervisor save and report the learned state.
 
-`make drill` flies them, each at several times.
+`make drill` repeats each flight with several times of the fault.
 """
 
 import contextlib
@@ -40,7 +40,7 @@ def folder(tmp_path_factory, as_a_user):
 
 
 def processes_of(supervisor):
-    """Return the processes of a flight, and the function that each of them runs."""
+    """Return the process numbers of a flight with the name of the function that each process runs."""
     result = {}
     for pid in Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split():
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
@@ -61,13 +61,13 @@ def wait_for(condition, seconds=120.0):
     assert condition()
 
 
-def fly_once(folder, out, what, seed, page=("--no-page",), seconds=SECONDS):
+def fly_once(folder, out, act, seed, page=("--no-page",), seconds=SECONDS):
     """Fly, and act after the first policy update; return exit code and output."""
     words = "live", "--policy", "p", "--disturbance", "small", "--seconds", seconds, *page, "--out", out
     process, log = start_process(words, folder), folder / out / "flight.csv"
     at = 50.0 * np.random.default_rng(seed).uniform(3.0, SECONDS - 2.0)  # ticks
     wait_for(lambda: process.poll() is not None or (log.exists() and log.read_text().count("\n") > at))
-    what(process)
+    act(process)
     message, _ = process.communicate(timeout=120)
     text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", message.decode())
     assert "Traceback" not in text, text
@@ -75,7 +75,7 @@ def fly_once(folder, out, what, seed, page=("--no-page",), seconds=SECONDS):
 
 
 def read_whole_log(path):
-    """Return a log, which begins with the flight and ends with its landing."""
+    """Return a log after asserting that it contains the flight and its landing."""
     rows = read_log(path)
     assert rows[0, 0] == 0
     assert np.diff(rows[:, 0]).max() < 25
@@ -84,7 +84,7 @@ def read_whole_log(path):
 
 
 def check_saved_state(folder):
-    """Assert that the learner state can be continued, and that its policy flies."""
+    """Assert that the learner state can be loaded and contains the adapted policy."""
     state, _ = load_learner_state(folder / "learner_state.safetensors")
     adapted_policy, _ = load_policy(folder / "adapted.safetensors")
     np.testing.assert_array_equal(adapted_policy.layers[0].weight, state.policy.policy.layers[0].weight)
@@ -115,7 +115,7 @@ def test_hung_plant_or_control_ends_flight_in_defined_way(folder, role, seed):
     out, function = f"{role}{seed}", {"plant": "simulate", "control": "fly"}[role]
 
     def suspend(process):
-        (pid,) = (pid for pid, runs in processes_of(process.pid).items() if runs == function)
+        (pid,) = (pid for pid, name in processes_of(process.pid).items() if name == function)
         os.kill(pid, signal.SIGSTOP)
 
     code, text = fly_once(folder, out, suspend, seed)
@@ -159,7 +159,7 @@ def test_lost_folder_is_created_again_with_log_and_learner_state(folder, how, se
     check_saved_state(out)
 
 
-def elsewhere(text, name, reason):
+def find_saved_file(text, name, reason):
     """Return the temporary folder of a file that the output names."""
     line = rf"retrim: {re.escape(name)} cannot be written to \S+ \({reason}\); it is in (\S+)"
     return Path(re.search(line, text)[1])
@@ -171,12 +171,12 @@ def test_results_are_saved_elsewhere_if_file_replaces_folder(folder, seed):
 
     def replace(process):
         shutil.rmtree(out)
-        out.write_text("somebody's file")
+        out.write_text("a foreign file")
 
     code, text = fly_once(folder, out.name, replace, seed)
     assert code == 1, text
-    place = elsewhere(text, "the learner state", "File exists")
-    result = results(elsewhere(text, "results.json", "File exists"))
+    place = find_saved_file(text, "the learner state", "File exists")
+    result = results(find_saved_file(text, "results.json", "File exists"))
     assert result["ended"] == "landed"
     assert any(fault.startswith(f"{out.name}/flight.csv: ") for fault in result["faults"])
     assert len(read_whole_log(place / "flight.csv")) > 50 * SECONDS - 25
@@ -186,11 +186,11 @@ def test_results_are_saved_elsewhere_if_file_replaces_folder(folder, seed):
 
 @pytest.fixture
 def small_disk(folder, tmp_path):
-    """A folder on a disk of its own, which the log of a few seconds fills."""
+    """Return a folder on a small disk, which the log of a few seconds fills."""
     disk = folder / tmp_path.name
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=260k", "none", disk], check=False).returncode:
-        pytest.skip("a disk that is full takes the right to mount one")
+        pytest.skip("a test of a full disk needs the right to mount a file system")
     yield disk
     subprocess.run(["umount", "--lazy", disk], check=True)
 
@@ -200,9 +200,9 @@ def test_results_are_saved_elsewhere_if_disk_is_full(folder, small_disk, seed):
     full = "No space left on device"
     code, text = fly_once(folder, small_disk.name, lambda process: fill(small_disk), seed)
     assert code == 1, text
-    place = elsewhere(text, "the learner state", full)
+    place = find_saved_file(text, "the learner state", full)
     assert f"retrim: {small_disk.name}/flight.csv: {full}; the log continues in {place}/flight.csv" in text
-    result = results(elsewhere(text, "results.json", full))
+    result = results(find_saved_file(text, "results.json", full))
     assert result["ended"] == "landed"
     assert len(result["faults"]) >= 4
     assert len(read_whole_log(place / "flight.csv")) > 50 * SECONDS - 25
@@ -232,7 +232,7 @@ def test_learner_state_survives_loss_of_supervisor_and_recorder(folder, seed):
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in flight))
     check_saved_state(out)
     assert not (out / "results.json").exists()
-    left = Path(bus[0])
-    assert left.exists()
-    SharedMemoryBus.create({}).remove()  # the next flight
-    assert not left.exists()
+    bus_folder = Path(bus[0])
+    assert bus_folder.exists()
+    SharedMemoryBus.create({}).remove()  # the next flight removes it
+    assert not bus_folder.exists()

@@ -1,4 +1,4 @@
-"""The page in a browser: it shows the vehicle, and a knob changes the flight."""
+"""The page in a browser shows the vehicle, and its knobs change the flight."""
 
 import os
 import shutil
@@ -48,8 +48,8 @@ def test_occupied_port_is_skipped():
     import socket
 
     with socket.create_server(("127.0.0.1", 0)) as server:
-        extract = server.getsockname()[1]
-        assert extract < free_port("127.0.0.1", extract) < extract + 10
+        port = server.getsockname()[1]
+        assert port < free_port("127.0.0.1", port) < port + 10
     with pytest.raises(ConfigError, match="no free port from 8080 on at 'no-such-host'"):
         free_port("no-such-host", 8080)
 
@@ -66,7 +66,7 @@ def test_quaternion_equals_rotation_matrix(vector):
 
 @pytest.fixture
 def flight(tmp_path):
-    """A bus with a vehicle that hovers, and a page."""
+    """Return a bus and the address of a page."""
     pytest.importorskip("viser")
     bus = SharedMemoryBus.create(dict.fromkeys(SMALL, 65536))
     port = free_port("127.0.0.1", 18080)
@@ -82,7 +82,7 @@ def flight(tmp_path):
 
 
 def hover(bus, seconds, until=lambda: False):
-    """Report a vehicle at rest for a while."""
+    """Publish the state of a hovering vehicle for some seconds, or until a condition is true."""
     start, tick = time.monotonic(), 0
     while time.monotonic() < start + seconds and not until():
         sample = Sample(tick, tick * DT, time.monotonic(), 0.0, level(), level(), np.array([9.81, 0.0, 0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""A page answers whoever has its printed address, and nobody else."""
+"""A page accepts only requests with its printed address."""
 
 import os
 import socket
@@ -24,14 +24,14 @@ WITHIN = 60.0  # [s]
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """A page that listens; its port and its token."""
+    """Return the port, the token and the protocol of a page that listens."""
     viser = pytest.importorskip("viser")
     bus = SharedMemoryBus.create(dict.fromkeys(TOPICS, 65536))
     spec = PageSpec("127.0.0.1", free_port("127.0.0.1", 18280), "hover", HOME[None].repeat(2, 0), (), 0.06, 0.19)
     log = tmp_path_factory.mktemp("page") / "page.log"
     process = launch("retrim.live.operator.page:show", PagePlan(bus.folder, spec, os.getpid()), log)
     try:
-        assert _until(lambda: bus.latest("ready.page") is not None), log.read_text()
+        assert _wait_for(lambda: bus.latest("ready.page") is not None), log.read_text()
         yield spec.port, spec.token, f"viser-v{viser.__version__}"
     finally:
         process.terminate()
@@ -39,17 +39,17 @@ def page(tmp_path_factory):
         bus.remove()
 
 
-def _until(true):
+def _wait_for(condition):
     import time
 
     end = time.monotonic() + WITHIN
-    while not true() and time.monotonic() < end:
+    while not condition() and time.monotonic() < end:
         time.sleep(0.05)
-    return true()
+    return condition()
 
 
 def status(port, path, *headers):
-    """Return the status with which a request is answered; 0: by silence."""
+    """Return the status of the answer to a request, or 0 without an answer."""
     lines = (f"GET {path} HTTP/1.1", *headers, "", "")
     with socket.create_connection(("127.0.0.1", port), 20.0) as connection:
         connection.sendall("\r\n".join(lines).encode("latin-1"))
@@ -137,7 +137,7 @@ def test_file_is_refused_like_handshake(page):
 
 
 @pytest.mark.parametrize(
-    ("listens", "reached_hosts", "names"),
+    ("host", "local", "names"),
     [
         ("0.0.0.0", ("192.168.1.5", 8080), {"192.168.1.5:8080"}),
         ("", ("127.0.0.1", 8080), {"127.0.0.1:8080", "localhost:8080"}),
@@ -146,14 +146,14 @@ def test_file_is_refused_like_handshake(page):
         ("::", ("::ffff:10.0.0.2", 80, 0, 0), {"10.0.0.2:80", "10.0.0.2"}),
     ],
 )
-def test_page_accepts_only_names_of_reached_address(listens, reached_hosts, names):
-    calls = {*names, "192.168.1.5:8080", "localhost:8080", "quad.local:8080", "0.0.0.0:8080", "evil.example:8080"}
-    answer = {
-        name for name in calls
-        if refusal("/T", {"host": (name,)}, token="T", host=listens, local=reached_hosts) is None
+def test_page_accepts_only_names_of_reached_address(host, local, names):
+    hosts = {*names, "192.168.1.5:8080", "localhost:8080", "quad.local:8080", "0.0.0.0:8080", "evil.example:8080"}
+    accepted = {
+        name for name in hosts
+        if refusal("/T", {"host": (name,)}, token="T", host=host, local=local) is None
     }  # fmt: skip
-    assert answer == names
-    wrong = refusal("/t", {"host": (min(names),)}, token="T", host=listens, local=reached_hosts)
+    assert accepted == names
+    wrong = refusal("/t", {"host": (min(names),)}, token="T", host=host, local=local)
     assert wrong == HTTPStatus.NOT_FOUND
 
 
@@ -172,13 +172,13 @@ def test_page_without_protection_is_refused():
 
 
 def test_browser_reads_address_from_private_file(tmp_path, monkeypatch):
-    message = []
-    monkeypatch.setattr(webbrowser, "open", message.append)
+    urls = []
+    monkeypatch.setattr(webbrowser, "open", urls.append)
     monkeypatch.setenv("DISPLAY", ":0")
     open_page("http://127.0.0.1:8080/SECRET", tmp_path)
     (file,) = tmp_path.iterdir()
-    assert message == [file.as_uri()]
-    assert "SECRET" not in message[0]
+    assert urls == [file.as_uri()]
+    assert "SECRET" not in urls[0]
     assert "url=http://127.0.0.1:8080/SECRET" in file.read_text()
     assert file.stat().st_mode & 0o777 == 0o600
 

@@ -1,4 +1,4 @@
-"""The page survives any input of a browser or another process, reports refusals, and keeps its *Land* button."""
+"""The page survives any input of a browser or another process, reports refusals, and always has its *Land* button."""
 
 import asyncio
 import contextlib
@@ -38,7 +38,7 @@ VALUES = (None, True, -1, 2**70, 1e300, float("nan"), float("inf"), "", "x", "la
 
 @pytest.fixture
 def server():
-    """A real viser server on a port of its own, with somebody connected."""
+    """Return a viser server on a free port with one connected client."""
     viser = pytest.importorskip("viser")
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer("127.0.0.1", free_port("127.0.0.1", 18380), verbose=False)
@@ -56,7 +56,7 @@ def bus():
 
 
 def send(server, handle, **updates):
-    """Send the message of a changed control, and wait until the page has handled it."""
+    """Send the message of a changed control, and wait until the page has processed it."""
     from viser._messages import GuiUpdateMessage
 
     connection = server._websock_server
@@ -70,11 +70,11 @@ def controls(server):
     return {handle._impl.props.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
 
 
-def settled(true):
+def wait_for(condition):
     end = time.monotonic() + 10.0
-    while not true() and time.monotonic() < end:
+    while not condition() and time.monotonic() < end:
         time.sleep(0.01)
-    return true()
+    return condition()
 
 
 def test_page_survives_any_value_of_controls_and_lands(server, bus):
@@ -86,19 +86,19 @@ def test_page_survives_any_value_of_controls_and_lands(server, bus):
         for value in VALUES:
             if label not in ("Land", "Calm"):
                 send(server, handle, value=value)
-    assert settled(lambda: last_note(bus, "refusals.page").get("count", 0) > 50)
-    for label, handle in result.items():  # afterwards every control says what stands, and works
+    assert wait_for(lambda: last_note(bus, "refusals.page").get("count", 0) > 50)
+    for label, handle in result.items():  # afterwards, every control shows the present value, and works
         if label in ("method", "reference", "rotor", "load [kg]", "push [m/s²]"):
             good = {"method": "lora", "reference": "figure8", "push [m/s²]": [1.0, 0.5, 0.0]}.get(label, 0.75)
             good = 0.1 if label == "load [kg]" else good
             send(server, handle, value=good)
-    assert settled(lambda: last_note(bus, "wish").get("reference") == "figure8")
-    assert settled(lambda: last_note(bus, "wish").get("method") == "lora")
-    assert settled(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).load == 0.1)
-    assert settled(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).push == (1.0, 0.5, 0.0))
+    assert wait_for(lambda: last_note(bus, "wish").get("reference") == "figure8")
+    assert wait_for(lambda: last_note(bus, "wish").get("method") == "lora")
+    assert wait_for(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).load == 0.1)
+    assert wait_for(lambda: ManualDisturbance.unpack(bus.latest("knobs").data).push == (1.0, 0.5, 0.0))
     send(server, result["Land"], value=True)
-    assert settled(lambda: last_note(bus, "wish").get("land") is True)
-    _Page(SPEC, bus, MagicMock())  # a page that is started again begins from that
+    assert wait_for(lambda: last_note(bus, "wish").get("land") is True)
+    _Page(SPEC, bus, MagicMock())  # a restarted page begins with this request
 
 
 @pytest.mark.parametrize("updates", [{"visible": False}, {"removed": True}, {"disabled": True, "value": True}, {}])
@@ -130,8 +130,8 @@ def test_page_and_restarted_page_survive_any_note(bus, topic):
     for tick, data in enumerate(hostile):
         bus.publish(topic, data)
         bus.publish("sample", Sample(tick, *list(vars(sample).values())[1:]).pack())
-        again = kind in ("wish", "knobs", "refusals.page") or tick % 10 == 0  # what a new page reads as it begins
-        for page in (before, *([_Page(SPEC, bus, MagicMock())] if again else [])):
+        restart = kind in ("wish", "knobs", "refusals.page") or tick % 10 == 0  # a new page reads these notes
+        for page in (before, *([_Page(SPEC, bus, MagicMock())] if restart else [])):
             page.refresh(text=True)
             page._panel.show("x")
         watch.look()
@@ -165,13 +165,13 @@ def test_text_of_process_is_not_interpreted_as_markup(bus, monkeypatch):
 
 def test_refused_notes_are_counted_and_occasionally_reported():
     bus = InProcessBus({"learner.policy": 4096, "sample": 4096, "refusals.page": 4096})
-    watch, text = RefusedNotes(bus, ("learner.policy", "sample", "refusals.page")), []
+    watch, texts = RefusedNotes(bus, ("learner.policy", "sample", "refusals.page")), []
     for i in range(12):
         bus.publish("learner.policy", pack_note("learner.policy", took="x" * (i + 1)))
         bus.publish("sample", b"no note")
-        text += watch.look()
+        texts += watch.look()
         assert watch.look() == []
-    assert text == [
+    assert texts == [
         "note learner.policy: learner.policy: took = 'x' must be a number; 1 so far",
         "note learner.policy: learner.policy: took = 'xxxxxxxxxx' must be a number; 10 so far",
     ]

@@ -17,7 +17,7 @@ from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.io.policies import save_learner_state
 from retrim.live.live_options import choices, paths
-from retrim.live.operator import reference_switcher as following
+from retrim.live.operator import reference_switcher as switcher_module
 from retrim.live.operator.reference_switcher import ReferenceSwitcher
 from retrim.live.processes.controllers import adaptive_source
 from retrim.live.processes.learner import LearnerLoop, LearnerPlan
@@ -41,7 +41,7 @@ AT = 1.4  # [s]
 
 @pytest.fixture(scope="module")
 def setups():
-    """A set-up on the circle, its initial learner state, and the controller."""
+    """Return a set-up on the circle, its initial learner state, and the controller."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(brief_preset("track/retrim"), "circle")
         state = setup.learner.init(setup.new_policy(random.key(0)), random.key(1))
@@ -59,14 +59,14 @@ def message(table, controller, version=1, computed_from=AT - 0.8):
 
 
 class Flight:
-    """The loop that flies, on a point mass without delay; no clock."""
+    """The control loop on a point mass without delay and without a clock."""
 
     def __init__(self, controller):
         self.bus = InProcessBus(ROOM)
         self.loop = ControlLoop(plan(controller, delay_ticks=0), self.bus)
         self.x, self.tick, self.commands = level(np.array([0.0, 0.0, 1.0])), 0, []
 
-    def until(self, t):
+    def fly_until(self, t):
         while self.tick * DT < t - 1e-9:
             now, u = time.monotonic(), self.commands[-1] if self.commands else np.array([9.81, 0.0, 0.0, 0.0])
             self.bus.publish("sample", Sample(self.tick, self.tick * DT, now, 0.0, self.x, self.x, u).pack())
@@ -81,42 +81,42 @@ class Flight:
         return unpack_note(self.bus.latest("status").data, "status")
 
 
-# ---- the process that flies
+# ---- control
 
 
 def test_reference_is_parameter_of_controller(setups, table):
-    one, other = Flight(setups[2]), Flight(setups[2])
-    for flight in (one, other):
-        flight.until(0.7)
+    plain, other = Flight(setups[2]), Flight(setups[2])
+    for flight in (plain, other):
+        flight.fly_until(0.7)
     other.bus.publish("parameters.reference", message(table, setups[2]))
-    for flight in (one, other):
-        flight.until(0.96)  # the preview of 0.4 s still shows the old reference
-    np.testing.assert_allclose(one.commands, other.commands, atol=0.02)
+    for flight in (plain, other):
+        flight.fly_until(0.96)  # the preview of 0.4 s still shows the old reference
+    np.testing.assert_allclose(plain.commands, other.commands, atol=0.02)
     for t in (0.9, 2.0, 3.3, 20.0):
         np.testing.assert_allclose(other.loop.pilot.target(t), table(jnp.array(t)).p, atol=1e-9)
-        np.testing.assert_allclose(one.loop.pilot.target(t), setups[0].flight_task.target(jnp.array(t)), atol=1e-9)
+        np.testing.assert_allclose(plain.loop.pilot.target(t), setups[0].flight_task.target(jnp.array(t)), atol=1e-9)
     assert other.status["versions"] == {"policy": 0, "residual": 0, REFERENCE: 1}
     assert other.status["swaps"] == []  # no policy was learned
 
 
 def test_reference_remains_with_learning_on_and_off(setups, table):
     flight = Flight(setups[2])
-    flight.until(0.7)
+    flight.fly_until(0.7)
     flight.loop.intake.open = False
     flight.bus.publish("parameters.reference", message(table, setups[2]))
-    flight.until(0.8)
+    flight.fly_until(0.8)
     expected = np.asarray(table(jnp.array(9.0)).p)
-    for learner_state in (False, True, False):
-        flight.loop.intake.open = learner_state
+    for learning in (False, True, False):
+        flight.loop.intake.open = learning
         np.testing.assert_allclose(flight.loop.pilot.target(9.0), expected, atol=1e-9)
         assert flight.status["versions"][REFERENCE] == 1
 
 
 def test_late_reference_is_refused(setups, table):
     flight = Flight(setups[2])
-    flight.until(AT)
+    flight.fly_until(AT)
     flight.bus.publish("parameters.reference", message(table, setups[2]))
-    flight.until(AT + 0.1)
+    flight.fly_until(AT + 0.1)
     assert flight.status["refused"] == {"late reference": 1}
     np.testing.assert_allclose(flight.loop.pilot.target(9.0), setups[0].flight_task.target(jnp.array(9.0)), atol=1e-9)
 
@@ -131,7 +131,7 @@ def test_learner_uses_new_reference_without_compiling_again(setups, table, tmp_p
     bus = InProcessBus(ROOM)
     loop = LearnerLoop(LearnerPlan(tmp_path, "policy", start, "circle", 3, controller.base, 0), bus)
     before = loop.worker.learner
-    bus.publish("parameters.reference", message(table, controller)[:-1] + b"x")  # damaged on the way
+    bus.publish("parameters.reference", message(table, controller)[:-1] + b"x")  # a damaged message
     loop.due()
     assert loop.worker.learner is before
     bus.publish("parameters.reference", message(table, controller))
@@ -146,11 +146,11 @@ def test_learner_uses_new_reference_without_compiling_again(setups, table, tmp_p
             assert (leaf.aval, leaf.weak_type) == (other.aval, other.weak_type)
 
 
-# ---- who asks
+# ---- the switcher
 
 
 class RecordingSupervisor(Supervisor):
-    """Has a bus and no processes; the plant's time, which is control's, is ``behind`` the wall's [s]."""
+    """A supervisor with a bus and without processes; the time of the plant is ``behind`` the wall clock [s]."""
 
     def __init__(self, spec, behind):
         super().__init__(spec)
@@ -163,8 +163,8 @@ class RecordingSupervisor(Supervisor):
         return t
 
 
-def ask(result, folder, fence=3.0, behind=0.0):
-    setup, state, _ = result
+def make_switcher(setups, folder, fence=3.0, behind=0.0):
+    setup, state, _ = setups
     request = LiveRequest(setup, state.policy.policy, Scenario(reference="circle"), "full", 60.0, 0, fence, folder)
     supervisor = RecordingSupervisor(live_spec(request), behind)
     return ReferenceSwitcher(request, supervisor, ThreadPoolExecutor(1)), supervisor
@@ -176,77 +176,78 @@ def status(supervisor, version=0):
     return Status(t, {"versions": {REFERENCE: version}}, {}, {}, {}, None, [], False, 0, None)
 
 
-def poll_requests(follows, supervisor, done, version=0):
-    """Events until ``done``."""
+def poll_requests(switcher, supervisor, done, version=0):
+    """Process requests until ``done``; return the events."""
     events, until = [], time.monotonic() + 60.0
     while not done() and time.monotonic() < until:
-        events += [f"{event.kind}: {event.note}" for event in follows.obey(status(supervisor, version))]
+        events += [f"{event.kind}: {event.note}" for event in switcher.obey(status(supervisor, version))]
         time.sleep(0.005)
     return events
 
 
 def test_choice_is_sent_as_table_and_followed_once_accepted(setups, tmp_path):
-    follows, supervisor = ask(setups, tmp_path)
-    assert follows.ask("circle", 1.0) == follows.ask("module:name", 1.0) == []  # followed already; not offered
-    assert [event.note for event in follows.ask("figure8", 1.0)] == ["reference figure8"]
-    assert follows.ask("star", 1.0) == []  # one change at a time; the request is repeated below
+    switcher, supervisor = make_switcher(setups, tmp_path)
+    assert switcher.ask("circle", 1.0) == []  # this reference is active already
+    assert switcher.ask("module:name", 1.0) == []  # the switcher does not offer it
+    assert [event.note for event in switcher.ask("figure8", 1.0)] == ["reference figure8"]
+    assert switcher.ask("star", 1.0) == []  # one change at a time; the request is repeated below
     bus = supervisor.bus
-    assert poll_requests(follows, supervisor, lambda: bus.latest("parameters.reference") is not None) == []
-    assert len(follows.pieces) == 1
+    assert poll_requests(switcher, supervisor, lambda: bus.latest("parameters.reference") is not None) == []
+    assert len(switcher.pieces) == 1
     controller = supervisor.spec.controller
     result = Parameters.unpack(
         bus.latest("parameters.reference").data, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base,
         after=0,
     )  # fmt: skip
     assert result.computed_from <= time.monotonic() - supervisor.epoch
-    assert poll_requests(follows, supervisor, lambda: len(follows.pieces) > 1, 1) == [
+    assert poll_requests(switcher, supervisor, lambda: len(switcher.pieces) > 1, 1) == [
         "reference: transition tofigure8", "asked: reference star",
     ]  # fmt: skip
-    assert follows.name == last_note(bus, "followed")["name"] == "figure8"
-    at, table = follows.pieces[-1]
+    assert switcher.name == last_note(bus, "followed")["name"] == "figure8"
+    at, table = switcher.pieces[-1]
     t = at + 12.0
     expected = figure8()(jnp.array(12.0)).p
     np.testing.assert_allclose(table(jnp.array(t)).p, expected, atol=1e-3)
 
-    whole = setups[0].on(splice(follows.pieces))  # what its errors are measured by
+    whole = setups[0].on(splice(switcher.pieces))  # errors are relative to this reference
     x = State.at(expected)
     assert float(whole.flight_task.error(jnp.array(t), x)) < 1e-3
     assert float(whole.flight_task.error(jnp.array(5.0), State.at(circle()(jnp.array(5.0)).p))) < 1e-9
 
 
 def test_late_plant_changes_reference_at_plant_time(setups, tmp_path):
-    """A table is made for the time of the plant; by the wall's it would be of a time to come, and then too late."""
-    follows, supervisor = ask(setups, tmp_path, behind=5.0)
-    follows.ask("figure8", 10.0)
+    """A table refers to the time of the plant; with the time of the wall clock, it would begin too late."""
+    switcher, supervisor = make_switcher(setups, tmp_path, behind=5.0)
+    switcher.ask("figure8", 10.0)
     began = supervisor.fly()
     bus = supervisor.bus
-    poll_requests(follows, supervisor, lambda: bus.latest("parameters.reference") is not None)
+    poll_requests(switcher, supervisor, lambda: bus.latest("parameters.reference") is not None)
     controller = supervisor.spec.controller
     data = bus.latest("parameters.reference").data
     result = Parameters.unpack(data, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=0)
     assert began <= result.computed_from <= supervisor.fly()
-    assert follows.obey(status(supervisor)) == []
-    assert follows._attempts == 1
-    poll_requests(follows, supervisor, lambda: len(follows.pieces) > 1, 1)
-    assert follows.pieces[-1][0] == pytest.approx(result.computed_from + following.LEAD)
+    assert switcher.obey(status(supervisor)) == []
+    assert switcher._attempts == 1
+    poll_requests(switcher, supervisor, lambda: len(switcher.pieces) > 1, 1)
+    assert switcher.pieces[-1][0] == pytest.approx(result.computed_from + switcher_module.LEAD)
 
 
 def test_reference_outside_fence_or_not_accepted_is_reported(setups, tmp_path, monkeypatch):
-    follows, supervisor = ask(setups, tmp_path, fence=0.5)
-    follows.ask("figure8", 1.0)
-    (message,) = poll_requests(follows, supervisor, lambda: follows._coming is None)
+    switcher, supervisor = make_switcher(setups, tmp_path, fence=0.5)
+    switcher.ask("figure8", 1.0)
+    (message,) = poll_requests(switcher, supervisor, lambda: switcher._coming is None)
     assert "reference figure8 cannot be followed: it passes" in message
     assert "--fence" in message
     assert supervisor.bus.latest("parameters.reference") is None
-    assert follows.ask("figure8", 2.0) == []  # a page repeats its request
+    assert switcher.ask("figure8", 2.0) == []  # the page repeats its request
 
-    monkeypatch.setattr(following, "LEAD", 0.05)
-    follows.ask("star", 2.0)
+    monkeypatch.setattr(switcher_module, "LEAD", 0.05)
+    switcher.ask("star", 2.0)
     events = poll_requests(
-        follows, supervisor, lambda: follows._attempts == 3 and follows._coming is follows._pending is None
+        switcher, supervisor, lambda: switcher._attempts == 3 and switcher._coming is switcher._pending is None
     )
     assert events == ["asked: reference star cannot be followed: it was not taken"]
-    assert follows.name == "circle"
+    assert switcher.name == "circle"
     last, controller = supervisor.bus.latest("parameters.reference").data, supervisor.spec.controller
     back = Parameters.unpack(last, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=3)
     np.testing.assert_array_equal(
@@ -260,9 +261,9 @@ def test_only_policies_that_observe_reference_have_choices(setups):
     assert choices(Setup.from_preset("track/blind"), "figure8") == ()
     assert choices(Setup.from_preset("track/paper"), "figure8") == ("figure8", "circle", "lissajous", "star")
     assert choices(Setup.from_preset("hover/retrim"), "") == ()
-    pictures = paths(("circle", "star"), 20.0)
-    np.testing.assert_allclose(pictures["circle"][-1], circle()(jnp.array(19.95)).p, atol=1e-9)
-    assert pictures["star"].shape == (400, 3)
+    shapes = paths(("circle", "star"), 20.0)
+    np.testing.assert_allclose(shapes["circle"][-1], circle()(jnp.array(19.95)).p, atol=1e-9)
+    assert shapes["star"].shape == (400, 3)
 
 
 def test_setup_on_other_reference_differs_only_in_reference(setups, table):

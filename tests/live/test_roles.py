@@ -1,4 +1,4 @@
-"""Roles of a live flight: which flights need which processes, and what each is started with."""
+"""Roles of a live flight: the required processes and their plans."""
 
 import importlib
 from dataclasses import replace
@@ -29,7 +29,7 @@ def spec():
     )  # fmt: skip
 
 
-def needed(spec):
+def required_roles(spec):
     return [name for name, role in ROLES.items() if role.is_needed(spec)]
 
 
@@ -37,11 +37,11 @@ def test_flight_has_required_processes(spec):
     here = replace(spec, layers=("residual", "policy"))
     remote = replace(here, learners=Address.of("zenoh:127.0.0.1:7447", None))
     identifying = replace(spec, controller=replace(spec.controller, parameters={VEHICLE: {}}))
-    assert needed(spec) == ALWAYS
-    assert needed(here) == ["control", "plant", "residual", "policy", "watchdog", "recorder"]
-    assert needed(remote) == ["control", "plant", "bridge", "watchdog", "recorder"]
-    assert needed(identifying) == ["control", "plant", "identifier", "watchdog", "recorder"]
-    assert needed(replace(spec, page=PAGE)) == [*ALWAYS, "page"]
+    assert required_roles(spec) == ALWAYS
+    assert required_roles(here) == ["control", "plant", "residual", "policy", "watchdog", "recorder"]
+    assert required_roles(remote) == ["control", "plant", "bridge", "watchdog", "recorder"]
+    assert required_roles(identifying) == ["control", "plant", "identifier", "watchdog", "recorder"]
+    assert required_roles(replace(spec, page=PAGE)) == [*ALWAYS, "page"]
 
 
 @pytest.mark.parametrize("name", ROLES)
@@ -53,8 +53,8 @@ def test_main_function_of_role_exists(name):
 def test_plans_contain_flight_and_priority_of_role(spec):
     request = RoleRequest(spec, spec.start, Path("bus"), cores=frozenset({1}), control=7)
     plans = {name: ROLES[name].plan(request) for name in (*ALWAYS, "residual", "policy", "identifier")}
-    assert {setup.folder for setup in plans.values()} == {Path("bus")}
-    assert {setup.parent for setup in plans.values()} == {request.parent}
+    assert {plan.folder for plan in plans.values()} == {Path("bus")}
+    assert {plan.parent for plan in plans.values()} == {request.parent}
     assert plans["watchdog"].control == 7
     assert plans["watchdog"].priority > plans["control"].priority > plans["plant"].priority > 0
     assert (plans["residual"].layer, plans["policy"].layer) == ("residual", "policy")

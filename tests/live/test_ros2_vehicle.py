@@ -1,8 +1,8 @@
 """Vehicles behind a genuine ROS 2 node: conformance, whole flights that adapt, and the outcome of each fault.
 
-``RETRIM_ROS2`` names the Python of an environment with rclpy and retrim. `make test-ros2` makes one and runs this. The
-peer's node is that of rclpy, with Fast DDS, which serialises odometry and poses itself. px4_msgs and mavros_msgs, which
-the package index lacks, are stand-ins with the names and hashes of the genuine ones (``tests/ros2_packages``).
+``RETRIM_ROS2`` names the Python of an environment with rclpy and retrim; `make test-ros2` creates it and runs the
+tests. The node of the peer uses rclpy with Fast DDS, which serialises odometry and poses. The package index does not
+have px4_msgs and mavros_msgs; ``tests/ros2_packages`` contains replacements with the same names and hashes.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ pytestmark = [
 PACKAGES = Path(__file__).parents[1] / "ros2_packages"
 RETRIM = ("-P", "-m", "retrim.cli")
 HOME = np.array([0.0, 0.0, 1.0])
-BUSY = 0.05  # share of the ticks that the watchdog may fly on a machine that is busy with something else
+BUSY = 0.05  # largest share of ticks of the watchdog on a machine with other work
 PLACE = ("--place", "0.3", "-0.2", "1.5", "--yaw", str(HEADING))
 
 
@@ -44,27 +44,27 @@ def limit_discovery(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(PACKAGES))
 
 
-def genuine(*words):
-    """The vehicle behind rclpy."""
+def start_rclpy_peer(*words):
+    """Start a vehicle behind rclpy."""
     return start_process(ROS2, "-P", PACKAGES / "genuine_peer.py", *words)
 
 
-def by_zenoh(port, *words):
-    """A vehicle of ours behind zenoh, which rclpy of the package index lacks."""
+def start_zenoh_peer(port, *words):
+    """Start a simulated vehicle behind zenoh, which rclpy of the package index does not have."""
     return start_process(
         sys.executable, "-P", "-m", "retrim.testing.ros2_peer", *words, "--listen", f"127.0.0.1:{port}"
     )
 
 
 @contextlib.contextmanager
-def vehicle(backend, dialect, *words):
-    """A vehicle, and the address at which a back end finds it."""
+def start_vehicle(backend, dialect, *words):
+    """Start a vehicle; yield its process and its address for a back end."""
     if backend == "zenoh":
         port = free_port()
-        with by_zenoh(port, dialect, *words) as process:
+        with start_zenoh_peer(port, dialect, *words) as process:
             yield process, f"ros2:zenoh@127.0.0.1:{port}:{dialect}"
     else:
-        with genuine(dialect, *words) as process:
+        with start_rclpy_peer(dialect, *words) as process:
             yield process, f"ros2:{backend}:{dialect}"
 
 
@@ -91,7 +91,7 @@ for k, name in enumerate(sys.argv[1:]):
 
 @pytest.mark.parametrize(("backend", "dialect", "words"), CASES, ids=[f"{a} {b} {c[-1:]}" for a, b, c in CASES])
 def test_link_conforms(backend, dialect, words):
-    with vehicle(backend, dialect, "--plant", "simple", *words) as (_, address):
+    with start_vehicle(backend, dialect, "--plant", "simple", *words) as (_, address):
         done = subprocess.run(
             [python_of(backend), "-P", PACKAGES / "conform.py", address], capture_output=True, text=True, timeout=200
         )
@@ -128,13 +128,13 @@ def output_of(flight, *, fails=False):
 
 
 def read_results(out):
-    """Figures of the flight, and its log."""
+    """Return the figures and the log of a flight."""
     rows = json.loads((out / "results.json").read_text())["rows"]
     return {row["metric"]: row["value"] for row in rows}, read_log(out / "flight.csv")
 
 
 def error(rows, since):
-    """Distance from the start at each tick that the policy flew [m]."""
+    """Return the distance from the goal at each tick of the policy [m]."""
     late = rows[(rows[:, 1] >= since) & (rows[:, -1] == Mode.POLICY)]
     return np.linalg.norm(late[:, 3:6] - HOME, axis=1)
 
@@ -144,7 +144,7 @@ def error(rows, since):
     [("rclpy", "mavros"), ("cyclonedds", "px4"), ("cyclonedds", "mavros"), ("zenoh", "px4")],
 )
 def test_flight_adapts_under_large_disturbance_as_in_lockstep(backend, dialect, policy, tmp_path):
-    with vehicle(backend, dialect, "--disturbance", "large") as (_, address):
+    with start_vehicle(backend, dialect, "--disturbance", "large") as (_, address):
         text = output_of(fly(policy, address, tmp_path, backend=backend))
     figures, rows = read_results(tmp_path)
     print(f"{backend}, {dialect}: {error(rows, 15.0).mean():.4f} m, {figures['policies']} policies")
@@ -155,25 +155,25 @@ def test_flight_adapts_under_large_disturbance_as_in_lockstep(backend, dialect, 
     assert error(rows, 15.0).mean() < 0.01
 
 
-HABITS = {
+IRREGULARITIES = {
     "20 Hz": ("--rate", "20"), "50 Hz": ("--rate", "50"), "200 Hz": ("--rate", "200"), "out of order": ("--scrambled",),
     "clock set back": ("--clock-jump", "6", "-1000"), "clock set forward": ("--clock-jump", "6", "1000"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("habit", HABITS)
-def test_flight_survives_irregular_messages(habit, policy, tmp_path):
-    with vehicle("cyclonedds", "mavros", "--disturbance", "large", *HABITS[habit]) as (_, address):
+@pytest.mark.parametrize("irregularity", IRREGULARITIES)
+def test_flight_survives_irregular_messages(irregularity, policy, tmp_path):
+    with start_vehicle("cyclonedds", "mavros", "--disturbance", "large", *IRREGULARITIES[irregularity]) as (_, address):
         text = output_of(fly(policy, address, tmp_path))
     figures, rows = read_results(tmp_path)
-    print(f"{habit}: {error(rows, 15.0).mean():.4f} m")
+    print(f"{irregularity}: {error(rows, 15.0).mean():.4f} m")
     assert "flight over: landed" in text
     assert figures["fallback_ticks"] <= BUSY * len(rows)
-    assert error(rows, 15.0).mean() < (0.05 if habit == "20 Hz" else 0.02)
+    assert error(rows, 15.0).mean() < (0.05 if irregularity == "20 Hz" else 0.02)
 
 
 def wait_for_flight(out, seconds):
-    """Wait until the policy has flown for some seconds."""
+    """Wait for a time of the flight [s]."""
     end = time.monotonic() + 120.0
     while time.monotonic() < end:
         with contextlib.suppress(OSError, ValueError, IndexError):
@@ -184,7 +184,7 @@ def wait_for_flight(out, seconds):
 
 
 def test_killed_vehicle_ends_flight_and_successor_is_unaffected(policy, tmp_path):
-    with vehicle("cyclonedds", "mavros") as (process, address):
+    with start_vehicle("cyclonedds", "mavros") as (process, address):
         flight = fly(policy, address, tmp_path, seconds=60)
         wait_for_flight(tmp_path, 5.0)
         process.send_signal(signal.SIGKILL)
@@ -192,7 +192,8 @@ def test_killed_vehicle_ends_flight_and_successor_is_unaffected(policy, tmp_path
     _, rows = read_results(tmp_path)
     assert "plant lost: no state has come for 1.5 s; the other pilot has control again" in text
     assert rows[-1, 1] < 12.0
-    with vehicle("cyclonedds", "mavros") as (_, address):  # which is found although the killed one is still listed
+    # the network still lists the killed vehicle
+    with start_vehicle("cyclonedds", "mavros") as (_, address):
         text = output_of(fly(policy, address, tmp_path / "again", seconds=5))
     assert "flight over: landed" in text
 
@@ -205,7 +206,7 @@ def refusal(policy, address, out):
 
 def test_another_release_of_px4_is_refused_until_it_is_named(policy, tmp_path, monkeypatch):
     monkeypatch.setenv("RETRIM_PX4_MSGS", "1.14")
-    with genuine("px4", "--release", "1.14"):
+    with start_rclpy_peer("px4", "--release", "1.14"):
         text = refusal(policy, "ros2:cyclonedds:px4", tmp_path / "newest")
         assert "px4_msgs 1.14 (before 1.15)" in text
         assert "px4_msgs 1.15 or later" in text
@@ -215,6 +216,6 @@ def test_another_release_of_px4_is_refused_until_it_is_named(policy, tmp_path, m
 
 def test_another_version_of_mavros_msgs_is_refused_with_both_names(policy, tmp_path, monkeypatch):
     monkeypatch.setenv("RETRIM_OTHER_HASH", "RIHS01_" + 32 * "ab")
-    with genuine("mavros"):
+    with start_rclpy_peer("mavros"):
         text = refusal(policy, "ros2:cyclonedds:mavros", tmp_path)
     assert "an unknown version (RIHS01_abababab...) at the other end, and of mavros_msgs 1 and 2 here" in text

@@ -1,4 +1,4 @@
-"""A vehicle behind ROS 1: conformance, and a whole flight that adapts. `make test-ros` installs ROS and runs them."""
+"""A vehicle behind ROS 1: conformance, and a flight that adapts. `make test-ros` installs ROS and runs the tests."""
 
 import json
 import subprocess

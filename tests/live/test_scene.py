@@ -1,4 +1,4 @@
-"""The scene and the chart of the page: what fills the picture, and the scale of the errors."""
+"""The scene and the chart of the page: contents of the picture, and scale of the errors."""
 
 from unittest.mock import MagicMock
 
@@ -20,8 +20,8 @@ def scene_of(path, arm=0.08):
     return server, Scene(server, path, arm, 20.0)
 
 
-def angles(server, places):
-    """Return the angles of places from the middle of the picture, in halves of its height: across and up."""
+def picture_positions(server, places):
+    """Return horizontal and vertical positions in the picture, relative to its centre, in units of half its height."""
     camera, at = (np.array(getattr(server.initial_camera, name)) for name in ("position", "look_at"))
     forward = (at - camera) / np.linalg.norm(at - camera)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -29,8 +29,8 @@ def angles(server, places):
     away = np.atleast_2d(places) - camera
     depth = away @ forward
     assert (depth > 0).all()
-    across = np.stack([away @ right, away @ np.cross(right, forward)], axis=1)
-    return across / depth[:, None] / np.tan(HALF)
+    offsets = np.stack([away @ right, away @ np.cross(right, forward)], axis=1)
+    return offsets / depth[:, None] / np.tan(HALF)
 
 
 @pytest.mark.parametrize("arm", [0.06, 0.08, 0.25])
@@ -38,14 +38,14 @@ def test_picture_of_hover_contains_large_vehicle_and_ground(arm):
     server, _ = scene_of(HOME[None].repeat(2, 0), arm)
     width = 2 * (1 + ROTOR) * max(arm, 0.08)
     ends = HOME + 0.5 * width * np.array([[0.7, -0.8, 0.0], [-0.7, 0.8, 0.0]]) / np.hypot(0.7, 0.8)
-    result = angles(server, ends)
+    result = picture_positions(server, ends)
     assert 0.1 < np.ptp(result[:, 0]) / 2 < 0.5
-    assert np.abs(angles(server, HOME * [1.0, 1.0, 0.0])).max() < 1.0
+    assert np.abs(picture_positions(server, HOME * [1.0, 1.0, 0.0])).max() < 1.0
 
 
 def test_picture_contains_whole_reference():
     server, _ = scene_of(CIRCLE)
-    assert np.abs(angles(server, CIRCLE)).max() < 1.0
+    assert np.abs(picture_positions(server, CIRCLE)).max() < 1.0
 
 
 def test_world_has_sky_ground_and_axes():
@@ -72,9 +72,9 @@ def test_flight_to_goal_does_not_set_scale():
     t = np.arange(0.0, 10.0, 0.05)
     error = np.where(t < 0.9 * START_S, 70.0, 2.0)
     assert top_of(t, error) == pytest.approx(2.2)
-    assert top_of(t[:20], error[:20]) == pytest.approx(77.0)  # the beginning of the flight shows everything
+    assert top_of(t[:20], error[:20]) == pytest.approx(77.0)  # at the beginning, the scale includes all errors
     assert top_of(t, 0.0 * error) == LEAST
-    assert top_of(t + 60.0, error) == pytest.approx(77.0)  # a later error of this size does
+    assert top_of(t + 60.0, error) == pytest.approx(77.0)  # a later error of this size changes the scale
 
 
 def test_panel_states_scenario_and_addition_of_knobs():

@@ -1,4 +1,4 @@
-"""From a policy and a scenario to a live flight: what cannot be flown is refused before anything is started."""
+"""From a policy and a scenario to a live flight: an invalid flight is refused before its processes start."""
 
 import dataclasses
 
@@ -18,8 +18,8 @@ from retrim.tasks import Hover
 pytestmark = pytest.mark.usefixtures("optax_promotion")
 
 
-class Lost(Hover):
-    """Somebody's own task, whose reference is nowhere after two seconds."""
+class InfiniteReference(Hover):
+    """A user's task, whose reference is infinite after two seconds."""
 
     def target(self, t):
         return jnp.where(t < 2.0, 1.0, jnp.inf) * super().target(t)
@@ -34,9 +34,9 @@ def request_for(task, folder, seconds):
 
 
 def test_fence_contains_reference_and_infinite_reference_is_refused(tmp_path):
-    limits = live_spec(request_for(Lost, tmp_path, 2.0)).limits
+    limits = live_spec(request_for(InfiniteReference, tmp_path, 2.0)).limits
     home = np.asarray(request_for(Hover, tmp_path, 2.0).setup.flight_task.home())
     np.testing.assert_allclose(limits.high, home + 3.0)
     assert limits.find_violation(np.concatenate([home + np.array([3.1, 0.0, 0.0]), np.eye(3).ravel(), np.zeros(3)]))
     with pytest.raises(ConfigError, match=r"its reference is not finite at 2 s; no fence can hold it"):
-        live_spec(request_for(Lost, tmp_path, 4.0))
+        live_spec(request_for(InfiniteReference, tmp_path, 4.0))

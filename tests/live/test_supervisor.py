@@ -1,4 +1,4 @@
-"""The end of a flight: who has something left to say is waited for, as long as it lives."""
+"""The end of a flight: the supervisor waits for processes that must still send messages, while they live."""
 
 import threading
 import time
@@ -17,8 +17,8 @@ from retrim.transport.shared_memory import SharedMemoryBus
 ADDRESS = Address("zenoh", "127.0.0.1", 1)
 
 
-def ground_of(folder, base, reply):
-    """Learners elsewhere, who take a while to hear of the end."""
+def run_ground(folder, base, reasons):
+    """Remote learners that confirm the end of the flight late."""
     bus = SharedMemoryBus(folder)
     while not (end_note := last_note(bus, "ended")):
         bus.publish("ground", pack_note("ground", base=base, alive={"policy": True}))
@@ -28,22 +28,22 @@ def ground_of(folder, base, reply):
         bus.publish("ground", pack_note("ground", base="of another flight", alive={"policy": True}, over=True))
         time.sleep(0.02)
     if folder.exists():
-        reply.append(end_note["reason"])
+        reasons.append(end_note["reason"])
     bus.publish("ground", pack_note("ground", base=base, alive={}, over=True))
     bus.close()
 
 
 @pytest.mark.parametrize("reason", ["landed", None])
 def test_remote_learners_receive_end_before_bridge_exits(tmp_path, controller, reason):  # noqa: F811
-    reply = list[str]()
+    reasons = list[str]()
     with Supervisor(make_spec(tmp_path, controller, learners=ADDRESS)) as flight:
-        ground = threading.Thread(target=ground_of, args=(flight.bus.folder, controller.base, reply))
+        ground = threading.Thread(target=run_ground, args=(flight.bus.folder, controller.base, reasons))
         ground.start()
         while flight.bus.latest("ground") is None:
             time.sleep(0.01)
         if reason:
             flight.bus.publish("ended", pack_note("ended", reason=reason))
-    assert reply == [reason or "the flight did not come to its end"]
+    assert reasons == [reason or "the flight did not come to its end"]
     ground.join()
 
 
@@ -53,12 +53,12 @@ def test_supervisor_does_not_wait_for_lost_remote_learners(tmp_path, controller,
         folder = flight.bus.folder
         flight.bus.publish("ground", pack_note("ground", base=controller.base, alive={"policy": True}))
         began = time.monotonic()
-    assert time.monotonic() > began + FAREWELL  # there is always time for a message to leave
+    assert time.monotonic() > began + FAREWELL  # a message always has time for transmission
     assert not folder.exists()
 
 
-class Process:
-    """Runs until it is told to end."""
+class FakeProcess:
+    """A process that runs until its termination."""
 
     def __init__(self, runs=True):
         self.stop_time, self._code = None, None if runs else 0
@@ -78,8 +78,8 @@ class Process:
 
 def test_control_has_time_to_publish_last_rows_after_plant_ends(tmp_path, controller):  # noqa: F811
     with Supervisor(make_spec(tmp_path, controller)) as flight:
-        control = Process()
-        flight.processes = {"recorder": Process(), "control": control, "plant": Process(runs=False)}
+        control = FakeProcess()
+        flight.processes = {"recorder": FakeProcess(), "control": control, "plant": FakeProcess(runs=False)}
         began = time.monotonic()
         flight.finish(patience=1.0)
         assert began + 3 * DT < control.stop_time < began + 1.0

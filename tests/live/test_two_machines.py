@@ -1,4 +1,4 @@
-"""A whole flight whose learners are on another machine: over zenoh and ROS 2 between two namespaces, and over ROS 1."""
+"""Flights with learners on another machine: over zenoh and ROS 2 between two namespaces, and over ROS 1."""
 
 import json
 import subprocess
@@ -66,7 +66,7 @@ def test_flight_uses_learners_on_another_machine(policy, tmp_path, network, monk
 
 
 def test_one_ground_process_learns_for_two_vehicles_as_between_namespaces(policy, tmp_path):
-    """Over zenoh on this machine: two flights with low-rank policies, which share a base."""
+    """Two flights over zenoh on this machine have low-rank policies with a common base."""
     pytest.importorskip("zenoh")
     where = [f"zenoh:127.0.0.1:{free_port()}" for _ in range(2)]
     words = [*RETRIM, "live", "--policy", str(policy), "--plant", "simple", "--disturbance", "large", "--seconds", "25"]

@@ -1,4 +1,4 @@
-"""A flight of something whose time does not wait: ready, take-off, hand-over, and every way in which it may end."""
+"""Flights of a real-time vehicle: preparation, take-off, hand-over, and every possible end."""
 
 import os
 import signal
@@ -39,7 +39,7 @@ def spec(tmp_path, controller):
 
 
 def fly_once(spec, kill=None):
-    """Fly; return how it ended and what was said of it."""
+    """Fly; return the last status and the events."""
     events = LiveEvents()
     with DrillSupervisor(spec) as flight:
         for _ in flight.warm_up():
@@ -65,7 +65,7 @@ def test_vehicle_flies_from_hand_over_to_landing(spec):
     assert status.end_reason == "landed"
     assert rows[0, 0] == 0
     assert rows[-1, -1] == Mode.LANDED
-    # A busy machine leaves ticks out; it neither stretches the flight nor renumbers those that it flew.
+    # A busy machine may skip ticks, but neither delays the flight nor changes the numbers of ticks.
     flying = rows[rows[:, 1] < SECONDS]
     np.testing.assert_allclose(flying[:, 1], flying[:, 0] * DT, atol=1e-6)
     assert np.all(np.diff(flying[:, 0]) >= 1)
@@ -80,27 +80,27 @@ def test_slow_landing_is_not_hang(spec):
 
 
 @pytest.fixture
-def alone(spec):
-    """The same without learners."""
+def plain_spec(spec):
+    """Return the same specification without learners."""
     return replace(spec, layers=())
 
 
-def test_watchdog_lands_vehicle_without_control(alone):
-    status, events = fly_once(alone, "control")
-    rows = read_log(alone.folder / "flight.csv")
+def test_watchdog_lands_vehicle_without_control(plain_spec):
+    status, events = fly_once(plain_spec, "control")
+    rows = read_log(plain_spec.folder / "flight.csv")
     assert status.end_reason == "landed"
     assert rows[-1, -1] == Mode.WATCHDOG
     assert any(event.note.startswith("watchdog: ") for event in events)
 
 
-def test_lost_link_ends_flight_and_log_is_complete(alone):
-    status, _ = fly_once(replace(alone, scenario=Scenario(plant="fake_vehicle:lost")))
+def test_lost_link_ends_flight_and_log_is_complete(plain_spec):
+    status, _ = fly_once(replace(plain_spec, scenario=Scenario(plant="fake_vehicle:lost")))
     assert status.end_reason == "plant lost: the link has been silent"
-    assert read_log(alone.folder / "flight.csv")[-1, 1] > 0.1
+    assert read_log(plain_spec.folder / "flight.csv")[-1, 1] > 0.1
 
 
-def test_vehicle_that_refuses_to_arm_does_not_fly(alone):
-    spec = replace(alone, scenario=Scenario(plant="fake_vehicle:unarmed"))
+def test_vehicle_that_refuses_to_arm_does_not_fly(plain_spec):
+    spec = replace(plain_spec, scenario=Scenario(plant="fake_vehicle:unarmed"))
     with pytest.raises(PlantError, match=r"before it began: .*refuses to be armed; it said: no battery"), \
             DrillSupervisor(spec) as flight:  # fmt: skip
         for _ in flight.warm_up():
@@ -108,15 +108,15 @@ def test_vehicle_that_refuses_to_arm_does_not_fly(alone):
     assert not flight.bus.folder.exists()
 
 
-def test_interrupt_before_take_off_leaves_vehicle_on_ground(alone):
-    flight = DrillSupervisor(alone)
+def test_interrupt_before_take_off_leaves_vehicle_on_ground(plain_spec):
+    flight = DrillSupervisor(plain_spec)
     with flight:
         for _ in flight.warm_up():
             if flight.bus.latest("ready.plant") is not None:
                 break
         processes = dict(flight.processes)
     assert all(process.poll() is not None for process in processes.values())
-    log = alone.folder / "flight.csv"
+    log = plain_spec.folder / "flight.csv"
     assert not log.exists() or not len(read_log(log))
 
 
@@ -132,8 +132,8 @@ def status(*, flies, ticks):
 
 def test_short_flight_by_watchdog_is_reported():
     events = LiveEvents()
-    for observation in [status(flies=False, ticks=0), status(flies=True, ticks=2), status(flies=False, ticks=3)]:
-        events.take(observation)
+    for each in [status(flies=False, ticks=0), status(flies=True, ticks=2), status(flies=False, ticks=3)]:
+        events.take(each)
     notes = [event.note for event in events.all]
     assert notes[0].startswith("watchdog: ")
     assert notes[1] == "watchdog: it flew 3 ticks, control was late"

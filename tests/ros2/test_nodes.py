@@ -108,7 +108,7 @@ def test_installed_ros_has_priority(monkeypatch):
     installed = {"rclpy", "px4_msgs", "cyclonedds", "zenoh"}
     monkeypatch.setattr(backends, "is_installed", lambda name: name in installed)
     assert choose_backend(("px4_msgs",)) == "rclpy"
-    assert choose_backend(("mavros_msgs",)) == "cyclonedds"  # this does not need a package of messages
+    assert choose_backend(("mavros_msgs",)) == "cyclonedds"  # this back end needs no package of messages
     installed.remove("cyclonedds")
     assert choose_backend(("mavros_msgs",)) == "zenoh"
     installed.clear()
@@ -121,7 +121,7 @@ def test_ros_variables_configure_cyclone(monkeypatch):
     assert 'name="lo"' in configuration()
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     monkeypatch.setenv("ROS_STATIC_PEERS", "127.0.0.1")
-    assert '<NetworkInterface address="127.0.0.1"/>' in configuration()  # that leads to the peer
+    assert '<NetworkInterface address="127.0.0.1"/>' in configuration()  # the interface of the route to the peer
     monkeypatch.setenv("ROS_STATIC_PEERS", "10.0.0.7;quad1.local")
     assert 'name="lo"' not in configuration()
     assert '<Peer address="10.0.0.7"/><Peer address="quad1.local"/>' in configuration()
