@@ -1,4 +1,4 @@
-"""Two ends of a bus of each kind, for the tests that every bus must pass."""
+"""Two ends of a bus of each kind, for tests of all buses."""
 
 import atexit
 import functools
@@ -28,7 +28,7 @@ class Ends(NamedTuple):
 
 @functools.cache
 def master():
-    """Start a real rosmaster, one per process, since rospy supports one only; skip the test if there is none."""
+    """Start a real rosmaster, one per process, since rospy supports only one; skip the test without an installation."""
     stack = ExitStack()
     atexit.register(stack.close)
     address = stack.enter_context(rosmaster())
@@ -47,14 +47,14 @@ def two_ends(backend, topics):
         bus = SharedMemoryBus.create(topics)
         result = Ends(bus, SharedMemoryBus(bus.folder))
     else:
-        where = network(backend)
-        result = Ends(where.join(topics, listen=True), where.join(topics, listen=False))
+        address = network_address(backend)
+        result = Ends(address.join(topics, listen=True), address.join(topics, listen=False))
     yield result
     result.reader.close()
     result.writer.remove() if backend == "shared memory" else result.writer.close()
 
 
-def network(backend):
+def network_address(backend):
     """Return the address of a new bus on a network."""
     if backend == "ros":
         return master()
@@ -75,4 +75,4 @@ def await_message(bus, topic, after=0, data=None, patience=10.0):
         if result is not None and data in (None, result.data):
             return result
         time.sleep(1e-3)
-    raise AssertionError(f"nothing came on {topic!r} within {patience} s")
+    raise AssertionError(f"no message on {topic!r} within {patience} s")

@@ -1,4 +1,4 @@
-"""Commands as a user runs them: in this process if that suffices, and in a separate one for Ctrl-C and kills."""
+"""Commands of a user: in this process if possible, and in a separate one for Ctrl-C and kills."""
 
 import contextlib
 import io
@@ -12,7 +12,7 @@ import time
 from retrim.cli.console import console
 from retrim.cli.main import main
 
-# The policy hovers and updates take no time, both within seconds.
+# The policy hovers after seconds of training, and updates take little time.
 SMALL = """
 [pretrain]
 hidden_sizes = [64, 64]
@@ -82,15 +82,15 @@ def start_process(words, cwd, setup=""):
 
 def run_interrupted(words, cwd, *, after, setup="", by=signal.SIGINT):
     """Run; send a signal once the output shows ``after`` or that file exists; return exit code and output."""
-    process, observation = start_process(words, cwd, setup), b""
+    process, output = start_process(words, cwd, setup), b""
     deadline = time.monotonic() + 180
     while time.monotonic() < deadline and process.poll() is None:
         if isinstance(after, bytes):
-            observation += process.stdout.read1(4096)
+            output += process.stdout.read1(4096)
         else:
             time.sleep(0.005)
-        if after in observation if isinstance(after, bytes) else after.exists():
+        if after in output if isinstance(after, bytes) else after.exists():
             break
     process.send_signal(by)
     rest, _ = process.communicate(timeout=120)
-    return process.returncode, (observation + rest).decode()
+    return process.returncode, (output + rest).decode()

@@ -1,4 +1,4 @@
-"""Strict everywhere: double precision, no silent promotion of types or ranks; shapes are checked by the import hook."""
+"""Strict settings: double precision, no silent promotion of types or ranks; the import hook checks shapes."""
 
 import gc
 import os
@@ -7,9 +7,9 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-# Nearly all of the suite's time is compiling, and half of that is optimisation that does not pay in a short test. A
-# program in one piece takes fewer memory maps. The commands that tests start inherit this. `make demo` and
-# `make wheel` fly without these flags, as users do. jaxlib 0.11 and later end the process for an unknown flag.
+# Compilation takes nearly all of the suite's time; half of it is optimisation, which is too slow for short tests. A
+# program in one piece needs fewer memory maps. Commands of tests inherit the flags. `make demo` and `make wheel` do not
+# use them, like users. jaxlib 0.11 and later end the process for an unknown flag.
 os.environ["XLA_FLAGS"] = " ".join(
     dict.fromkeys(
         [
@@ -23,9 +23,9 @@ os.environ["XLA_FLAGS"] = " ".join(
 
 from shape_checks import keep_checks  # isort: skip
 
-keep_checks()  # before the functions that it is about are defined
+keep_checks()  # before the definition of these functions
 
-import retrim  # noqa: E402, F401  (before jax: it quiets the log of the compile cache)  # isort: skip
+import retrim  # noqa: E402, F401  (before jax: it reduces the log of the compile cache)  # isort: skip
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
@@ -41,13 +41,13 @@ enable_compile_cache()  # shared by the workers and by the commands that tests s
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.03)
 # A background process of a shell ignores Ctrl-C; tests need it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-gc.set_threshold(100_000, 20, 100)  # as it is by default, it takes some per cent of the time
+gc.set_threshold(100_000, 20, 100)  # the default takes several per cent of the time
 settings.register_profile("repeatable", derandomize=True)  # the same examples on every machine
 settings.load_profile("repeatable")
 
 
 LONG = ("test_examples.py", "test_extensions.py", "cli/", "docs/", "live/", "evaluation/", "paper/", "estimation/")
-"""Files whose tests fly whole flights: they begin first, so that both workers are done at about the same time."""
+"""Files with whole flights: they begin first, so that both workers end at about the same time."""
 
 
 def pytest_collection_modifyitems(config, items):
@@ -63,9 +63,9 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture(autouse=True)
 def forget_lowered():
-    """Free the sources of compiled programs: JAX keeps them, and with thousands of them compiling takes twice as long.
+    """Free the sources of compiled programs: with thousands of them in memory, compilation takes twice as long.
 
-    The compiled programs stay. JAX has no public name for this; where its private ones have changed, nothing is freed.
+    The compiled programs remain. JAX has no public name for this; if its private names change, this has no effect.
     """
     yield
     for module, name in (("jax._src.pjit", "_pjit_lower"), ("jax._src.interpreters.pxla", "_cached_lowering_to_hlo")):
@@ -76,7 +76,7 @@ def forget_lowered():
 
 @pytest.fixture
 def optax_promotion():
-    """For tests that run an optimiser: optax multiplies Python floats by integer counters."""
+    """Permit promotion for an optimiser: optax multiplies Python floats by integer counters."""
     with jax.numpy_dtype_promotion("standard"):
         yield
 
@@ -101,7 +101,7 @@ def key():
 
 @pytest.fixture(scope="module")
 def as_a_user():
-    """Single precision and JAX's own rules of promotion, also in threads, as where no test is set up."""
+    """Use the settings of a user: single precision and the default promotion of JAX, also in threads."""
     from retrim.evaluation.jobs import setup_for
 
     def configure(values):

@@ -1,4 +1,4 @@
-"""Live flights of peers that this process observes, with processes that are killed and links that are cut."""
+"""Live flights of peers in this process, with killed processes and cut links."""
 
 import contextlib
 import os
@@ -27,11 +27,11 @@ from retrim.testing.peer_vehicle import PeerVehicle
 
 HOME = np.array([0.0, 0.0, 0.8])
 STAND_INS = dict.fromkeys(("residual", "policy", "page", "identifier"), "live_processes:learner")
-TICK, STEPS = 0.01, 4  # [s] of a peer, in steps of its vehicle
+TICK, STEPS = 0.01, 4  # tick of a peer [s] and steps of its vehicle in a tick
 
 
 class PointVehicle(PeerVehicle):
-    """A point mass that turns as commanded, without JAX: the flights leave little of the cores to the peers."""
+    """A point mass that follows body rates, without JAX, because the flights use most of the cores."""
 
     def _place(self, p, v=None):
         self._state = p.copy(), self.R.copy(), np.zeros(3) if v is None else np.array(v, dtype=float)
@@ -46,7 +46,7 @@ class PointVehicle(PeerVehicle):
 
 
 class View(NamedTuple):
-    """A peer's vehicle at an instant."""
+    """The vehicle of a peer at one time."""
 
     at: float
     p: np.ndarray
@@ -54,17 +54,17 @@ class View(NamedTuple):
     upright: float
     """Cosine of the tilt."""
     follows: bool
-    """Whether commands of retrim, or of its guardian, move it."""
+    """Whether the vehicle follows commands of retrim or of its guardian."""
     flies: bool
     thrust: float
-    """Share of the motors' thrust, where the peer reports it."""
+    """Share of the thrust of the motors, if the peer reports it."""
 
 
 class Rig:
     """A peer that flies in a thread."""
 
-    def __init__(self, peer, plant, rest):
-        self.peer, self.plant, self._rest = peer, plant, rest
+    def __init__(self, peer, plant, reset):
+        self.peer, self.plant, self._reset = peer, plant, reset
         peer.vehicle.close()
         peer.vehicle = PointVehicle(Scenario(plant="simple"), heading=0.0)
         self.views = [self._view()]
@@ -73,15 +73,15 @@ class Rig:
         self._thread.start()
 
     def hover(self):
-        """Put the vehicle in the hands of its autopilot, at HOME."""
+        """Let the autopilot hold the vehicle at HOME."""
         with self.lock:
             self.peer.cut = False
             self.peer.vehicle.hover(HOME)
-            self._rest(self.peer)
+            self._reset(self.peer)
             self.views.clear()
 
     def kick(self, v):
-        """Give the vehicle a velocity, against which a controller commands body rates."""
+        """Set the velocity, so that a controller commands body rates."""
         with self.lock:
             self.peer.vehicle.hover(self.peer.vehicle.p, np.asarray(v))
 
@@ -90,7 +90,7 @@ class Rig:
             return [view for view in self.views if instant <= view.at <= until]
 
     def settle(self, at_least, at_most=8.0):
-        """Wait until the vehicle is at rest, or has landed."""
+        """Wait until the vehicle is at rest or has landed."""
         began = time.monotonic()
         while (now := time.monotonic()) < began + at_most:
             time.sleep(0.1)
@@ -110,7 +110,7 @@ class Rig:
         return View(time.monotonic(), x.p.copy(), x.v.copy(), float(x.R[2, 2]), self.peer.by_rates, x.flies, thrust)
 
     def _run(self):
-        with contextlib.suppress(OSError):  # a vehicle whose time stands still cannot be controlled
+        with contextlib.suppress(OSError):  # pauses of the vehicle would prevent its control
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(25))
         due = time.monotonic()
         while not self._over.is_set():
@@ -122,7 +122,7 @@ class Rig:
 
 
 def run_link(plan):
-    """The process of the link; it needs less time for the thrust at hover, since the peers hover without a wind."""
+    """Run the link process with a short measurement of the thrust at hover, since the peers have no wind."""
     for module in (crazyflie, offboard_plant, ros2):
         module.THRUST_S = 0.5
     vehicle.fly(plan)
@@ -140,7 +140,7 @@ def spec_of(rig, folder, layers=()):
 
 @contextlib.contextmanager
 def add_roles():
-    """Start stand-ins for the page and the identifier, too."""
+    """Add stand-ins for the page and the identifier."""
     before = dict(ROLES)
     try:
         for role in ("page", "identifier"):
@@ -151,7 +151,7 @@ def add_roles():
 
 
 def fly(spec, rig) -> Iterator[DrillSupervisor]:
-    """Fly; yield the flight and its newest status, again and again until it is over."""
+    """Fly; yield the flight with its newest status until its end."""
     rig.hover()
     with DrillSupervisor(spec) as flight:
         for _ in flight.warm_up():
@@ -169,7 +169,7 @@ def fly(spec, rig) -> Iterator[DrillSupervisor]:
 
 @contextlib.contextmanager
 def start_supervised_flight(spec, rig, seconds=0.6):
-    """A flight with a supervisor that can be killed; yield the processes by function once it has flown for a while."""
+    """Fly with a supervisor in a process; after some seconds of flight, yield the processes by function."""
     rig.hover()
     supervisor = launch("live_helpers:supervise", spec, spec.folder / "supervisor.log")
     log, until = spec.folder / "flight.csv", time.monotonic() + 60.0
@@ -187,7 +187,7 @@ def start_supervised_flight(spec, rig, seconds=0.6):
 
 
 def children_of(supervisor):
-    """Return the processes of a flight by the module and the function that each of them runs."""
+    """Return the processes of a flight by module and function."""
     result = {}
     with contextlib.suppress(OSError):
         for pid in map(int, Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()):
@@ -198,7 +198,7 @@ def children_of(supervisor):
 
 
 def kill_all(processes):
-    """Send SIGKILL to all processes of a flight; return when they are dead."""
+    """Send SIGKILL to all processes of a flight."""
     for pid in processes.values():
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""A flight of a rate loop with known delay, lags and thrust map, as measured on board: no attitude, no position."""
+"""A flight of a rate loop with known delay, lags and thrust map: onboard measurements without attitude and position."""
 
 from dataclasses import dataclass
 
@@ -49,33 +49,33 @@ def second_order(u, lag, damping, delay):
 
 def first_order(u, lag):
     """Return the first-order response to ``u``."""
-    keep = np.exp(-DT / lag)
-    return lfilter([0.0, 1.0 - keep], [1.0, -keep], u - u[0]) + u[0]
+    decay = np.exp(-DT / lag)
+    return lfilter([0.0, 1.0 - decay], [1.0, -decay], u - u[0]) + u[0]
 
 
-def wander(rng, n, size, tau, every=10):
+def random_walk(rng, n, size, tau, every=10):
     """Return a mean-reverting random walk, held over ``every`` rows."""
     k, h = n // every + 1, DT * every
-    keep = np.exp(-h / tau)
-    return np.repeat(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], size * rng.normal(size=k)), every)[:n]
+    decay = np.exp(-h / tau)
+    return np.repeat(lfilter([np.sqrt(1.0 - decay**2)], [1.0, -decay], size * rng.normal(size=k)), every)[:n]
 
 
 def fly_body(seconds=16.0, truth=Truth(), seed=0, noise=0.01):
     """Fly random rates and thrusts, with mild measurement noise."""
     rng, n = np.random.default_rng(seed), round(seconds / DT)
-    command = np.stack([wander(rng, n, size, 0.15) for size in (2.0, 2.0, 1.2)], axis=1)
+    command = np.stack([random_walk(rng, n, size, 0.15) for size in (2.0, 2.0, 1.2)], axis=1)
     shapes = ((truth.lag, truth.damping), (truth.lag, truth.damping), (truth.yaw_lag, truth.damping))
     rates = np.stack(
         [truth.gain * second_order(u, *shape, truth.delay) for u, shape in zip(command.T, shapes, strict=True)], axis=1
     )
-    level = truth.hover * (1.0 + np.clip(wander(rng, n, 0.25, 0.5), -0.6, 0.9))
-    mix = 0.05 * np.stack([wander(rng, n, 1.0, 0.1) for _ in range(4)], axis=1)
+    level = truth.hover * (1.0 + np.clip(random_walk(rng, n, 0.25, 0.5), -0.6, 0.9))
+    mix = 0.05 * np.stack([random_walk(rng, n, 1.0, 0.1) for _ in range(4)], axis=1)
     motors = np.clip(level[:, None] + mix - mix.mean(axis=1, keepdims=True), IDLE, 1.0)
     share = ((1.0 - truth.curve) * motors + truth.curve * motors**2).mean(axis=1)
     full = STANDARD_GRAVITY / ((1.0 - truth.curve) * truth.hover + truth.curve * truth.hover**2)
     force = np.zeros((n, 3))
     force[:, 2] = full * first_order(share, truth.thrust_lag)
-    force[:, :2] = 0.3 * np.stack([wander(rng, n, 1.0, 0.3) for _ in range(2)], axis=1)
+    force[:, :2] = 0.3 * np.stack([random_walk(rng, n, 1.0, 0.3) for _ in range(2)], axis=1)
     rates += noise * rng.normal(size=rates.shape)
     force += 20.0 * noise * rng.normal(size=force.shape)
     return BodyFlight(DT * np.arange(n), command, rates, motors, force)

@@ -12,11 +12,11 @@ SIZES = {"float": "f", "uint64_t": "Q", "uint8_t": "B", "bool": "?"}
 
 
 def ulog(topics, stamps) -> bytes:
-    """A ULog.
+    """Return a ULog.
 
     Args:
-        topics: Of each topic, fields as ``{"x": ("float", column), "q": ("float[4]", columns)}``.
-        stamps: Times of its samples [us], of each topic or for all.
+        topics: Fields of each topic as ``{"x": ("float", column), "q": ("float[4]", columns)}``.
+        stamps: Times of the samples [us], for each topic or for all.
     """
 
     def message(kind, data):
@@ -74,13 +74,13 @@ PX4_OLD_ODOMETRY = {
 
 
 def bag2(path: Path, definitions, messages, typestore=None) -> Path:
-    """A bag of ROS 2 as MCAP.
+    """Write a bag of ROS 2 as MCAP.
 
     Args:
-        path: Its folder.
-        definitions: Text of each message type that is not of ROS.
+        path: Folder of the bag.
+        definitions: Text of each message type that ROS does not define.
         messages: Topic, type, time of reception [ns] and fields of each message.
-        typestore: With types of ROS; one of Humble by default.
+        typestore: Types of ROS, by default those of Humble.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -51,7 +51,7 @@ class Imaginary:
     """Made-up training and flights; it records the requests."""
 
     def __init__(self, error):
-        """``error`` of a specification [m]: a number, one for each row of the log, or None for a crash."""
+        """Set ``error`` [m]: a function of a specification that returns a number, an array, or null for a crash."""
         self._error, self.trainings, self.flights = error, [], []
 
     def train(self, preset, seeds, run, reporter):

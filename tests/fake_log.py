@@ -24,7 +24,7 @@ class Flight:
     v: np.ndarray
     a: np.ndarray
     c: np.ndarray
-    """What acts, and what is commanded."""
+    """Thrust, which acts and equals the command [m/s^2]."""
     omega: np.ndarray
 
 

@@ -51,7 +51,7 @@ class FakeNode(Ros2Node):
 
 
 class RemoteNode:
-    """The other end: it publishes messages, and stores those of other nodes."""
+    """The other end: it publishes messages and stores those of other nodes."""
 
     def __init__(self, network):
         self.node, self.publishers, self.messages = network.node(), {}, defaultdict(list)

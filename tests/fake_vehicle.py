@@ -67,7 +67,7 @@ class PointVehicle(VehiclePlant):
 
 
 def entry(**faults):
-    return PlantEntry(lambda request: PointVehicle(request, **faults), "a point that is pushed", is_vehicle=True)
+    return PlantEntry(lambda request: PointVehicle(request, **faults), "a point mass under a push", is_vehicle=True)
 
 
 point, unarmed, lost = entry(), entry(never_arms=True), entry(lost_after=40)

@@ -1,4 +1,4 @@
-"""The response that follows from Betaflight settings, for comparison with a log; and flights that excite a vehicle."""
+"""The response of a vehicle with given Betaflight settings, for comparison with a log, and flights with excitation."""
 
 import math
 import time
@@ -17,14 +17,14 @@ PLAIN = [
     "set tpa_rate = 0", "set dterm_lpf1_dyn_min_hz = 0", "set dterm_lpf1_dyn_max_hz = 0",
     "set dterm_lpf1_static_hz = 0", "set dterm_lpf2_static_hz = 0",
 ]  # fmt: skip
-"""A loop of P and D alone, without a filter of the derivative: its response follows from the two settings."""
+"""A loop with P and D only and an unfiltered derivative: two settings define its response."""
 LOGS = ["set blackbox_device = VIRTUAL", "set blackbox_sample_rate = 1/8"]
 
 
 def compute_response(path, model):
-    """Lag [s] and damping ratio of roll and pitch from the P and D settings in a log's header, and hover throttle.
+    """Return lag [s] and damping ratio from the P and D settings of a log header, and the throttle at hover.
 
-    Motors of time constant tau turn a body by A per throttle: A P / (tau s^2 + (1 + A D) s + A P).
+    Motors with the time constant tau and the authority A give the response A P / (tau s^2 + (1 + A D) s + A P).
     """
     vehicle, coefficient = model.vehicle, model.loop.thrust_map
     data = Path(path).read_bytes()
@@ -48,7 +48,7 @@ def fly_random_rates(plant, seconds, seed=0):
     plant.hold(time.monotonic() + 0.3)
     plant.send(np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0]))
     begin, turn, push = time.monotonic(), np.zeros(3), 0.0
-    fast, slow = math.exp(-0.1), math.exp(-0.025)  # 0.01 s, of 0.1 s and of 0.4 s
+    fast, slow = math.exp(-0.1), math.exp(-0.025)  # decay in 0.01 s with time constants of 0.1 s and 0.4 s
     while (t := time.monotonic() - begin) < seconds:
         s = plant.read()
         turn = fast * turn + math.sqrt(1.0 - fast**2) * rng.normal(size=3) * np.array([1.5, 1.5, 1.0])

@@ -85,9 +85,9 @@ def first_order(tau):
 
 
 def random_field_flight(field, key, *, n=100, delay_ticks=0):
-    """A window of flight under random commands in a world that is Eq. (1) plus ``field`` (x, u) [m/s^2].
+    """Return a window of a flight with random commands; the plant is Eq. (1) plus ``field`` (x, u) [m/s^2].
 
-    Commands act ``delay_ticks`` ticks after they were issued.
+    Commands act after ``delay_ticks`` ticks.
     """
     return _field_flight(field, key, n, delay_ticks)
 

@@ -92,7 +92,7 @@ NUMBERS = {  # JSON and TOML
     "deep list": (5000 * "[" + 5000 * "]",) * 2,
     "deep table": (5000 * '{"a":' + "1" + 5000 * "}", 5000 * "{a=" + "1" + 5000 * "}"),
     "many": ("[" + ",".join(100_000 * "1") + "]",) * 2,
-    # These may be valid for a field: they are accepted, or refused with a line.
+    # These values may be valid for a field; they are accepted, or refused with one line.
     "-0": ("-0.0", "-0.0"),
     "-1": ("-1", "-1"),
     "null": ("null", None),
@@ -111,7 +111,7 @@ class Case:
     name: str
     read: Callable[[], object]
     may_be_read: bool = False
-    """Whether it may be harmless, and is read."""
+    """Whether the case may be valid, so that reading succeeds."""
 
 
 def texts_and_numbers(*, toml: bool) -> Iterator[tuple[str, str]]:
@@ -160,7 +160,7 @@ def with_mark(tables: dict, path: tuple) -> dict:
 
 
 def without_none(tables: dict) -> dict:
-    """Return the tables without None, which TOML does not have."""
+    """Return the tables without null values, which TOML does not have."""
     return {k: without_none(v) if isinstance(v, dict) else v for k, v in tables.items() if v is not None}
 
 
@@ -189,7 +189,7 @@ def _plain(path, name) -> bool:
 
 
 def write(about: dict) -> dict[str, str]:
-    """A header whose texts are written now."""
+    """Return a header with evaluated texts."""
     return {name: text if isinstance(text, str) else text() for name, text in about.items()}
 
 
@@ -537,7 +537,7 @@ def callers() -> Iterator[str]:
 
 
 class AuditHook:
-    """Records what Python does while malicious bytes are read: imports, code, processes, written files, sockets."""
+    """An audit hook that records events during reading: imports, code, processes, written files, sockets."""
 
     EVENTS = (
         "import", "exec", "compile", "pickle.find_class", "subprocess.Popen", "socket.bind", "socket.connect",
@@ -552,13 +552,13 @@ class AuditHook:
         sys.addaudithook(self)
 
     def __call__(self, event: str, args: tuple) -> None:
-        """Take note; Python calls this for ever after, which costs nothing while it is off."""
+        """Record an event; Python always calls this method, which takes little time while it is off."""
         if not self.on:
             return
         paths = event == "open" and isinstance(args[1], str) and set(args[1]) & set("wax+")
         inside = bool(args) and str(args[0]).startswith(self.folder)
         if event == "compile" and args[1] == "<unknown>":
-            return  # ast.literal_eval executes nothing; NumPy reads the headers of arrays with it
+            return  # ast.literal_eval executes no code; NumPy reads the headers of arrays with it
         if event in ("compile", "exec") and any("/jaxtyping/" in name for name in callers()):
             return  # the tests check shapes
         if event in self.EVENTS or event.startswith(self.RUNS) or ((paths or event in self.CHANGES) and not inside):

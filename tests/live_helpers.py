@@ -28,7 +28,7 @@ TOPICS = {"sample": 4096, "setpoint": 4096, "fallback": 4096, "order": 4096, "en
 
 
 class HoverController(AbstractController[Float[Array, ""]]):
-    """HoverController HOME with four gains, and counts its ticks."""
+    """A controller that holds a position with two gains and counts its ticks."""
 
     gains: Float[Array, "2"] = eqx.field(default_factory=lambda: jnp.array([4.0, 3.5]))
     home: tuple[float, ...] = eqx.field(default=tuple(HOME.tolist()), static=True)
@@ -54,7 +54,7 @@ def plan(controller, *, folder=Path(), parent=0, window=50, delay_ticks=1, secon
 
 
 def hover_source(gains=(4.0, 3.5), *, fit_result=False, home=HOME):
-    """Return the controller as programs; ``fit_result`` adds a fitted part without effect."""
+    """Return the programs of the hover controller; ``fit_result`` adds a residual part without effect."""
     if not fit_result:
         return plain_source(setup(), HoverController(jnp.array(gains), tuple(map(float, home))))
     arrays, fixed = eqx.partition(HoverController(jnp.array(gains), tuple(map(float, home))), eqx.is_array)

@@ -1,6 +1,6 @@
-"""Processes for drills: a minimal plant and minimal learners, writers, and a bus of this machine in place of a network.
+"""Processes of drills: a minimal plant, minimal learners, writers, and a local bus that replaces a network.
 
-None of them imports JAX, so that twenty flights cost little.
+The processes do not import JAX, so that twenty flights take little time.
 """
 
 import os
@@ -35,7 +35,7 @@ def rotation(vector):
 
 
 def move(x, u, push=(0.0, 0.0, 0.0)):
-    """Return one tick of a point mass, in steps of a millisecond."""
+    """Return the state of a point mass after one tick, in steps of 1 ms."""
     p, R, v = x[:3].copy(), x[3:12].reshape(3, 3).copy(), x[12:].copy()
     turn = rotation(1e-3 * np.asarray(u[1:]))
     for _ in range(20):
@@ -99,7 +99,7 @@ def nothing(plan) -> None:
 
 
 def write_for_ever(folder: Path, topic: str, room: int) -> None:
-    """Write messages of many lengths; each repeats one byte."""
+    """Write messages of many lengths without end; each message repeats one byte."""
     bus = SharedMemoryBus(folder)
     i = 0
     while True:
@@ -119,7 +119,7 @@ def answer(address: Address, topics: dict[str, int], topic: str, data: bytes) ->
 
 
 class NetworkStandIn(SharedMemoryBus):
-    """A bus in place of a network, which records that a process left it."""
+    """A local bus that replaces a network and records that a process left it."""
 
     def close(self):
         if self._maps:
@@ -129,7 +129,7 @@ class NetworkStandIn(SharedMemoryBus):
 
 @dataclass(frozen=True)
 class LocalAddress(Address):
-    """An address whose network is a bus of this machine."""
+    """An address of a local bus that replaces a network."""
 
     folder: Path = Path()
 

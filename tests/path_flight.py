@@ -1,4 +1,4 @@
-"""An independent closed-loop flight of many vehicles at once, in NumPy: the plant of the evidence document.
+"""An independent closed-loop flight of many vehicles at once in NumPy: the plant of the evidence document.
 
 Point mass, second-order rate loop, first-order lag and gain of the thrust, transport delay, linear drag, steps
 of 2 ms. A cautious PD controller with an observer of the disturbance flies to the origin.

@@ -1,4 +1,4 @@
-"""Processes that simulate an autopilot and its vehicle."""
+"""Processes that simulate an autopilot and a vehicle."""
 
 import contextlib
 import subprocess

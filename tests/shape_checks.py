@@ -1,8 +1,8 @@
-"""Make the check of a nested function once, instead of each time that its definition runs.
+"""Generate the check of a nested function once, instead of at each execution of its definition.
 
-The import hook checks the shapes and types of every function. For a function inside a function, it generates and
-compiles the check again at every call of the outer one, which takes more than a millisecond. The check depends on the
-code and the annotations, so it is kept for each pair of them. All arguments and results are checked as before.
+The import hook checks the shapes and types of every function. For a nested function, it generates and compiles the
+check at every call of the outer function, which takes more than a millisecond. The check depends on the code and the
+annotations, so this module stores one check for each pair. It does not change the checks of arguments and results.
 """
 
 import functools
@@ -17,13 +17,13 @@ _GENERATED = ("_destring_annotation", "_make_fn_with_signature", "_apply_typeche
 
 
 def keep_checks():
-    """Keep the checks that jaxtyping generates for nested functions; keep none if its private names have changed."""
+    """Store the checks that jaxtyping generates for nested functions, if its private names are still the same."""
     module = getattr(jaxtyping, "_decorator", None)
     if not all(hasattr(module, name) for name in _GENERATED):
         return
-    plain, kept, active = jaxtyping.jaxtyped, {}, threading.local()
+    plain, checks, active = jaxtyping.jaxtyped, {}, threading.local()
 
-    def replayed(make):
+    def replay(make):
         @functools.wraps(make)
         def wrapped(*args, **kwargs):
             results = getattr(active, "results", None)
@@ -35,7 +35,7 @@ def keep_checks():
         return wrapped
 
     for name in _GENERATED:
-        setattr(module, name, replayed(getattr(module, name)))
+        setattr(module, name, replay(getattr(module, name)))
 
     @functools.wraps(plain)
     def jaxtyped(fn=None, *, typechecker):
@@ -45,13 +45,13 @@ def keep_checks():
             return plain(fn, typechecker=typechecker)
         try:
             key = fn.__code__, typechecker, tuple((name, _identity(a)) for name, a in fn.__annotations__.items())
-            earlier = kept.get(key)
+            earlier = checks.get(key)
         except TypeError:  # an annotation without a hash
             return plain(fn, typechecker=typechecker)
         active.earlier, active.results = earlier, []
         try:
             result = plain(fn, typechecker=typechecker)
-            kept.setdefault(key, active.results)
+            checks.setdefault(key, active.results)
         finally:
             active.results = None
         return result

@@ -1,4 +1,4 @@
-"""The instructions of the Containerfile, and the program that runs them where there is no daemon."""
+"""The instructions of the Containerfile, and the program that executes them without a daemon."""
 
 import importlib.util
 import json
@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 def container():
     spec = importlib.util.spec_from_file_location("container", ROOT / "tools" / "container.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
+    sys.modules[spec.name] = module  # dataclasses search their module
     spec.loader.exec_module(module)
     yield module
     del sys.modules[spec.name]
@@ -56,9 +56,9 @@ def test_every_installation_is_pinned(instructions):
 
 def test_last_matching_pattern_decides(container):
     patterns = ["*", "!src", "!tools/uv.txt", "**/__pycache__", "*.md", "!README.md"]
-    kept = ["src", "src/a/b.py", "tools/uv.txt", "README.md"]
-    left_out = ["docs", "tools", "tools/mutants.py", "src/a/__pycache__", "src/a/__pycache__/b.pyc", "OTHER.md"]
-    assert [path for path in kept + left_out if not container.is_ignored(path, patterns)] == kept
+    included = ["src", "src/a/b.py", "tools/uv.txt", "README.md"]
+    excluded = ["docs", "tools", "tools/mutants.py", "src/a/__pycache__", "src/a/__pycache__/b.pyc", "OTHER.md"]
+    assert [path for path in included + excluded if not container.is_ignored(path, patterns)] == included
 
 
 def test_copies_have_same_places_as_in_docker(container, tmp_path):

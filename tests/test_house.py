@@ -1,4 +1,4 @@
-"""Automated house rules: layers, docstrings, sizes, imports, and no addresses in the pins."""
+"""Automated house rules: layers, docstrings, sizes, imports, and pins without addresses."""
 
 import ast
 import importlib
@@ -34,8 +34,8 @@ def test_every_package_is_in_a_layer():
     text = (ROOT / "pyproject.toml").read_text()
     (layers,) = re.findall(r"^layers = (\[.*\])$", text, re.M)
     places = {name.strip() for layer in ast.literal_eval(layers) for name in layer.split("|")}
-    apart = {name for name in ROOMS if f'source_modules = ["retrim.{name}"]' in text}
-    assert set(ROOMS) <= places | apart
+    independent = {name for name in ROOMS if f'source_modules = ["retrim.{name}"]' in text}
+    assert set(ROOMS) <= places | independent
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -61,7 +61,7 @@ def test_files_are_small_and_not_named_utils(path):
 
 
 CHANGING = {"Document", "Fallback", "FleetProcess", "GeometricHover", "RollbackMonitor", "Status", "Supervisor"}
-"""Dataclasses that change: a page that grows, what watches processes, and what flies on board without JAX."""
+"""Mutable dataclasses: pages, supervisors of processes, and onboard controllers without JAX."""
 
 
 def test_values_are_frozen():
@@ -83,14 +83,14 @@ def test_packages_have_limited_size(room):
 def test_dataclasses_are_frozen():
     """Exceptions are dataclasses with state: documents, processes, guards."""
 
-    def melt(path):
+    def mutable_classes(path):
         classes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)]
         return {each.name for each in classes for mark in map(ast.unparse, each.decorator_list)
                 if mark.partition("(")[0] == "dataclass" and "frozen=True" not in mark}  # fmt: skip
 
-    rooms = {path.relative_to(HOUSE).parts[0] for path in SOURCES if melt(path)}
+    rooms = {path.relative_to(HOUSE).parts[0] for path in SOURCES if mutable_classes(path)}
     assert rooms <= {"runkit", "live", "onboard"}
-    assert set().union(*map(melt, (HOUSE / "runkit").rglob("*.py"))) == {"Document"}
+    assert set().union(*map(mutable_classes, (HOUSE / "runkit").rglob("*.py"))) == {"Document"}
 
 
 def test_only_viz_imports_matplotlib():
@@ -143,7 +143,7 @@ for words in (["--help"], ["--version"], [], ["fyl"]):
 assert "jax" not in sys.modules, "retrim --help imports jax"
 for module in (*(f"cli.{{name}}" for name in COMMANDS), "onboard.control_process", "onboard.watchdog"):
     __import__(f"retrim.{{module}}")
-    assert not {{"matplotlib", "scipy"}} & set(sys.modules), f"{{module}} begins with what it may never need"
+    assert not {{"matplotlib", "scipy"}} & set(sys.modules), f"{{module}} imports packages that it may not need"
 for package in {packages!r}:
     __import__(package)
 for name in retrim.__all__:

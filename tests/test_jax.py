@@ -1,4 +1,4 @@
-"""The fault of jax 0.10.2 on CPU (jax-ml/jax#39103), and the constraint that keeps it out."""
+"""The fault of jax 0.10.2 on CPU (jax-ml/jax#39103), and the constraint that excludes this version."""
 
 import os
 import subprocess
@@ -28,14 +28,14 @@ def test_batched_products_are_correct_with_default_flags():
 
 
 @pytest.mark.parametrize("imports", ["import jax; from retrim import State", "from retrim import State; import jax"])
-@pytest.mark.parametrize(("calls", "extract"), [(None, "float32"), ("tensorfloat32", "tensorfloat32")])
-def test_products_have_full_single_precision_by_default(calls, extract, imports):
+@pytest.mark.parametrize(("setting", "expected"), [(None, "float32"), ("tensorfloat32", "tensorfloat32")])
+def test_products_have_full_single_precision_by_default(setting, expected, imports):
     """This includes GPUs, whose default is lower; the user's choice has priority, in any order of imports."""
     environment = {name: value for name, value in os.environ.items() if name != "JAX_DEFAULT_MATMUL_PRECISION"}
-    environment |= {} if calls is None else {"JAX_DEFAULT_MATMUL_PRECISION": calls}
+    environment |= {} if setting is None else {"JAX_DEFAULT_MATMUL_PRECISION": setting}
     code = f"{imports}; print(jax.config.jax_default_matmul_precision)"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == extract, done.stderr
+    assert done.stdout.strip() == expected, done.stderr
 
 
 def test_excluded_version_is_not_installed():

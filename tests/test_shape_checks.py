@@ -1,4 +1,4 @@
-"""The check of a nested function is generated once, and checks every definition of it."""
+"""The check of a nested function is generated once and applies to all its definitions."""
 
 import jaxtyping
 import numpy as np
@@ -25,7 +25,7 @@ def make_scale(size, result_size=None, kind=float):
 def test_arguments_and_results_of_every_definition_are_checked():
     for size in (2.0, 3.0, 4.0):
         scale = make_scale(size)
-        np.testing.assert_array_equal(scale(np.zeros(5), 2.0), 2.0 * size)  # each with values of its own
+        np.testing.assert_array_equal(scale(np.zeros(5), 2.0), 2.0 * size)  # with the values of this definition
         with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
             scale(np.zeros((5, 1)), 2.0)
         with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
@@ -38,7 +38,7 @@ def test_check_is_generated_once_for_equal_annotations():
     for kind, value in ((int, 2), (str, "x"), (int, 2)):
         scale = make_scale(1 if kind is int else "", kind=kind)
         with pytest.raises(jaxtyping.TypeCheckError, match="parameters"):
-            scale(np.zeros(5), 2.0)  # by the annotation of this definition, not of an earlier one
+            scale(np.zeros(5), 2.0)  # the annotation of this definition applies, not that of an earlier one
         if kind is int:
             assert scale(np.zeros(5), value).shape == (5,)
     before = len(GENERATED)

@@ -17,7 +17,7 @@ import signal, sys, threading, time
 from pathlib import Path
 from retrim.signals import handle_signals, stop_on_signal
 
-for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # whoever runs the tests may ignore them
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the runner of the tests may ignore them
     signal.signal(number, signal.SIG_DFL)
 stop, out = threading.Event(), Path(sys.argv[1])
 with stop_on_signal(stop):
@@ -26,7 +26,7 @@ with stop_on_signal(stop):
         time.sleep(60.0)
     except KeyboardInterrupt:
         with handle_signals(lambda *_: stop.set()):
-            print("what is said now may have nobody to hear it", flush=True)
+            print("nobody may read this line", flush=True)
             out.write_text(f"kept, {stop.is_set()}")
 """
 
@@ -55,7 +55,7 @@ def test_closed_terminal_saves_finished_work(tmp_path):
     process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
     os.close(theirs)
     begin(out)
-    os.close(ours)  # from now on, writing to it raises an error
+    os.close(ours)  # from now on, writing raises an error
     process.send_signal(signal.SIGHUP)
     assert process.wait(60.0) == 0
     assert out.read_text() == "kept, True"
@@ -64,7 +64,7 @@ def test_closed_terminal_saves_finished_work(tmp_path):
 def test_hangup_ignored_by_nohup_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with handle_signals(lambda *_: pytest.fail("it was answered")):
+        with handle_signals(lambda *_: pytest.fail("the handler was called")):
             signal.raise_signal(signal.SIGHUP)
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from bus_ends import LOCAL, NETWORK, await_message, network, two_ends
+from bus_ends import LOCAL, NETWORK, await_message, network_address, two_ends
 from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
 from retrim.onboard.topics import INTO, OUT
@@ -72,7 +72,7 @@ def test_each_end_writes_its_own_topic(ends):
 
 @pytest.mark.parametrize("backend", NETWORK)
 def test_late_process_receives_last_message_and_continues_version(backend):
-    where = network(backend)
+    where = network_address(backend)
     bus = where.join(TOPICS, listen=True)
     bus.publish("again", b"before")
     version = bus.latest("again").version
