@@ -13,7 +13,7 @@ from retrim.runkit.reporter import Silent
 from retrim.runkit.run import Run
 
 
-def test_time_is_in_units_of_its_moment(monkeypatch):
+def test_units_follow_speed_of_machine(monkeypatch):
     """If the machine becomes ten times slower during a run, the result in units is the same."""
     units, took = iter([0.1, 0.1, 1.0, 1.0, 1.0]), iter([0.3, 1.65, 3.0, 3.0])
     monkeypatch.setattr(timing, "unit", lambda: lambda: next(units))

@@ -21,7 +21,7 @@ def test_message_is_one_line_for_any_quoted_text(kind):
     assert str(kind("plain: 'a' must be b")) == "plain: 'a' must be b"
 
 
-def test_long_line_keeps_its_beginning_and_end():
+def test_long_line_keeps_beginning_and_end():
     line = one_line("start " + 10**7 * "x" + " end")
     assert line.startswith("start x")
     assert line.endswith("x end")

@@ -1,4 +1,4 @@
-"""An exported policy equals JAX in every format; a file with different results is refused."""
+"""An exported policy has the results of JAX in every format; a file with different results is refused."""
 
 import ast
 import shutil

@@ -92,7 +92,7 @@ def test_flight_adapts_under_large_disturbance(protocol, small, tmp_path):
 
 @each_peer
 def test_link_cut_for_one_second_ends_in_landing(protocol, small, tmp_path):
-    """The guard sinks without measurements, holds after the next one, and lands; the log continues."""
+    """The guard sinks without measurements, holds after the next measurement, and lands; the log continues."""
     with start_vehicle(protocol, "--cut", "5", "1"):
         text = output_of(live(small, PEERS[protocol], tmp_path))
     _, rows = read_results(tmp_path)

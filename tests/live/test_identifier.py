@@ -33,7 +33,7 @@ def setup(as_a_user):
 
 @pytest.fixture(scope="module")
 def rows(setup):
-    """Return a flight of a geometric controller: 40 ms of delay, 80 ms of lag, 80 % of the thrust."""
+    """Return rows of a flight with a geometric controller, 40 ms of delay, 80 ms of lag and 80 % of the thrust."""
     vehicle = VehicleSpec(
         name="slow", mass=1.0, inertia=(0.01, 0.01, 0.02), arm=(0.1, 0.1), thrust_max=40.0,
         rates_max=(6.0, 6.0, 4.0), motor_tau=0.03, rate_lag=(0.08, 0.08, 0.08), rate_damping=(1.0, 1.0, 1.0),

@@ -22,7 +22,7 @@ def add_knobs(plant="simple", **scenario):
 
 
 def speeds(plant, ticks):
-    """Velocity after each tick of hover commands."""
+    """Return the velocity after each tick of hover commands."""
     return np.array([np.asarray(plant.step(Command.hover(jnp.zeros(0).dtype))[0].v) for _ in range(ticks)])
 
 

@@ -30,7 +30,7 @@ SECONDS = 7.0
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, as_a_user):
-    """A folder with a small policy in p/."""
+    """Return a folder with a small policy in p/."""
     here = tmp_path_factory.mktemp("user")
     (here / "small.toml").write_text(
         SMALL.replace("num_updates = 150", "num_updates = 150\nnum_envs = 8\nhorizon = 60")

@@ -58,7 +58,7 @@ def status(port, path, *headers):
 
 
 def handshake(page, path="/{token}", host="127.0.0.1:{port}", origin="http://127.0.0.1:{port}", more=()):
-    """Return the status of a WebSocket handshake; None leaves a header out."""
+    """Return the status of a WebSocket handshake; a null value omits a header."""
     port, token, protocol = page
     fill = {"port": port, "next": port + 1, "token": token, "short": token[:-1], "bare": token.swapcase()}
     lines = [f"{name}: {value.format(**fill)}" for name, value in (("Host", host), ("Origin", origin)) if value]

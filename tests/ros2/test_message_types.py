@@ -21,13 +21,13 @@ RCLPY = {
     "nav_msgs/msg/Odometry": "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     "geometry_msgs/msg/PoseStamped": "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
 }
-"""As rclpy 9.1.2 (Kilted) reports them for its own publishers."""
+"""Hashes that rclpy 9.1.2 (Kilted) reports for its publishers."""
 FIRMWARE = {
     "VehicleRatesSetpoint": 0x79992167, "OffboardControlMode": 0x2FF32960, "VehicleCommand": 0xCBA514AF,
     "VehicleOdometry": 0x3AF07476, "TrajectorySetpoint": 0xF614ACDE, "VehicleControlMode": 0x25A90612,
     "VehicleThrustSetpoint": 0x67088E65, "MessageFormatRequest": 0x24E20CB7, "MessageFormatResponse": 0x60A08C2D,
 }  # fmt: skip
-"""As the program of PX4 (main branch of March 2026) contains them."""
+"""Hashes in the program of PX4 (main branch of March 2026)."""
 COMMAND = "px4_msgs/msg/VehicleCommand"
 KINDS = [(name, release) for name, forms in DEFINITIONS.items() for release in forms]
 
