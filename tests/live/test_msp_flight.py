@@ -36,7 +36,7 @@ def wait_for_rows(out, count):
         time.sleep(0.1)
 
 
-def test_the_log_of_a_flight_by_hand_identifies_the_rate_loop(identified):
+def test_log_of_manual_flight_identifies_rate_loop(identified):
     file = tomllib.loads(identified.read_text())
     assert 0.005 < file["rate_lag"][0] < 0.06
     assert 0.01 < file["motor_tau"] < 0.06
@@ -44,7 +44,7 @@ def test_the_log_of_a_flight_by_hand_identifies_the_rate_loop(identified):
 
 
 @pytest.mark.parametrize(("disturbance", "allowance"), [("none", 0.02), ("large", 0.02)])
-def test_a_hover_adapts_and_ends_on_the_ground(policy, disturbance, allowance, tmp_path):
+def test_hover_adapts_and_ends_on_ground(policy, disturbance, allowance, tmp_path):
     with flight(policy, tmp_path, pilot=("--disturbance", disturbance)) as (process, pilot):
         process.wait(120.0)
         text = (tmp_path / "output.txt").read_text()
@@ -60,7 +60,7 @@ def test_a_hover_adapts_and_ends_on_the_ground(policy, disturbance, allowance, t
     assert height < 0.2
 
 
-def test_the_pilot_takes_over_by_the_switch(policy, tmp_path):
+def test_pilot_takes_over_with_switch(policy, tmp_path):
     with flight(policy, tmp_path, "--adapt", "none") as (process, pilot):
         wait_for_rows(tmp_path, 150)
         pilot.turn_switch()
@@ -72,7 +72,7 @@ def test_the_pilot_takes_over_by_the_switch(policy, tmp_path):
     assert tilt < 10.0
 
 
-def test_a_dead_computer_s_guardian_lets_the_vehicle_sink_level(policy, tmp_path):
+def test_guardian_lowers_vehicle_level_after_processes_are_killed(policy, tmp_path):
     """SIGKILL of all processes; without the guardian the board would hold the last body rates for ever."""
     with flight(policy, tmp_path, "--adapt", "none") as (process, pilot):
         wait_for_rows(tmp_path, 150)
