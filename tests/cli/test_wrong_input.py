@@ -211,7 +211,7 @@ def test_refused_flight_prints_no_other_remark(folder, monkeypatch):
         (("fyl",), "no command 'fyl'; did you mean 'fly'?"),
         (("fly", "--latency", "maybe"), "invalid choice 'maybe'"),
         (("fly", "--bogus", "3"), "--bogus"),
-        (("fly", "--seconds", "soon"), "retrim: --seconds: could not convert string to float: 'soon'; `retrim fly --help`"),
+        (("fly", "--seconds", "soon"), "retrim: --seconds: could not convert string to float: 'soon'; `retrim"),
         (("fly", "--policy"), "Missing value for argument '--policy'"),
         (("replay", "log.csv", "--adapt", "full"), "retrim: --adapt full needs --policy; `retrim pretrain hover"),
         (("pretrain",), "required"),
