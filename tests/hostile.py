@@ -23,6 +23,7 @@ import scipy.interpolate
 import scipy.optimize  # noqa: F401
 from jax import random
 
+import retrim.plants.simulations  # noqa: F401  (the registry of plants imports it at its first use)
 from fake_log import MAP, columns, fly_once, write_csv
 from helpers import tiny_preset
 from retrim import Setup, load_learner_state, load_policy
