@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from commands import OVERLAY, results, retrim, start_process
@@ -109,6 +110,18 @@ def test_finished_sweep_flies_nothing_and_smaller_one_reports_its_flights(folder
     rows = [json.loads(line) for line in fly_once(folder / "whole")]
     (mine,) = [r["error"] for r in rows if (r["seed"], r["disturbance"], r["method"]) == (1, "wind=3", "base")]
     assert result[0]["mean"] == pytest.approx(mine)
+
+
+def test_log_of_each_flight_is_written_once(folder):
+    sweep_text = SWEEP.replace("[0, 1]", "[1]").replace('["none", "wind=3"]', '["none"]').replace('"base", ', "")
+    (folder / "logs.toml").write_text("logs = true\n" + sweep_text)
+    out = retrim("sweep", "logs.toml", "--out", "whole", cwd=folder)
+    assert "flying" in out  # the rows exist, but not the logs
+    (row,) = (json.loads(line) for line in fly_once(folder / "whole") if '"log"' in line)
+    with np.load(folder / "whole" / row["log"]) as log:
+        assert log["t"][-1] == pytest.approx(1.2)
+        assert log["error"].min() <= row["error"] <= log["error"].max()
+    assert "flying" not in retrim("sweep", "logs.toml", "--out", "whole", cwd=folder)
 
 
 def test_changed_code_or_files_repeat_training_and_flights(tmp_path, monkeypatch):

@@ -17,10 +17,12 @@ from ..config.trust import check_trust
 from ..config.validation import read_toml, validated
 from ..config.vehicle_file import VehicleSpec
 from ..control.policy import AbstractPolicy
+from ..io.logs.recording import write_npz
 from ..runkit.codecs import rows_codec
 from ..runkit.document import Document, TableSection
 from ..runkit.file_digests import file_digests, preset_names, scenario_names
 from ..runkit.flights import Flight, FlightSpec
+from ..runkit.outputs import recording_of
 from ..runkit.provenance import section_key
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
@@ -59,6 +61,8 @@ class Sweep:
     starts: int = Field(default=1, ge=1, le=100_000, strict=True)
     seconds: float | None = Field(default=None, ge=1.0, le=36_000.0, strict=True)
     """Length of a flight [s]; the task's own by default."""
+    logs: bool = Field(default=False, strict=True)
+    """Whether the log of each flight is written to ``logs/``; its row has the name of the file as ``log``."""
     overlay: dict[str, Any] = Field(default_factory=dict)
     """Values that override every preset's, in the preset format. A vehicle file is relative to the sweep file."""
 
@@ -113,7 +117,7 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     for fleet in fleets:
         for scenario in sweep.scenarios():
             scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # fails if a package is missing
-    rows = _FlightRows(run, reporter)
+    rows = _FlightRows(run, reporter, need_logs=sweep.logs)
     # The keys are made once, before the first flight; a file that changes in the meantime affects only the next run.
     keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
     for preset, of_fleet in zip(presets, keys, strict=True):
@@ -144,7 +148,11 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], rows: "_FlightRows", run:
         return
 
     def on_result(flights: Sequence[Flight]) -> None:
-        rows.add({keys[flight.spec]: {"preset": fleet.preset.name, **record(flight)} for flight in flights})
+        result = dict[str, dict[str, Any]]()
+        for flight in flights:
+            key = keys[flight.spec]
+            result[key] = {"preset": fleet.preset.name, **record(flight), **rows.write_log(key, flight)}
+        rows.add(result)
 
     with reporter.progress(f"flying {fleet.preset.name}") as advance:
         advance(0.0, "compiling the programs of a flight")
@@ -173,15 +181,34 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], rows: "_FlightRows", run:
 class _FlightRows:
     """Rows of completed flights by their keys, one line of JSON each; failed flights and unusable lines fly again."""
 
-    def __init__(self, run: Run, reporter: Reporter) -> None:
-        """Read the rows of an earlier run."""
-        self._store = run.store(reporter)
+    def __init__(self, run: Run, reporter: Reporter, *, need_logs: bool = False) -> None:
+        """Read the rows of an earlier run.
+
+        Args:
+            run: Run whose folder has the rows.
+            reporter: Receives a line about rows that cannot be used.
+            need_logs: Whether each row needs the log of its flight; flights without a log fly again.
+        """
+        self._store, self._folder, self._need_logs = run.store(reporter), run.folder, need_logs
         lines = self._store.get(FLIGHTS, rows_codec()) or ()
         if unusable := sum(not _is_record(row) for row in lines):
             path = self._store.path(FLIGHTS, rows_codec())
             reporter.say(f"{path}: unusable lines, {unusable}; their flights are flown again")
-        self.by_key = {row["key"]: row for row in lines if _is_record(row) and row.get("failed") is None}
+        complete = (row for row in lines if _is_record(row) and row.get("failed") is None)
+        self.by_key = {row["key"]: row for row in complete if not need_logs or self._log(row["key"]).is_file()}
         self.earlier = frozenset(self.by_key)
+
+    def write_log(self, key: str, flight: Flight) -> dict[str, str]:
+        """Write the log of a flight if logs are needed, and return the entry of its row."""
+        if not self._need_logs:
+            return {}
+        path = self._log(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_npz(path, recording_of(flight))
+        return {"log": path.relative_to(self._folder).as_posix()}
+
+    def _log(self, key: str) -> Path:
+        return self._folder / "logs" / f"{key}.npz"
 
     def add(self, rows: Mapping[str, Mapping[str, Any]]) -> None:
         """Add rows by their keys, and store all rows."""
