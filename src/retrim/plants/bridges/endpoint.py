@@ -128,7 +128,7 @@ class SerialEndpoint:
         Raises:
             PlantError: The line does not exist, or pyserial is not installed.
         """
-        serial = import_extra("serial", "mavlink", package="pyserial")
+        serial = import_extra("serial", "mavlink", package="pyserial", kind="a serial line; the extra")
         try:
             self._line = serial.Serial(device, baud, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:

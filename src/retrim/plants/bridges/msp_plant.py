@@ -286,7 +286,7 @@ def _check_installed() -> None:
     if not is_installed("rosbags"):
         raise PlantError(
             "plant 'msp' receives the state over ROS 2, which needs the package 'rosbags'; in a checkout: `uv pip "
-            "install -e '.[ros2]'`; elsewhere: `pip install cyclonedds rosbags`"
+            "install -e '.[msp]'`; elsewhere: `pip install cyclonedds rosbags pyserial`"
         )
 
 
