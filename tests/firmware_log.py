@@ -13,7 +13,8 @@ from retrim.physics.rate_tuning import authority
 from retrim.physics.state import STANDARD_GRAVITY
 
 PLAIN = [
-    *(f"set i_{axis} = 0" for axis in ("roll", "pitch", "yaw")), "set d_max_roll = 0", "set d_max_pitch = 0",
+    *(f"set {term}_{axis} = 0" for term in ("i", "f") for axis in ("roll", "pitch", "yaw")),
+    "set d_max_roll = 0", "set d_max_pitch = 0", "set anti_gravity_gain = 0",
     "set tpa_rate = 0", "set dterm_lpf1_dyn_min_hz = 0", "set dterm_lpf1_dyn_max_hz = 0",
     "set dterm_lpf1_static_hz = 0", "set dterm_lpf2_static_hz = 0",
 ]  # fmt: skip
