@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from .clock import StampClock
+from .pose_velocities import PoseVelocities
 from .vehicle_state import Reading
 
 FRESH_S = 0.5  # [s] without odometry, after which poses are used instead
-SMOOTH_S = 0.03  # [s] over which velocities from differences of poses are smoothed
 RATE_WINDOW_S = 1.0  # [s] over which the rate of states is counted
 MOST_NOTES = 5
 
@@ -20,7 +20,7 @@ class RosStates:
     """Keeps the newest state; messages may be taken in any thread."""
 
     def __init__(self) -> None:
-        self._clock = StampClock()
+        self._clock, self._velocities = StampClock(), PoseVelocities()
         self._odometry_at = -math.inf
         self._arrivals: list[float] = []
         self._one_at_a_time = threading.Lock()
@@ -63,7 +63,7 @@ class RosStates:
         self.take(stamp, p, R, v if in_world else R @ v, R.T @ omega if in_world else omega)
 
     def take_pose(self, message: Any, stamp: float) -> None:
-        """Take geometry_msgs/PoseStamped unless odometry is recent; velocities are smoothed differences of poses."""
+        """Take geometry_msgs/PoseStamped unless odometry is recent; velocities are derived from the last poses."""
         result, now = pose_of(message.pose), time.monotonic()
         if result is None:
             self.ignore("a pose with values that are not finite, or without an attitude")
@@ -73,7 +73,7 @@ class RosStates:
     def take(
         self, stamp: float, p: np.ndarray, R: np.ndarray, v: np.ndarray | None = None, omega: np.ndarray | None = None
     ) -> None:
-        """Take a state in our frames; without velocities, they are derived from the previous state.
+        """Take a state in our frames; without velocities, they are derived from the last poses.
 
         Args:
             stamp: Time at which the state was valid, on the sender's clock [s]; 0 if it is unknown.
@@ -83,30 +83,16 @@ class RosStates:
             omega: Body rates [rad/s].
         """
         with self._one_at_a_time:
-            now, last, jumps = time.monotonic(), self.reading, self._clock.jumps
+            now, jumps = time.monotonic(), self._clock.jumps
             here = self._clock.here(stamp, now)
             if here is None:
                 return
+            if self._clock.jumps > jumps:
+                self._velocities.restart()
             if v is None or omega is None:
-                v, omega = self._velocities(here, p, R, last, was_set=self._clock.jumps > jumps)
+                v, omega = self._velocities.update(here, p, R)
             self._arrivals = [t for t in self._arrivals if now - t < RATE_WINDOW_S] + [now]
             self.reading, self.last_message = Reading(here, p, R, v, omega), now
-
-    def _velocities(
-        self, here: float, p: np.ndarray, R: np.ndarray, last: Reading | None, *, was_set: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return velocity and body rates from the difference of two poses."""
-        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
-
-        if last is None or here - last.stamp > FRESH_S:
-            return np.zeros(3), np.zeros(3)
-        dt = here - last.stamp
-        if was_set or dt < 1e-4:
-            return last.v, last.omega
-        new = dt / (dt + SMOOTH_S)
-        v = last.v + new * ((p - last.p) / dt - last.v)
-        omega = last.omega + new * (Rotation.from_matrix(last.R.T @ R).as_rotvec() / dt - last.omega)
-        return v, omega
 
 
 def pose_of(pose: Any) -> tuple[np.ndarray, np.ndarray] | None:
