@@ -14,7 +14,7 @@ def velocities(times, place, attitude=lambda t: np.eye(3)):
     return np.array([v for v, _ in result]), np.array([omega for _, omega in result])
 
 
-@pytest.mark.parametrize("rate", [30.0, 50.0, 100.0, 333.0])
+@pytest.mark.parametrize("rate", [20.0, 50.0, 100.0, 333.0])
 def test_parabola_and_constant_turn_are_exact(rate):
     times = 1e5 + np.arange(40) / rate
     p0, v0, a0 = np.array([1.0, -2.0, 0.5]), np.array([3.0, 0.2, -1.0]), np.array([-4.0, 9.0, 20.0])
@@ -29,7 +29,7 @@ def test_parabola_and_constant_turn_are_exact(rate):
     np.testing.assert_allclose(omega[5:], np.broadcast_to(turn, omega[5:].shape), atol=1e-5)
 
 
-@pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])
+@pytest.mark.parametrize("rate", [30.0, 50.0, 100.0, 200.0])
 def test_oscillation_of_three_hertz_is_not_late(rate):
     times, w = np.arange(600) / rate, 2.0 * np.pi * 3.0
     v, _ = velocities(times, lambda t: np.array([np.sin(w * t) / w, 0.0, 0.0]))

@@ -5,7 +5,8 @@ from collections import deque
 import numpy as np
 
 WINDOW_S = 0.06  # [s] of poses to which a parabola is fitted; shorter: more noise, longer: wrong for quick motions
-FEWEST, MOST = 4, 60  # poses of a fit
+FEWEST, MOST = 3, 60  # poses of a fit
+PARABOLA_S = 0.025  # [s] of poses from which a parabola is fitted; before, a line
 SHORTEST_S = 1e-4  # [s] between two poses
 LONGEST_S = 0.5  # [s] between two poses, beyond which the series begins again
 
@@ -50,7 +51,7 @@ class PoseVelocities:
         times = np.array([each[0] - t for each in poses])
         places = np.array([each[1] - p for each in poses])
         turns = Rotation.from_matrix(np.array([R.T @ each[2] for each in poses])).as_rotvec()
-        degree = 2 if len(poses) >= FEWEST else 1
+        degree = 2 if len(poses) >= FEWEST and -times[0] > PARABOLA_S else 1
         slope = np.linalg.pinv(np.vander(times, degree + 1, increasing=True))[1]
         self._last = slope @ places, slope @ turns
         return self._last
