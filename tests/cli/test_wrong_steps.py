@@ -35,6 +35,8 @@ def folder(tmp_path_factory, as_a_user):
         "flight.doc": "no log",
         "title.csv": "t,x,y,z\n",
     }
+    (here / "found").mkdir()
+    files["found/vehicle.toml"] = text
     for name, content in files.items():
         (here / name).write_text(content)
     preset = tiny_preset()
@@ -48,6 +50,7 @@ COMMANDS = [
     (("pretrain", "hover", "--vehicle", "kilograms.toml"), "is it the thrust of one rotor? four have 12.8 N"),
     (("pretrain", "hover", "--vehicle", "typo.toml"), "motor_tao: unknown key; did you mean 'motor_tau'?"),
     (("pretrain", "hover", "--vehicle", "id/vehicle.toml"), "id/vehicle.toml: no such file"),
+    (("pretrain", "hover", "--vehicle", "found"), "vehicle 'found' is a folder; state the file: found/vehicle.toml"),
     (("replay", "manual.bfl", "--identify"), "manual.bfl: no such file"),
     (("replay", "empty.bfl", "--identify"), "empty.bfl: it is empty"),
     (("replay", "header.bfl", "--identify"), "the header of the Blackbox log is incomplete"),

@@ -325,14 +325,19 @@ def test_switch_that_is_on_too_early_must_be_turned_off(make):
     board.modes.add(msp.OVERRIDE)
     began = time.monotonic()
 
+    remarks = []
+
     def turn():
         t = time.monotonic() - began
+        remarks.append((t, plant.waits_for))
         (board.modes.add if t > 6.5 else board.modes.discard if t > 2.5 else board.modes.add)(msp.OVERRIDE)
         return True
 
     plant.connect()
     plant.take_off(np.array([0.0, 0.0, 1.0]), 0.0, turn)
     assert time.monotonic() - began > 6.5
+    assert all("turn it off" in text for t, text in remarks if 0.7 < t < 2.4)
+    assert not any(text for t, text in remarks if 3.5 < t < 6.4)
     assert plant.curve.hover == pytest.approx((1335 - 1050) / 950)
 
 

@@ -35,6 +35,8 @@ def vehicle_from(name: str | VehicleSpec) -> str | VehicleSpec:
         return name
     if name.endswith(".toml"):
         return read_vehicle(Path(name))
+    if (path := Path(name) / "vehicle.toml").is_file():
+        raise ConfigError(f"vehicle {name!r} is a folder; state the file: {path}")
     VEHICLES.find(name)
     return name
 

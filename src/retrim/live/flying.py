@@ -18,6 +18,7 @@ from ..io.logs.viewers import can_record, record
 from ..onboard.guard import Mode
 from ..onboard.log_file import log_path
 from ..onboard.messages import ACCOUNTS, COMMAND, MEASURED, PHASE, TRUE
+from ..runkit.earlier_outputs import EarlierOutputs
 from ..runkit.flights import Flight
 from ..runkit.outlet import Outlet
 from ..runkit.outputs import clear_outputs, write_events, write_learner_state, write_state
@@ -75,15 +76,16 @@ def fly_live(
         PlantError: The flight could not begin, or did not write a log.
     """
     run.folder.mkdir(parents=True, exist_ok=True)
-    clear_outputs(run.folder)
-    names = "flight.csv", "flight.npz", "flight.mcap", "results.json"
-    for old in (*run.folder.glob("*.log"), *(run.folder / name for name in names)):
-        old.unlink(missing_ok=True)
     events, outlet = LiveEvents(), Outlet(run.folder)
-    with ExitStack() as screen:  # the display closes last, since a blocked terminal would delay everything else
+    for old in run.folder.glob("*.log"):
+        old.unlink()
+    # The display closes last, since a blocked terminal would delay everything else.
+    with EarlierOutputs(run.folder, ("flight.*", "results.json")) as earlier, ExitStack() as screen:
         with Supervisor(replace(live_spec(request), spare=outlet.spare)) as supervisor:
             if not _warm_up(supervisor, run, reporter):
                 return None
+            earlier.discard()
+            clear_outputs(run.folder)
             page = supervisor.spec.page
             if request.page is not None and page is not None and supervisor.page_port is not None:
                 on_page(page_url(request.page[0], supervisor.page_port, page.token))
@@ -158,7 +160,7 @@ def _warm_up(supervisor: Supervisor, run: Run, reporter: Reporter) -> bool:
     """Wait until all processes are ready; return False if the user interrupted the wait."""
     with reporter.progress("warming up") as advance:
         for waiting, _ in supervisor.warm_up():
-            advance(0.5, f"compiling; not ready: {waiting}")
+            advance(0.5, f"not ready: {waiting}")
             if run.interrupted:
                 reporter.say("interrupted before take-off; the flight did not start")
                 return False

@@ -132,7 +132,8 @@ class Supervisor:
         self.bus.publish("order", pack_note("order", order="take off"))
         while self.bus.latest("airborne") is None:
             self._check_alive()
-            yield self.spec.scenario.entry.awaits, time.monotonic() - began
+            usual = self.spec.scenario.entry.awaits
+            yield str(last_note(self.bus, "world").get("waits_for") or usual), time.monotonic() - began
             time.sleep(0.1)
 
     def land(self) -> None:

@@ -11,6 +11,7 @@ from jax import tree
 from ..config.loading import changed, load, with_vehicle
 from ..config.methods import find_method, learning_methods
 from ..config.setup import Setup
+from ..config.vehicles import name_of
 from ..control.policy import AbstractPolicy
 from ..errors import ConfigError, LogError
 from ..io.logs import BodyLog, FlightLog, read_log, read_map
@@ -32,6 +33,7 @@ from .vehicle import vehicle_toml
 REPORT_MODELS = ("regression", "ensemble", "linear")  # residual models to compare with the baselines
 ENSEMBLE_RATE = 1e-3  # learning rate; with that of hover/paper, an ensemble fits the noise in a real log
 DEFAULT = "hover/retrim"
+UNSTATED = "values that the log does not determine are those of the vehicle in --vehicle"
 SAMPLES = (12, 100_000)  # limits for the number of samples in a fit; the command delay is added to the minimum
 SLOWEST = 0.1  # [s]: the longest tick of a preset; a log's tick may differ slightly
 LOST = 0.5  # [m]: above this error, the corrected model no longer describes the flight
@@ -115,6 +117,8 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
     )
     chosen_map = None if request.map is None else read_map(request.map)
     log = read_log(path, chosen_map, dt=preset.dt, flight=request.flight)
+    if request.identify and request.vehicle is None and request.policy is None:
+        reporter.say(f"{UNSTATED}, which is not stated: {name_of(setup.preset.vehicle)!r}")
     if isinstance(log, BodyLog):
         return replay_body(log, path, setup, run, reporter, identify=request.identify, seed=request.seed,
                            adapt=request.adapt)  # fmt: skip

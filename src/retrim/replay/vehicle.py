@@ -60,10 +60,10 @@ def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str, *, r
     base_lag = None if base.rate_lag is None else base.rate_lag.tolist()
     if (level := identification.rate_lag) is not None:
         yaw = identification.yaw_lag
-        origin = (
-            f"roll and pitch {level.text('ms', 1000.0)}, yaw {yaw.text('ms', 1000.0) if yaw else 'taken for the same'}"
-        )
-        lags = [_limit(each.value) for each in (level, level, yaw or level)]
+        known = yaw.text("ms", 1000.0) if yaw else f"not determined, {'assumed equal' if base_lag is None else 'kept'}"
+        origin = f"roll and pitch {level.text('ms', 1000.0)}, yaw {known}"
+        yaw_lag = _limit((yaw or level).value) if yaw is not None or base_lag is None else base_lag[2]
+        lags = [_limit(level.value), _limit(level.value), yaw_lag]
         lines.append(f"rate_lag = {_row(lags)}  # [s], identified: {origin}")
         if (damping := identification.rate_damping) is not None:
             least, most = DAMPINGS

@@ -42,7 +42,13 @@ def fly(plan: PlantPlan) -> None:
                 if not is_active():
                     return
                 plant.wait(time.monotonic() + HOLD_S)
-            plant.take_off(plan.x0[:3], heading_of(plan.x0[3:12].reshape(3, 3)), is_active)
+
+            def keep_on(link: VehiclePlant = plant) -> bool:
+                if link.waits_for != last_note(bus, "world").get("waits_for", ""):
+                    bus.publish("world", pack_note("world", waits_for=link.waits_for))
+                return is_active()
+
+            plant.take_off(plan.x0[:3], heading_of(plan.x0[3:12].reshape(3, 3)), keep_on)
             plant.now()  # performs the imports of the first call before timing matters
             bus.publish("airborne", pack_note("airborne"))
             while (epoch := last_note(bus, "order").get("epoch")) is None:

@@ -12,8 +12,8 @@ from ..extras import import_extra
 
 LONGEST = 65_535
 FORMS = {
-    "udp": "udp:HOST:PORT, as udp:127.0.0.1:14540,",
-    "tcp": "tcp:HOST:PORT, as tcp:127.0.0.1:5761,",
+    "udp": "udp:HOST:PORT, as udp:127.0.0.1:14540",
+    "tcp": "tcp:HOST:PORT, as tcp:127.0.0.1:5761",
     "serial": "serial:DEVICE:BAUD, as serial:/dev/ttyACM0:921600",
 }
 CLOSED_S = 1e-3  # [s] of a read after the other end has closed, since select then returns at once
@@ -177,7 +177,7 @@ def address_of(text: str, kinds: Sequence[str] = ("udp", "serial")) -> tuple[str
         or not 0 < int(number[-9:]) <= most
         or len(number) > 9
     ):
-        raise ConfigError(f"address {text!r}: expected {' or '.join(FORMS[each] for each in kinds)}")
+        raise ConfigError(f"address {text!r}: expected {', or '.join(FORMS[each] for each in kinds)}")
     return kind, place, int(number)
 
 

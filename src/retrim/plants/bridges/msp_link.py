@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ...errors import MessageError, PlantError
+from ...ros2.backends import is_installed
 from ...ros2.node import Ros2Node
 from . import msp
 from .endpoint import Endpoint, pump
@@ -215,3 +216,16 @@ class MspLink:
             self.channels = msp.numbers(packet.payload)
             if len(self.channels) > THROTTLE and not self.has_mode(msp.OVERRIDE):
                 self.throttles.append(self.board.throttle_at(self.channels))
+
+
+def check_installed() -> None:
+    """Check that the packages of the link are installed, before anything is trained.
+
+    Raises:
+        PlantError: A package is missing.
+    """
+    if not is_installed("rosbags"):
+        raise PlantError(
+            "plant 'msp' receives the state over ROS 2, which needs the package 'rosbags'; in a checkout: `uv pip "
+            "install -e '.[msp]'`; elsewhere: `pip install cyclonedds rosbags pyserial`"
+        )

@@ -11,13 +11,13 @@ from ...errors import ConfigError, PlantError
 from ...onboard.guard import GeometricHover, Limits
 from ...physics.state import STANDARD_GRAVITY
 from ...physics.vehicle import Vehicle
-from ...ros2.backends import BACKENDS, is_installed
+from ...ros2.backends import BACKENDS
 from ..entry import PlantEntry, PlantRequest
 from . import msp
 from .endpoint import address_of, open_endpoint
 from .guardian import Guardian, Phase, SafeCommands
 from .msp_board import ThrustCurve
-from .msp_link import MspLink, StateLink
+from .msp_link import MspLink, StateLink, check_installed
 from .piloted_plant import GO_S, PilotedPlant
 from .polling import KeepOn
 from .ros2 import await_states, connect_link
@@ -32,6 +32,7 @@ ADDRESS = re.compile(
 )
 HOVER_S = 2.0  # [s] over which the pilot's throttle at hover is averaged
 ECHO_S = 0.6  # [s], limit for the board to follow our sticks
+EARLY = "the pilot: MSP OVERRIDE is on too early, and the board ignores the sticks; turn it off, then hover"
 MARK = 0.15  # [rad/s], yaw rate by which our sticks differ from those of a pilot who hovers
 LATE_S = 0.3  # [s], age of a command that the board has not answered
 SILENT_S = 0.5  # [s] without an answer of the board
@@ -158,6 +159,13 @@ class MspPlant(PilotedPlant[MspLink]):
         self._holder = hover
 
     @property
+    def waits_for(self) -> str:
+        """The remedy if the switch is on too early."""
+        link, curve = self._link, self._curve
+        is_early = link is not None and link.has_mode(msp.OVERRIDE) and curve is not None and curve.hover is None
+        return EARLY if is_early else ""
+
+    @property
     def curve(self) -> ThrustCurve:
         """Throttle for a thrust per mass.
 
@@ -281,20 +289,11 @@ def _make(request: PlantRequest) -> MspPlant:
     return MspPlant(request.address, request.dt, *request.limits, strongest, vehicle)
 
 
-def _check_installed() -> None:
-    """Raise an error if the packages are missing, before anything is trained."""
-    if not is_installed("rosbags"):
-        raise PlantError(
-            "plant 'msp' receives the state over ROS 2, which needs the package 'rosbags'; in a checkout: `uv pip "
-            "install -e '.[msp]'`; elsewhere: `pip install cyclonedds rosbags pyserial`"
-        )
-
-
 entry = PlantEntry(
     _make,
     "a Betaflight board with MSP override, and its state from motion capture or odometry over ROS 2",
     is_vehicle=True,
     awaits="the pilot, who hovers at the start and then switches MSP OVERRIDE on",
     check_address=msp_address_of,
-    needs=_check_installed,
+    needs=check_installed,
 )

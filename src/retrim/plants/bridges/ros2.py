@@ -21,6 +21,7 @@ from .target_plant import TargetPlant
 
 WAIT_S, LISTENER_S = 10.0, 5.0  # [s], limits for the first state, and for listeners to the setpoints
 CROWD_S = 25.0  # [s] for which a killed node may still be listed
+SAME = "the same px4_msgs or mavros_msgs at both ends"
 LOOK_EVERY_S = 0.5  # [s] between two looks at the other nodes
 RATE_S, LOWEST_RATE = 1.2, 15.0  # [s], [Hz]: the guard refuses states that are older than 0.1 s
 ENOUGH_THRUSTS = 5
@@ -61,7 +62,9 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
         nonlocal looked
         if time.monotonic() - looked > LOOK_EVERY_S:
             for fault in (*link.faults(), *(note for note in link.notes if "this end has" in note)):
-                raise PlantError(f"{where}: {fault}; use the same px4_msgs or mavros_msgs at both ends")
+                is_state = "PoseStamped" in fault and "Odometry" in fault
+                remedy = "pose=TOPIC for poses, odometry=TOPIC for odometry" if is_state else SAME
+                raise PlantError(f"{where}: {fault}; use {remedy}")
             looked = time.monotonic()
         return link.reading is not None
 

@@ -48,6 +48,11 @@ class VehiclePlant(Plant, abc.ABC):
         """Descriptions of the kinds of ignored messages from the vehicle, each listed once."""
         return ()
 
+    @property
+    def waits_for(self) -> str:
+        """Present reason for which the take-off waits; empty for the usual one, which the plant's entry states."""
+        return ""
+
     @abc.abstractmethod
     def connect(self, keep_on: KeepOn = lambda: True) -> None:
         """Connect, and wait until the vehicle can be armed; return immediately if this is already possible.
