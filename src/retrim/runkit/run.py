@@ -67,7 +67,7 @@ class Run:
         """Return a line on whether the run resumes or replaces earlier results; empty if the folder has none."""
         if any((self.folder / PARTS).glob("*")):
             return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
-        return f"results in {self.folder} are replaced" if any(self.folder.glob("*.json")) else ""
+        return f"results in {self.folder} will be replaced" if any(self.folder.glob("*.json")) else ""
 
     def store(self, reporter: Reporter | None = None) -> Store:
         """Return the store of the run's parts in its folder; ``reporter`` receives lines about unusable files."""
