@@ -117,6 +117,7 @@ def test_log_of_each_flight_is_written_once(folder):
     (folder / "logs.toml").write_text("logs = true\n" + sweep_text)
     out = retrim("sweep", "logs.toml", "--out", "whole", cwd=folder)
     assert "flying" in out  # the rows exist, but not the logs
+    assert len(fly_once(folder / "whole")) == 8  # other rows stay
     (row,) = (json.loads(line) for line in fly_once(folder / "whole") if '"log"' in line)
     with np.load(folder / "whole" / row["log"]) as log:
         assert log["t"][-1] == pytest.approx(1.2)

@@ -143,7 +143,7 @@ def _make_untrained(preset: Preset, sweep: Sweep) -> dict[int, AbstractPolicy]:
 
 def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], rows: "_FlightRows", run: Run, reporter: Reporter) -> None:
     """Fly the missing flights, and store the rows of the completed ones."""
-    missing = [spec for spec, key in keys.items() if key not in rows.by_key]
+    missing = [spec for spec, key in keys.items() if not rows.has(key)]
     if not missing or run.interrupted:
         return
 
@@ -194,9 +194,12 @@ class _FlightRows:
         if unusable := sum(not _is_record(row) for row in lines):
             path = self._store.path(FLIGHTS, rows_codec())
             reporter.say(f"{path}: unusable lines, {unusable}; their flights are flown again")
-        complete = (row for row in lines if _is_record(row) and row.get("failed") is None)
-        self.by_key = {row["key"]: row for row in complete if not need_logs or self._log(row["key"]).is_file()}
-        self.earlier = frozenset(self.by_key)
+        self.by_key = {row["key"]: row for row in lines if _is_record(row) and row.get("failed") is None}
+        self.earlier = frozenset(filter(self.has, self.by_key))
+
+    def has(self, key: str) -> bool:
+        """Return whether a flight is complete: its row exists, and its log if logs are needed."""
+        return key in self.by_key and (not self._need_logs or self._log(key).is_file())
 
     def write_log(self, key: str, flight: Flight) -> dict[str, str]:
         """Write the log of a flight if logs are needed, and return the entry of its row."""
