@@ -222,7 +222,7 @@ def test_hung_learner_is_restarted(tmp_path, monkeypatch):
 
 @pytest.fixture
 def bus_case(tmp_path, monkeypatch):
-    """Return a network, and a ground station whose learners do nothing."""
+    """Return a network, and a ground station with idle learners."""
     network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 

@@ -43,6 +43,5 @@ def usage_text(box: str) -> str:
         elif part:
             break
     text = ATTEMPTS.sub(r"\1: \2", " ".join(part))
-    return text.removeprefix("Error parsing request: ").removeprefix("Error parsing ").rstrip(".") or " ".join(
-        box.split()
-    )
+    text = text.removeprefix("Error parsing request: ").removeprefix("Error parsing ").rstrip(".")
+    return text or " ".join(box.split())

@@ -138,11 +138,11 @@ class Registry(Mapping[str, T], Generic[T]):
         return thing
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is a registered object with this name; nothing is imported."""
+        """Return whether there is a registered object with this name, without importing it."""
         return name in self._objects
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the registered names; nothing is imported."""
+        """Iterate over the registered names, without importing the objects."""
         return iter(self._objects)
 
     def __len__(self) -> int:

@@ -1,8 +1,8 @@
 """Check a vehicle's link without propellers: ``python -m retrim.live.link_check mavlink:udp:0.0.0.0:14540``.
 
-The program connects as a flight does, and arms nothing. Move the vehicle by hand, forwards, to its left and upwards,
-and turn it about each axis: the printed numbers must follow. In the end, the program states whether velocities and body
-rates agree with positions and attitudes.
+The program connects as a flight does, but does not arm the vehicle. Move the vehicle by hand, forwards, to its left and
+upwards, and turn it about each axis: the printed numbers must follow. In the end, the program states whether velocities
+and body rates agree with positions and attitudes.
 """
 
 import argparse

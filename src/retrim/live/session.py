@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import random
+from jaxtyping import Array, Key
 
 from ..adapt.learner_state import LearnerState
 from ..adapt.updates import Layer
@@ -57,16 +58,22 @@ def live_setup(preset: Preset, reference: str | None, method: str) -> Setup:
     Raises:
         ConfigError: The method cannot be used with the preset, or in a live flight.
     """
-    setup, entry = Setup.from_preset(preset, reference), find_method(method)
-    if entry.on_board is not None:
+    setup = Setup.from_preset(preset, reference)
+    if find_method(method).learns is None:
+        _pilot(setup, setup.new_policy(random.key(0)), method, random.key(0))
+    return setup
+
+
+def _pilot(setup: Setup, policy: AbstractPolicy, method: str, key: Key[Array, ""]) -> ControllerPilot:
+    """Return the pilot of a method that does not learn, or raise ``ConfigError`` if the method cannot fly live."""
+    if find_method(method).on_board is not None:
         raise ConfigError(
             f"method {method!r} commands the motors on board; a live flight commands thrust and body rates"
         )
-    if entry.learns is None and method != "base":
-        policy = setup.new_policy(random.key(0))
-        if not isinstance(setup.pilot(policy, method, random.key(0)), ControllerPilot):
-            raise ConfigError(f"method {method!r} must learn or return a ControllerPilot to fly live")
-    return setup
+    pilot = setup.pilot(policy, method, key)
+    if not isinstance(pilot, ControllerPilot):
+        raise ConfigError(f"method {method!r} must learn or return a ControllerPilot to fly live")
+    return pilot
 
 
 def check_limits(fence: float, seconds: float | None, policy_age: float | None) -> None:
@@ -152,9 +159,7 @@ def live_spec(request: LiveRequest) -> LiveSpec:
         controller = adaptive_source(setup, state)
         save_learner_state(start, state, preset)
     else:
-        pilot = setup.pilot(request.policy, request.method, request.flight.key())
-        if not isinstance(pilot, ControllerPilot):
-            raise ConfigError(f"method {request.method!r} must learn or return a ControllerPilot to fly live")
+        pilot = _pilot(setup, request.policy, request.method, request.flight.key())
         controller = plain_source(setup, pilot.controller)
         save_learner_state(start, learner_state(request, request.policy, "full"), preset)
     # Make the hash unique: parameters and learners of a different flight must not match, even with the same controller.

@@ -86,7 +86,7 @@ class TcpEndpoint:
         """Connect.
 
         Raises:
-            PlantError: Nothing accepts the connection within ``patience`` [s].
+            PlantError: The connection is not accepted within ``patience`` [s].
         """
         try:
             self._socket = socket.create_connection((host, port), timeout=patience)

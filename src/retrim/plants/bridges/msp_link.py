@@ -148,7 +148,7 @@ class MspLink:
         self.send(msp.SET_RAW_RC, msp.sticks_payload(channels))
 
     def mirror(self) -> None:
-        """Send the pilot's own sticks, so that a switch that is turned too early changes nothing."""
+        """Send the pilot's own sticks, so that the board continues with them if the switch is turned too early."""
         if self.board is not None and len(self.channels) > THROTTLE and not self.has_mode(msp.OVERRIDE):
             channels = [0] * 4
             for axis in (ROLL, PITCH, YAW, THROTTLE):
