@@ -184,10 +184,11 @@ def test_px4_compensates_load_and_weak_battery_within_three_seconds(tmp_path_fac
     figures, rows = read_results(tmp_path)
     print(f"mean error [m] by 5 s: {[round(float(error(rows, t, t + 5).mean()), 3) for t in range(0, 90, 5)]}")
     assert "flight over: landed" in text
-    # PX4's estimate has an error of 4 to 5 cm, which drifts: windows of 5 s have 4 to 12 cm, with or without a change.
+    # PX4's own position controller has a mean distance of 0.06 m from its mean position in this simulation, since the
+    # simulated sensors are noisy: the estimated tilt has an error of 0.6 degrees, and the velocity of 0.05 m/s.
     spans = [error(rows, since, until).mean() for since, until in ((0.0, 30.0), (33.0, 60.0), (63.0, 90.0))]
     print(f"mean error [m] before, and from 3 s after each change: {np.round(spans, 3).tolist()}")
-    assert max(spans) < 0.10
+    assert max(spans) < 0.06
     assert figures["fallback_ticks"] <= BUSY * len(rows)
 
 
@@ -201,7 +202,7 @@ def test_px4_follows_circle(tmp_path_factory, tmp_path):
     flight = rows[(rows[:, 1] > 6.0) & (rows[:, -1] == Mode.POLICY)]
     print(f"steady error {figures['steady']:.3f} m")
     assert "flight over: landed" in text
-    assert figures["steady"] < 0.2
+    assert figures["steady"] < 0.12
     assert np.ptp(flight[:, 18]) == pytest.approx(2.0, abs=0.3)  # the circle's diameter, along x and y
     assert np.ptp(flight[:, 19]) == pytest.approx(2.0, abs=0.3)
     assert np.abs(flight[:, 20] - 1.0).max() < 0.4

@@ -24,7 +24,7 @@ GROUND_STATION = 14550  # port to which PX4 sends, in addition to the port for a
 PAYLOAD = 14030  # a further port to which PX4 sends
 CAPTURE_RATE = 50.0  # [Hz]: rate of the motion capture
 MOCAP = {
-    "EKF2_EV_CTRL": 15, "EKF2_HGT_REF": 3, "EKF2_GPS_CTRL": 0, "EKF2_BARO_CTRL": 0,
+    "EKF2_EV_CTRL": 15, "EKF2_HGT_REF": 3, "EKF2_GPS_CTRL": 0, "EKF2_BARO_CTRL": 0, "EKF2_RNG_CTRL": 0,
     "EKF2_EV_NOISE_MD": 1, "EKF2_EVP_NOISE": 0.01, "EKF2_EVV_NOISE": 0.02, "EKF2_EVA_NOISE": 0.05,
     "EKF2_EV_DELAY": 8, "EKF2_DELAY_MAX": 20, "EKF2_TAU_POS": 0.1, "EKF2_TAU_VEL": 0.1,
 }  # fmt: skip
