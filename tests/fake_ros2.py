@@ -42,6 +42,10 @@ class FakeNode(Ros2Node):
     def endpoints(self, topic):
         return [end for node, end in self.network.ends[topic] if node is not self and not node.closed]
 
+    def published_topics(self):
+        names = {topic: [end for end in self.endpoints(topic) if end.publishes] for topic in list(self.network.ends)}
+        return {topic: ends[0].type_name for topic, ends in names.items() if ends}
+
     def close(self):
         self.closed = True
 

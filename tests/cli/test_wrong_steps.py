@@ -59,6 +59,7 @@ COMMANDS = [
     (("replay", "title.csv", "--identify"), "it has a header and no sample"),
     (("replay", "first/flight.csv", "--identify", "--policy", "h"), "first/flight.csv: no such file"),
     (("fly", "--policy", "h", "--plant", "second-order", "--vehicle", "id/vehicle.toml"), "no such file"),
+    (("fly", "--policy", "five_inch.toml"), "`retrim pretrain hover --vehicle five_inch.toml` makes one"),
     (("fly", "--policy", "missing", "--disturbance", "large"), "missing: no such file"),
     ((*LIVE, "mavlnk:udp:0.0.0.0:14540"), "did you mean 'mavlink'?"),
     ((*LIVE, "mavlink:udp:0.0.0.0"), "expected udp:HOST:PORT, as udp:127.0.0.1:14540"),

@@ -348,6 +348,25 @@ def test_missing_vehicle_is_reported(connects):
         connects("mavros")
 
 
+@pytest.mark.parametrize(
+    ("topics", "advice"),
+    [
+        ({}, "no other node was found: check the network"),
+        ({"/scan": "std_msgs/msg/String"}, "other nodes publish no odometry and no poses, but /scan"),
+        (
+            {"/mocap/quad": "geometry_msgs/msg/PoseStamped", "/vio": "nav_msgs/msg/Odometry"},
+            "other nodes publish states, for odometry=/vio or pose=/mocap/quad",
+        ),
+        ({"/px4_1/fmu/out/vehicle_odometry": "px4_msgs/msg/VehicleOdometry"}, "other nodes publish states, for px4/px4_1"),
+    ],
+)
+def test_missing_state_names_available_ones(connects, remote, topics, advice):
+    for topic, name in topics.items():
+        remote.publish(topic, name)
+    with pytest.raises(PlantError, match=f"no state arrived on /fmu/out/vehicle_odometry in .*; {advice}"):
+        connects("px4")
+
+
 def test_states_of_other_release_are_refused(connects, periodic):
     def old(remote, t):
         remote.publish(STATE, "px4_msgs/msg/VehicleOdometry", release="1.13")

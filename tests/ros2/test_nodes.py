@@ -75,6 +75,8 @@ def test_other_ends_are_found_with_type_and_hash(nodes):
     (fault,) = mismatches("/x", kind, [end])
     assert "px4_msgs 1.14 (before 1.15) at the other end, and of px4_msgs 1.15 or later here" in fault
     assert there.endpoints("/elsewhere") == []
+    assert there.published_topics()["/fmu/in/vehicle_command"] == "px4_msgs/msg/VehicleCommand"
+    assert "/fmu/in/vehicle_command" not in here.published_topics()
 
 
 def test_keys_and_attachments_equal_rmw_zenoh():

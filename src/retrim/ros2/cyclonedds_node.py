@@ -3,7 +3,7 @@
 import os
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..errors import ConfigError
@@ -91,16 +91,23 @@ class CycloneNode(Ros2Node):
         """Return the publishers and subscriptions that other nodes have on a topic."""
         policies = self._core.Policy
         result = []
-        for reader, publishes in self._builtin:
-            for sample in reader.read(1000):
-                if getattr(sample, "topic_name", "") != f"rt{topic}" or str(sample.participant_key) == self._me:
-                    continue
+        for sample, publishes in self._announcements():
+            if sample.topic_name == f"rt{topic}":
                 text = sample.qos[policies.Userdata].data if policies.Userdata in sample.qos else b""
                 fields = text.decode("ascii", "replace").split(";")
                 type_hash = next((each[len(HASH_KEY) :] for each in fields if each.startswith(HASH_KEY)), "")
                 reliable = policies.Reliability in sample.qos and "Reliable" in repr(sample.qos[policies.Reliability])
                 result.append(Endpoint(ros_name(sample.type_name), type_hash, publishes, reliable))
         return result
+
+    def published_topics(self) -> Mapping[str, str]:
+        """Return the topics on which other nodes publish."""
+        publishers = [sample for sample, publishes in self._announcements() if publishes]
+        return {
+            each.topic_name.removeprefix("rt"): ros_name(each.type_name)
+            for each in publishers
+            if each.topic_name.startswith("rt/")
+        }
 
     def close(self) -> None:
         """Leave the domain."""
@@ -109,6 +116,15 @@ class CycloneNode(Ros2Node):
             self._thread.join(1.0)
         self._readers, self._builtin, self._topics = [], [], {}
         self._participant, self._wait = None, None
+
+    def _announcements(self) -> list[tuple[Any, bool]]:
+        """Return the endpoints of other participants, and whether each of them publishes."""
+        return [
+            (sample, publishes)
+            for reader, publishes in self._builtin
+            for sample in reader.read(1000)
+            if getattr(sample, "topic_name", "") and str(sample.participant_key) != self._me
+        ]
 
     def _receive(self) -> None:
         from cyclonedds.util import duration

@@ -2,7 +2,7 @@
 
 import abc
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
 from ..errors import ConfigError
@@ -84,6 +84,10 @@ class Ros2Node(abc.ABC):
     @abc.abstractmethod
     def endpoints(self, topic: str) -> Sequence[Endpoint]:
         """Return the publishers and subscriptions that other nodes have on a topic, as far as they are discovered."""
+
+    @abc.abstractmethod
+    def published_topics(self) -> Mapping[str, str]:
+        """Return the topics on which other nodes publish, as far as they are discovered, with the types of ROS."""
 
     @abc.abstractmethod
     def close(self) -> None:

@@ -4,7 +4,7 @@ import importlib
 import itertools
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..errors import ConfigError
@@ -73,6 +73,12 @@ class RclpyNode(Ros2Node):
     def endpoints(self, topic: str) -> Sequence[Endpoint]:
         """Return the publishers and subscriptions that other nodes have on a topic."""
         return [each for each, node in self._endpoints(topic) if node != self._name]
+
+    def published_topics(self) -> Mapping[str, str]:
+        """Return the topics on which other nodes publish."""
+        names = [topic for topic, _ in self._node.get_topic_names_and_types()]
+        found = {topic: [each for each in self.endpoints(topic) if each.publishes] for topic in names}
+        return {topic: publishers[0].type_name for topic, publishers in found.items() if publishers}
 
     def close(self) -> None:
         """Leave the network."""

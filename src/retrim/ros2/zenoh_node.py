@@ -5,7 +5,7 @@ import secrets
 import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..errors import ConfigError
@@ -100,15 +100,18 @@ class ZenohNode(Ros2Node):
 
     def endpoints(self, topic: str) -> Sequence[Endpoint]:
         """Return the publishers and subscriptions that other nodes have on a topic."""
-        replies = self._session.liveliness().get(f"{ADMIN}/{self._domain}/**", timeout=LOOK_S)
         result = []
-        for reply in replies:
-            parts = str(reply.ok.key_expr).split("/") if reply.ok is not None else []
-            if len(parts) == 13 and parts[2] != self._me and parts[9] == _mangle(topic) and parts[5] in ("MP", "MS"):
+        for parts in self._announcements():
+            if parts[9] == _mangle(topic):
                 type_hash = "" if parts[11] == NO_HASH else parts[11]
                 reliable = not parts[12].startswith(BEST_EFFORT)
                 result.append(Endpoint(ros_name(parts[10]), type_hash, parts[5] == "MP", reliable))
         return result
+
+    def published_topics(self) -> Mapping[str, str]:
+        """Return the topics on which other nodes publish."""
+        publishers = [parts for parts in self._announcements() if parts[5] == "MP"]
+        return {parts[9].replace("%", "/"): ros_name(parts[10]) for parts in publishers}
 
     def close(self) -> None:
         """Close the session."""
@@ -118,6 +121,12 @@ class ZenohNode(Ros2Node):
     def key(self, topic: str, kind: MessageType) -> str:
         """Return the key of a topic."""
         return f"{self._domain}{topic}/{kind.dds_name}/{kind.hash}"
+
+    def _announcements(self) -> list[list[str]]:
+        """Return the parts of the tokens of other nodes' publishers and subscriptions."""
+        replies = self._session.liveliness().get(f"{ADMIN}/{self._domain}/**", timeout=LOOK_S)
+        tokens = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
+        return [each for each in tokens if len(each) == 13 and each[2] != self._me and each[5] in ("MP", "MS")]
 
     def _token(self, key: str) -> Any:
         return self._session.liveliness().declare_token(key)

@@ -1,7 +1,7 @@
 """A vehicle behind ROS 2 as a plant: PX4's own topics, or those of mavros."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ from .linked_plant import ThrustScale
 from .offboard_plant import THRUST_S, OffboardPlant
 from .polling import KeepOn
 from .ros2_address import Ros2Address, address_of
-from .ros2_link import MavrosLink, Ros2Link
+from .ros2_link import ODOMETRY, POSE, MavrosLink, Ros2Link
 from .ros2_px4_link import Px4Link
 from .target_plant import TargetPlant
 
@@ -25,6 +25,8 @@ SAME = "the same px4_msgs or mavros_msgs at both ends"
 LOOK_EVERY_S = 0.5  # [s] between two looks at the other nodes
 RATE_S, LOWEST_RATE = 1.2, 15.0  # [s], [Hz]: the guard refuses states that are older than 0.1 s
 ENOUGH_THRUSTS = 5
+PX4_STATE = "/fmu/out/vehicle_odometry"
+MOST_STATES = 5  # in a message
 
 L = TypeVar("L", bound=Ros2Link)
 Wait = Callable[[KeepOn, float, KeepOn], bool]
@@ -70,6 +72,7 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
 
     if not until(is_clear, WAIT_S, keep_on):
         remarks = "".join(f"; ignored: {note}" for note in link.notes)
+        remarks += f"; {advice(link.node.published_topics())}"
         raise PlantError(f"{where}: no state arrived on {' or '.join(link.states)} in {WAIT_S:g} s{remarks}")
     looked = 0.0
     until(lambda: is_clear() and not link.topics_without_listener(), LISTENER_S, keep_on)
@@ -86,6 +89,22 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
             f"{where}: states come at {link.rate:g} Hz; at least {LOWEST_RATE:g} Hz are needed on "
             f"{' or '.join(link.states)}"
         )
+
+
+def advice(published: Mapping[str, str]) -> str:
+    """Return the states that are available, as they are written in an address.
+
+    Args:
+        published: Topics on which other nodes publish, with their types.
+    """
+    options = {ODOMETRY: "odometry=", POSE: "pose="}
+    states = sorted(options[kind] + topic for topic, kind in published.items() if kind in options)
+    states += sorted(f"px4{topic.removesuffix(PX4_STATE)}" for topic in published if topic.endswith(PX4_STATE))
+    if states:
+        return f"other nodes publish states, for {' or '.join(states[:MOST_STATES])}"
+    if published:
+        return f"other nodes publish no odometry and no poses, but {', '.join(sorted(published)[:MOST_STATES])}"
+    return "no other node was found: check the network, ROS_DOMAIN_ID and the back end"
 
 
 class MavrosPlant(TargetPlant[MavrosLink]):
