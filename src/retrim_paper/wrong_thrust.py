@@ -36,9 +36,9 @@ class WrongThrust(AbstractController[Any]):
         u, memory = self.inner(memory, t, x)
         return Command(u.c / self.factor.astype(u.c.dtype), u.omega), memory
 
-    def accepted(self, memory: Any, u: Command) -> Any:
+    def accept(self, memory: Any, u: Command) -> Any:
         """Remember the thrust that the accepted command causes according to the assumption."""
-        return self.inner.accepted(memory, Command(u.c * self.factor.astype(u.c.dtype), u.omega))
+        return self.inner.accept(memory, Command(u.c * self.factor.astype(u.c.dtype), u.omega))
 
 
 def _pilot(factor: float, request: MethodRequest) -> Pilot:

@@ -40,7 +40,7 @@ def test_accepted_command_replaces_only_last_command():
     buffer = RollingBuffer(3)
     for i in range(3):
         buffer.push(0.02 * i, at(float(i), 0.0, 1.0), Command(jnp.array(float(i)), jnp.zeros(3)))
-    buffer.accepted(Command(jnp.array(7.0), jnp.ones(3)))
+    buffer.accept(Command(jnp.array(7.0), jnp.ones(3)))
     window = buffer.window()
     np.testing.assert_array_equal(window.u.c, [0.0, 1.0, 7.0])
     np.testing.assert_array_equal(window.u.omega[:, 0], [0.0, 0.0, 1.0])

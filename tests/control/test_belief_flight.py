@@ -96,10 +96,10 @@ def fly(plant, controller, x0, ticks=200, *, senses=True):
     def tick(carry, k):
         sim, memory = carry
         now = controller.with_inertial(*plant.inertial(sim, k)) if senses else controller
-        u, memory = now(memory, plant.time(k, sim.a.dtype), plant.measured(sim))
+        u, memory = now(memory, plant.time(k, sim.a.dtype), plant.measure(sim))
         return (plant.advance(sim, plant.within_limits(u), k), memory), (plant.true(sim), memory)
 
-    return lax.scan(tick, (first, controller.init(plant.measured(first))), jnp.arange(ticks))[1]
+    return lax.scan(tick, (first, controller.init(plant.measure(first))), jnp.arange(ticks))[1]
 
 
 @pytest.fixture(scope="module")

@@ -222,7 +222,7 @@ def test_observer_excludes_known_residual(key):
     def observe():
         memory = in_frame.init(x)
         first = observer(memory.observer, jnp.array(-0.02), x)
-        memory = replace_fields(memory, observer=observer.issued(first, u))  # no delay is declared: it acts at once
+        memory = replace_fields(memory, observer=observer.issue(first, u))  # no delay is declared: it acts at once
         after = Hybrid(PointMass(0.02), residual).step(x, u, jnp.zeros(3))
         _, memory = in_frame(memory, jnp.array(0.0), after)
         apart = StateDependentResidual(residual, jnp.array(1.0))(x, u) + d, residual(x, u)
@@ -267,7 +267,7 @@ def test_pose_filter_estimate_rotates_image(key):
         start = calm.init(frame.state(x))
         expected, _ = calm((start[0], frame.command(last)), jnp.array(0.0), frame.state(x))
         commands = frame.command(u).vector(), expected.vector()
-        return commands, (after[1], u), (controller.accepted(after, last)[1], last)
+        return commands, (after[1], u), (controller.accept(after, last)[1], last)
 
     back = PointMass(0.02).step(State(x.p, x.R, -x.v), Command.hover(), jnp.zeros(3))
     assert_close(back.p, x.p)  # it hovers: a tick ago it was here
@@ -367,7 +367,7 @@ def test_known_rate_bias_is_subtracted_from_command(key):
             x, memory = carry
             u, memory = controller(memory, 0.02 * i, x)
             x = model.step(x, u, jnp.zeros(3))
-            return (x, controller.accepted(memory, u)), x
+            return (x, controller.accept(memory, u)), x
 
         x = State.at(HOME + 0.1)
         return lax.scan(tick, (x, controller.init(x)), jnp.arange(10.0))[1]
@@ -404,7 +404,7 @@ class HoverInAnyFrame(AbstractController[None]):
     def __call__(self, memory, t, x):
         return Command.hover(x.p.dtype), memory
 
-    def accepted(self, memory, u):
+    def accept(self, memory, u):
         return memory
 
 

@@ -82,9 +82,9 @@ def test_inner_controller_receives_accepted_commands_and_ages(setup):
     controller = make(setup, "geometric-i")
     _, memory = eqx.filter_jit(controller)(controller.init(HERE), jnp.array(0.0), HERE)
     u = Command(jnp.array(7.0), jnp.array([1.0, -2.0, 0.5]))
-    accepted_command = controller.accepted(memory, u)
+    accepted_command = controller.accept(memory, u)
     assert eqx.tree_equal(accepted_command.last, u)
-    assert eqx.tree_equal(accepted_command.inner, controller.inner.accepted(memory.inner, u))
+    assert eqx.tree_equal(accepted_command.inner, controller.inner.accept(memory.inner, u))
     assert not eqx.tree_equal(accepted_command.inner, memory.inner)
     assert float(controller.with_age(0.015).inner.prediction.age) == pytest.approx(0.015)
 

@@ -37,7 +37,7 @@ def _observe(observer, key, ticks, noise, late, turning, d, thrust_tau):
         s, x, queue, thrust = carry
         k, k_noise, t = xs
         u = command(k)
-        s = observer.issued(s, u)
+        s = observer.issue(s, u)
         queue = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), queue, u)
         acting = jax.tree.map(lambda leaf: leaf[0], queue)
         c, thrust = (acting.c, thrust) if thrust_tau is None else apply_lag(thrust, acting.c, DT, thrust_tau)
@@ -89,7 +89,7 @@ def test_estimate_is_held_while_command_at_limit_acts(key):
         at_limit = acting.c < 1.0
         lift = jnp.where(at_limit, 1.0, 0.0) * 9.0 * x.R[:, 2]
         x = model.step(x, acting, D + lift)
-        s = observer.issued(observer(s, t, x), message)
+        s = observer.issue(observer(s, t, x), message)
         return (s, x, message), (s.d_hat, at_limit)
 
     message = [hover] * 50 + [idle] * 20 + [hover] * 50
@@ -128,7 +128,7 @@ def test_error_is_close_to_best_constant_filter(key):
     def error(observer):
         def tick(s, xs):
             v, t = xs
-            s = observer.issued(observer(s, t, State(jnp.zeros(3), jnp.eye(3), v)), Command.hover(jnp.float64))
+            s = observer.issue(observer(s, t, State(jnp.zeros(3), jnp.eye(3), v)), Command.hover(jnp.float64))
             return s, s.d_hat
 
         first = observer.init(State.at(jnp.zeros(3)))
@@ -143,7 +143,7 @@ def test_irregular_intervals_are_not_disturbance():
     """The first measurement has no predecessor, and an interval with a missed tick has a different length."""
     observer, model, u = make(wander=np.inf), PointMass(DT), Command(jnp.array(12.0), jnp.array([0.5, 0.0, 0.0]))
     x = State(jnp.zeros(3), so3.exp(jnp.array([0.3, -0.3, 0.0])), jnp.array([1.0, 0.0, 0.0]))
-    step = jax.jit(lambda s, t, x: observer.issued(observer(s, t, x), u))
+    step = jax.jit(lambda s, t, x: observer.issue(observer(s, t, x), u))
     advance = jax.jit(lambda x: model.step(x, u, D))
     s = step(observer.init(x), jnp.array(0.0), x)
     np.testing.assert_array_equal(s.d_hat, 0.0)

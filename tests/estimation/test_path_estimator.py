@@ -34,9 +34,9 @@ def estimates(estimator, s, rows, age, every, inertial):
 
     def tick(s, row):
         k, t, p, R, v, omega, a, u = row
-        s = estimator.measured(s, t, State(p, R, v), omega if inertial else None, a if inertial else None, age)
+        s = estimator.observe(s, t, State(p, R, v), omega if inertial else None, a if inertial else None, age)
         s = jax.lax.cond((k + 1) % every == 0, lambda s: estimator.estimate_path(s), lambda s: s, s)
-        return estimator.issued(s, Command.of(u)), s.estimate
+        return estimator.issue(s, Command.of(u)), s.estimate
 
     return jax.lax.scan(tick, s, rows)
 
@@ -92,14 +92,14 @@ path_posterior = jax.jit(lambda channel, prior: posterior.path_posterior(channel
 predicted = jax.jit(lambda channel, prior: channel.predicted_by(path_posterior(channel, prior)))
 responses = jax.jit(lambda cells, hover: posterior.responses(cells, jnp.zeros(()), jnp.zeros(()), hover, DT))
 yaw_features = jax.jit(lambda history: history.features(DT)[3:])
-issued = jax.jit(CommandHistory.issued)
+issue = jax.jit(CommandHistory.issue)
 
 
 @jax.jit
-def measured(channel, features, value, kinds):
+def observe(channel, features, value, kinds):
     zero = jnp.zeros(())
     sample = Sample(value[None], jnp.zeros((1, 0)), jnp.array(True), kinds, zero, zero)
-    return channel.measured(features, sample, jnp.ones(()), DT, may_jump=True)
+    return channel.observe(features, sample, jnp.ones(()), DT, may_jump=True)
 
 
 def _linear_channel(kind, kinds, sigma, n=60):
@@ -116,11 +116,11 @@ def _linear_channel(kind, kinds, sigma, n=60):
         e_old = e
         rows.append(features)
         values.append(value)
-        channel = measured(channel, jnp.array(features[None]), jnp.array(value), jnp.array(kinds))
+        channel = observe(channel, jnp.array(features[None]), jnp.array(value), jnp.array(kinds))
         if k % 10 == 9:
             channel = predicted(channel, prior)
         u = np.array([0.0, 0.0, 0.0, rng.choice([-1.0, 1.0])])
-        history = issued(history, jnp.array(u))
+        history = issue(history, jnp.array(u))
     return channel, prior, np.array(rows), np.array(values)
 
 

@@ -36,7 +36,7 @@ def test_prediction_equals_lagged_model(delay, key):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), soon, model.state(after))
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), acting, after.actuators.command)
         u = random_command(k)
-        memory = prediction.issued(memory, u)
+        memory = prediction.issue(memory, u)
         queue.append(u)
         s = model.step(s, queue.pop(0), d)
 
@@ -45,8 +45,8 @@ def test_prediction_uses_accepted_commands(key):
     x, (k_a, k_b) = random_state(key), random.split(key)
     prediction = prediction_of(TAU, 1)
     commands, accepted_command = random_command(k_a), random_command(k_b)
-    message = prediction.accepted(prediction.issued(prediction.init(x), commands), accepted_command)
-    model = prediction.issued(prediction.init(x), accepted_command)
+    message = prediction.accept(prediction.issue(prediction.init(x), commands), accepted_command)
+    model = prediction.issue(prediction.init(x), accepted_command)
     for a, b in zip(prediction(message, x, jnp.zeros(3)), prediction(model, x, jnp.zeros(3)), strict=True):
         jax.tree.map(np.testing.assert_array_equal, a, b)
 
@@ -55,7 +55,7 @@ def test_old_measurement_is_predicted_to_present(key):
     """The predicted position of a vehicle in a steady turn, measured 20 ms late, is its true position."""
     x, u = random_state(key), random_command(key)
     prediction = prediction_of(0.0, 0)
-    memory = prediction.issued(prediction.init(x), u)
+    memory = prediction.issue(prediction.init(x), u)
     now = PointMass(DT).step(x, u, jnp.zeros(3))
     late, _ = prediction.with_age(DT)(memory, x, jnp.zeros(3))
     np.testing.assert_allclose(late.R, now.R, atol=1e-9)
@@ -75,7 +75,7 @@ def test_prediction_with_fractional_delay_and_underdamped_rate_loop(key):
     expected = {}
     for n, u in enumerate(commands):
         expected[arrivals[n]] = prediction(memory, x, d) if n == len(commands) - 1 else None
-        memory = prediction.issued(memory, u)
+        memory = prediction.issue(memory, u)
         for k in range(round(n * DT / fine), round((n + 1) * DT / fine)):
             x, actuators = _fine_step(model, response, commands, arrivals, k, x, actuators, d)
     ((at, result),) = ((at, result) for at, result in expected.items() if result is not None)

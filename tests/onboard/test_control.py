@@ -288,7 +288,7 @@ def test_controller_memory_has_clipped_command():
         def __call__(self, memory, t, x):
             return Command(jnp.full_like(x.p[0], 99.0), jnp.zeros_like(x.p)), jnp.full_like(x.p, 99.0)
 
-        def accepted(self, memory, u):
+        def accept(self, memory, u):
             return jnp.full_like(memory, 1.0) * u.c
 
     flight = Flight(plain_source(setup(), RecordsAccepted()))

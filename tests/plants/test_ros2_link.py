@@ -357,7 +357,10 @@ def test_missing_vehicle_is_reported(connects):
             {"/mocap/quad": "geometry_msgs/msg/PoseStamped", "/vio": "nav_msgs/msg/Odometry"},
             "other nodes publish states, for odometry=/vio or pose=/mocap/quad",
         ),
-        ({"/px4_1/fmu/out/vehicle_odometry": "px4_msgs/msg/VehicleOdometry"}, "other nodes publish states, for px4/px4_1"),
+        (
+            {"/px4_1/fmu/out/vehicle_odometry": "px4_msgs/msg/VehicleOdometry"},
+            "other nodes publish states, for px4/px4_1",
+        ),
     ],
 )
 def test_missing_state_names_available_ones(connects, remote, topics, advice):

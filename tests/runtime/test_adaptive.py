@@ -167,7 +167,7 @@ def test_updates_are_applied_in_order_and_sent_to_all_learners(trained_policy):
         for k in range(9):
             u = controller.act(measurement)
             if k < 8:
-                controller.accepted(Command.of(jnp.asarray(log.u[k + 1])))
+                controller.accept(Command.of(jnp.asarray(log.u[k + 1])))
                 measurement, _ = plant.step(Command.of(jnp.asarray(log.u[k + 1])))
     np.testing.assert_allclose(u.vector(), log.u[9], rtol=1e-12)
 

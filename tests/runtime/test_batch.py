@@ -110,7 +110,7 @@ class IncreasingThrust(AbstractController[Command]):
         u = Command(1.5 * memory.c, memory.omega + 40.0)
         return u, u
 
-    def accepted(self, memory, u):
+    def accept(self, memory, u):
         return u
 
 

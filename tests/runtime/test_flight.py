@@ -158,7 +158,7 @@ def test_log_and_observation_have_accepted_command(key):
             u, memory = controller(memory, jnp.array(0.02 * k), x)
             result.append(u.vector())
             if message:
-                memory = controller.accepted(memory, limit(u))
+                memory = controller.accept(memory, limit(u))
         return np.stack(result)
 
     np.testing.assert_allclose(replay(message=True), commands, atol=1e-12)
@@ -181,9 +181,9 @@ def test_window_of_log_equals_window_in_flight(key):
             buffer.push(measurement.t, measurement.x, u, measurement.age)
             return u
 
-        def accepted(self, u):
-            inner.accepted(u)
-            buffer.accepted(u)
+        def accept(self, u):
+            inner.accept(u)
+            buffer.accept(u)
 
     log = fly(OddPlant(sensors="rough", limit=limit), BufferingPilot(), START, ticks=15)
     observation, window = buffer.window(), log.window(10)

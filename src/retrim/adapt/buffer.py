@@ -30,7 +30,7 @@ class RollingBuffer:
         leaves, self._structure = jax.tree.flatten((x, u))
         self._rows.append((t, age, [np.asarray(leaf) for leaf in leaves]))
 
-    def accepted(self, u: Command) -> None:
+    def accept(self, u: Command) -> None:
         """Replace the last command with the one that the plant accepted."""
         late = [np.asarray(leaf) for leaf in jax.tree.leaves(u)]
         _, _, leaves = self._rows[-1]

@@ -137,7 +137,7 @@ def estimate_path(estimator: PathEstimator, window: Window) -> PathEstimate:
 
     def tick(s: PathState, row: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:
         t, x, u, valid, age = row
-        memory = estimator.issued(estimator.measured(s, t, x, age=age), u)
+        memory = estimator.issue(estimator.observe(s, t, x, age=age), u)
         return jax.tree.map(lambda new, old: jnp.where(valid, new, old), memory, s), None
 
     def piece(s: PathState, rows: tuple[Array, State, Command, Array, Array]) -> tuple[PathState, None]:

@@ -74,7 +74,7 @@ def _fly() -> None:
         u = pilot.act(measurement)
         measurement, accepted_command = plant.step(u)
         if accepted_command is not u:
-            pilot.accepted(accepted_command)
+            pilot.accept(accepted_command)
         took.append(time.perf_counter() - began)
         due += dt
         left = due - time.perf_counter()

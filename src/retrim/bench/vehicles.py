@@ -117,7 +117,7 @@ class Air:
 def _launch(simulations: Simulation, starts: State) -> tuple[SimState, Array]:
     def launch(simulation: Simulation, x0: State) -> tuple[SimState, Array]:
         s = simulation.launch(x0)
-        return s, simulation.measured(s).vector()
+        return s, simulation.measure(s).vector()
 
     start: tuple[SimState, Array] = eqx.filter_vmap(launch)(simulations, starts)
     return start
@@ -128,7 +128,7 @@ def _step(simulations: Simulation, state: SimState, u: Array, tick: Array) -> tu
     def step(simulation: Simulation, s: SimState, u: Array) -> tuple[SimState, Array, Array]:
         accepted_command = simulation.within_limits(Command.of(u))
         s = simulation.advance(s, accepted_command, tick)
-        return s, simulation.measured(s).vector(), accepted_command.vector()
+        return s, simulation.measure(s).vector(), accepted_command.vector()
 
     result: tuple[SimState, Array, Array] = eqx.filter_vmap(step)(simulations, state, u)
     return result

@@ -64,10 +64,10 @@ class ActuatorTracking(AbstractController[TrackingState]):
 
     def __call__(self, memory: TrackingState, t: Float[Array, ""], x: State) -> tuple[Command, TrackingState]:
         """Return the command of the inner controller, which receives the present thrust and body rates."""
-        rates = memory.rates.measured(x, self.age, self.path, self.dt, self.omega)
+        rates = memory.rates.observe(x, self.age, self.path, self.dt, self.omega)
         u, inner = self.inner.with_actuators(rates.path.actuators)(memory.inner, t, x)
-        return u, TrackingState(rates.issued(u, self.path, self.dt), inner)
+        return u, TrackingState(rates.issue(u, self.path, self.dt), inner)
 
-    def accepted(self, memory: TrackingState, u: Command) -> TrackingState:
+    def accept(self, memory: TrackingState, u: Command) -> TrackingState:
         """Remember the accepted command."""
-        return TrackingState(memory.rates.accepted(u, self.path, self.dt), self.inner.accepted(memory.inner, u))
+        return TrackingState(memory.rates.accept(u, self.path, self.dt), self.inner.accept(memory.inner, u))

@@ -91,9 +91,9 @@ class BeliefFlight(AbstractController[BeliefState]):
         u, inner = self._flying(caution.apply(belief))(memory.inner, t, x)
         return Command(u.c / gain, u.omega), BeliefState(belief, gain, inner, caution)
 
-    def accepted(self, memory: BeliefState, u: Command) -> BeliefState:
+    def accept(self, memory: BeliefState, u: Command) -> BeliefState:
         """Remember the accepted command."""
-        inner = self._flying(memory.caution.apply(memory.belief)).accepted(
+        inner = self._flying(memory.caution.apply(memory.belief)).accept(
             memory.inner, Command(u.c * memory.gain, u.omega)
         )
         return dataclasses.replace(memory, inner=inner)
@@ -165,15 +165,13 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
         if self.excitation is not None:
             doublet = self.excitation(t, path.estimate)
             u = Command(u.c + doublet.c.astype(u.c.dtype), u.omega + doublet.omega.astype(u.omega.dtype))
-            flight = follower.accepted(flight, u)
-        return u, IdentifiedState(self.estimator.issued(path, u), flight)
+            flight = follower.accept(flight, u)
+        return u, IdentifiedState(self.estimator.issue(path, u), flight)
 
-    def accepted(self, memory: IdentifiedState, u: Command) -> IdentifiedState:
+    def accept(self, memory: IdentifiedState, u: Command) -> IdentifiedState:
         """Remember the accepted command."""
-        path = self.estimator.accepted(memory.path, u)
-        return IdentifiedState(
-            path, self.follow(vehicle_estimate(self.family, path.estimate)).accepted(memory.flight, u)
-        )
+        path = self.estimator.accept(memory.path, u)
+        return IdentifiedState(path, self.follow(vehicle_estimate(self.family, path.estimate)).accept(memory.flight, u))
 
     @property
     def identifies(self) -> bool:

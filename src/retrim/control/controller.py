@@ -44,7 +44,7 @@ class AbstractController(eqx.Module, Generic[M]):
             The command, and the new memory with the same shapes.
         """
 
-    def accepted(self, memory: M, u: Command) -> M:
+    def accept(self, memory: M, u: Command) -> M:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
         del u
         return memory
@@ -167,7 +167,7 @@ class PolicyController(AbstractController[tuple[Any, Command]]):
         u = self.policy(o)
         return u, (memory_of_observation, u)
 
-    def accepted(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
+    def accept(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
         """Remember ``u`` as the last command."""
         return memory[0], u
 

@@ -54,9 +54,9 @@ class FiniteController(AbstractController[FiniteMemory[Any]]):
         )
         return last, FiniteMemory(inner, last, is_finite)
 
-    def accepted(self, memory: FiniteMemory[Any], u: Command) -> FiniteMemory[Any]:
+    def accept(self, memory: FiniteMemory[Any], u: Command) -> FiniteMemory[Any]:
         """Remember ``u`` as the last command."""
-        return FiniteMemory(self.base.accepted(memory.inner, u), u, memory.is_finite)
+        return FiniteMemory(self.base.accept(memory.inner, u), u, memory.is_finite)
 
     def with_age(self, age: float | Float[Array, ""]) -> "FiniteController":
         """Return the same controller for measurements that are ``age`` seconds old."""

@@ -86,8 +86,8 @@ class GeometricController(AbstractController[GeometricState]):
         integral = jnp.clip(memory.integral + dt * (setpoint.p - x.p), -bound, bound)
         acceleration = self.gains.acceleration(x, setpoint, integral)
         u = command_for(x, thrust_of(acceleration), setpoint, self.gains.turning()).within(self.low, self.high)
-        return u, GeometricState(self.prediction.issued(memory.underway, u), integral)
+        return u, GeometricState(self.prediction.issue(memory.underway, u), integral)
 
-    def accepted(self, memory: GeometricState, u: Command) -> GeometricState:
+    def accept(self, memory: GeometricState, u: Command) -> GeometricState:
         """Remember the accepted command."""
-        return GeometricState(self.prediction.accepted(memory.underway, u), memory.integral)
+        return GeometricState(self.prediction.accept(memory.underway, u), memory.integral)

@@ -150,7 +150,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         u, inner = flying.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
         u = Command(u.c, u.omega - bias)
-        return u, GravityFrameState(observer.issued(observer_state, u), inner, frame, load)
+        return u, GravityFrameState(observer.issue(observer_state, u), inner, frame, load)
 
     def _observe(
         self,
@@ -179,11 +179,11 @@ class GravityFrame(AbstractController[GravityFrameState]):
         pull, load = self.load.plan(load, t, (self.lead + self.age).astype(x.p.dtype), dt)
         return after, load, pull
 
-    def accepted(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
+    def accept(self, memory: GravityFrameState, u: Command) -> GravityFrameState:
         """Remember the accepted command in the observer and, transformed to the frame, in the inner controller."""
-        observer = self.observer.accepted(memory.observer, u)
+        observer = self.observer.accept(memory.observer, u)
         command = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
-        return GravityFrameState(observer, self.inner.accepted(memory.inner, command), memory.frame, memory.load)
+        return GravityFrameState(observer, self.inner.accept(memory.inner, command), memory.frame, memory.load)
 
     def _bias(self, dtype: Any) -> Float[Array, "3"]:
         return (self.trust_residual * self.rate_bias).astype(dtype)
@@ -223,7 +223,7 @@ class PoseFrame(AbstractController[tuple[Any, Command]]):
         u = frame.world_command(u)
         return u, (pose, u)
 
-    def accepted(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
+    def accept(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
         """Remember the accepted command."""
         return memory[0], u
 

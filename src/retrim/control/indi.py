@@ -87,8 +87,8 @@ class IndiController(AbstractController[IncrementalState]):
         acceleration = self.gains.acceleration(soon, setpoint, jnp.zeros_like(x.p))
         command = command_for(soon, thrust_of(acceleration) + excess, setpoint, self.gains.turning())
         u = command.within(self.low, self.high)
-        return u, IncrementalState(self.prediction.issued(memory.underway, u), x, excess, t.astype(a.dtype))
+        return u, IncrementalState(self.prediction.issue(memory.underway, u), x, excess, t.astype(a.dtype))
 
-    def accepted(self, memory: IncrementalState, u: Command) -> IncrementalState:
+    def accept(self, memory: IncrementalState, u: Command) -> IncrementalState:
         """Remember the accepted command."""
-        return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))
+        return dataclasses.replace(memory, underway=self.prediction.accept(memory.underway, u))

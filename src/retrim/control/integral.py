@@ -48,9 +48,9 @@ class IntegralAction(AbstractController[IntegralState]):
         """Return the disturbance that the inner controller expects."""
         return self.inner.disturbance(memory.inner, x, u)
 
-    def accepted(self, memory: IntegralState, u: Command) -> IntegralState:
+    def accept(self, memory: IntegralState, u: Command) -> IntegralState:
         """Pass the accepted command to the inner controller."""
-        return IntegralState(memory.integral, self.inner.accepted(memory.inner, u))
+        return IntegralState(memory.integral, self.inner.accept(memory.inner, u))
 
     def with_vehicle(self, member: Member) -> "IntegralAction":
         """Return the same controller for an identified vehicle."""

@@ -71,9 +71,9 @@ class LapLearning(WrappedController[LapState]):
         u, inner = set_shift(self.inner, shift)(memory.inner, t, x)
         return u, LapState(shift, inner)
 
-    def accepted(self, memory: LapState, u: Command) -> LapState:
+    def accept(self, memory: LapState, u: Command) -> LapState:
         """Pass the accepted command to the inner controller."""
-        return LapState(memory.shift, set_shift(self.inner, memory.shift).accepted(memory.inner, u))
+        return LapState(memory.shift, set_shift(self.inner, memory.shift).accept(memory.inner, u))
 
     def _correct(self, shift: Float[Array, "3 h"], t: Float[Array, ""], x: State) -> Float[Array, "3 h"]:
         phase, lap = self.reference.phase(t), self.reference.phase_lap

@@ -146,11 +146,11 @@ class Monitor(AbstractController[MonitorState]):
         u, flight = flying(memory.flight, t, x)
         return u, self._judge(dataclasses.replace(memory, flight=flight), t, x)
 
-    def accepted(self, memory: MonitorState, u: Command) -> MonitorState:
+    def accept(self, memory: MonitorState, u: Command) -> MonitorState:
         """Remember the accepted command."""
         trust = (memory.stage == Stage.ADAPTED).astype(u.c.dtype)
         frame = dataclasses.replace(self.frame, trust_residual=trust)
-        return dataclasses.replace(memory, flight=frame.accepted(memory.flight, u))
+        return dataclasses.replace(memory, flight=frame.accept(memory.flight, u))
 
     def condition(self, memory: MonitorState) -> Condition:
         """Return the stage of the next command, and the cause of this stage."""

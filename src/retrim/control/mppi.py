@@ -98,11 +98,11 @@ class MppiController(AbstractController[MppiState]):
         mean = plans @ weights
         u = Command.of(mean[0])
         plan = jnp.concatenate([mean[1:], mean[-1:]])
-        return u, MppiState(self.prediction.issued(underway, u), plan, estimate, x, memory.tick + 1)
+        return u, MppiState(self.prediction.issue(underway, u), plan, estimate, x, memory.tick + 1)
 
-    def accepted(self, memory: MppiState, u: Command) -> MppiState:
+    def accept(self, memory: MppiState, u: Command) -> MppiState:
         """Remember the accepted command."""
-        return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))
+        return dataclasses.replace(memory, underway=self.prediction.accept(memory.underway, u))
 
     def _colour(self, dtype: jnp.dtype) -> Float[Array, "horizon horizon"]:
         """Return the matrix that gives independent numbers the correlation exp(-|difference| / time constant)."""

@@ -40,9 +40,9 @@ class NearTarget(AbstractController[Any]):
         near = jnp.where(distance > reach, target + away * (reach / distance), x.p)
         return self.inner(memory, t, State(near, x.R, x.v))
 
-    def accepted(self, memory: Any, u: Command) -> Any:
+    def accept(self, memory: Any, u: Command) -> Any:
         """Pass the accepted command to the inner controller."""
-        return self.inner.accepted(memory, u)
+        return self.inner.accept(memory, u)
 
     def with_vehicle(self, member: Member) -> "NearTarget":
         """Return the same controller for an identified vehicle."""

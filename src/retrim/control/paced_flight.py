@@ -102,9 +102,9 @@ class PacedFlight(WrappedController[PacedState]):
         u, inner = set_clock(self.inner, now)(memory.inner, t, x)
         return u, PacedState(now, share, memory.least, peak, inner)
 
-    def accepted(self, memory: PacedState, u: Command) -> PacedState:
+    def accept(self, memory: PacedState, u: Command) -> PacedState:
         """Pass the accepted command to the inner controller."""
-        inner = set_clock(self.inner, memory.clock).accepted(memory.inner, u)
+        inner = set_clock(self.inner, memory.clock).accept(memory.inner, u)
         return dataclasses.replace(memory, inner=inner)
 
     def _disturbances(self, memory: Any, points: Point) -> Float[Array, "n 3"]:

@@ -73,9 +73,9 @@ class PoseFilteredController(AbstractController[PoseFilteredState]):
         u, inner = controller(memory.inner, t, here)
         return u, PoseFilteredState(poses, inner, u)
 
-    def accepted(self, memory: PoseFilteredState, u: Command) -> PoseFilteredState:
+    def accept(self, memory: PoseFilteredState, u: Command) -> PoseFilteredState:
         """Remember the accepted command, here and in the inner controller."""
-        return PoseFilteredState(memory.observation, self.inner.accepted(memory.inner, u), u)
+        return PoseFilteredState(memory.observation, self.inner.accept(memory.inner, u), u)
 
     def _estimate(self, poses: Any) -> State:
         estimator = self.observation.state_estimator

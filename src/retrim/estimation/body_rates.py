@@ -51,7 +51,7 @@ class BodyRates(eqx.Module):
         """Present body rates [rad/s]."""
         return self.path.actuators.command.omega
 
-    def measured(
+    def observe(
         self,
         x: State,
         age: Float[Array, ""],
@@ -81,7 +81,7 @@ class BodyRates(eqx.Module):
         corrected_state = ActuatorState(Command(acting.command.c, acting.command.omega + error), slope)
         return dataclasses.replace(self, R=x.R, path=dataclasses.replace(self.path, actuators=corrected_state))
 
-    def issued(self, u: Command, path: CommandPath, dt: float) -> "BodyRates":
+    def issue(self, u: Command, path: CommandPath, dt: float) -> "BodyRates":
         """Return the prediction for the end of the tick that begins with the command ``u``.
 
         Args:
@@ -92,7 +92,7 @@ class BodyRates(eqx.Module):
         mean, after = path(self.path, u, dt)
         return BodyRates(self.R, self.path, after, mean.omega, self.mean)
 
-    def accepted(self, u: Command, path: CommandPath, dt: float) -> "BodyRates":
+    def accept(self, u: Command, path: CommandPath, dt: float) -> "BodyRates":
         """Return the prediction after the plant accepted ``u`` instead of the command that was issued last."""
         mean, after = path(self.before, u, dt)
         after = jax.tree.map(lambda new, old: new.astype(old.dtype), after, self.path)

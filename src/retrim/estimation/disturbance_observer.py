@@ -111,7 +111,7 @@ class DisturbanceObserver(eqx.Module):
     def __call__(self, s: ObserverState, t: Float[Array, ""], x: State) -> ObserverState:
         """Return the memory with the estimate corrected by the new measurement.
 
-        Call the observer once per tick, then :meth:`issued` with the command of the new tick.
+        Call the observer once per tick, then :meth:`issue` with the command of the new tick.
 
         Args:
             s: Memory.
@@ -152,11 +152,11 @@ class DisturbanceObserver(eqx.Module):
             comparable &= is_unsaturated(self.arrival(s), self.limits)
         return where(comparable, after, result)
 
-    def issued(self, s: ObserverState, u: Command) -> ObserverState:
+    def issue(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""
         return dataclasses.replace(s, commands=s.commands.push(u))
 
-    def accepted(self, s: ObserverState, u: Command) -> ObserverState:
+    def accept(self, s: ObserverState, u: Command) -> ObserverState:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
         return dataclasses.replace(s, commands=s.commands.amend(u))
 

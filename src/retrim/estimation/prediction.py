@@ -93,10 +93,10 @@ class Prediction(eqx.Module):
             x = runge_kutta(x, mean, d, h)
         return x, actuators.command
 
-    def issued(self, s: Underway, u: Command) -> Underway:
+    def issue(self, s: Underway, u: Command) -> Underway:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""
         return Underway(self.acted(s)[1], s.queue.push(u))
 
-    def accepted(self, s: Underway, u: Command) -> Underway:
+    def accept(self, s: Underway, u: Command) -> Underway:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
         return Underway(s.before, s.queue.amend(u))

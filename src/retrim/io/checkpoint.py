@@ -55,7 +55,9 @@ def read_policy(
     path = Path(path)
     file = path / "policy.safetensors" if path.is_dir() else path
     if file.suffix == ".toml":
-        raise CheckpointError(f"{file}: a TOML file is not a policy; `retrim pretrain hover --vehicle {file}` makes one")
+        raise CheckpointError(
+            f"{file}: a TOML file is not a policy; `retrim pretrain hover --vehicle {file}` makes one"
+        )
     data = read_bounded(file, "`retrim pretrain hover --out DIR` makes one")
     try:
         if wire.kind_of(data, source=str(file)) == "learnt":

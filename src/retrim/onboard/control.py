@@ -74,7 +74,7 @@ class ControlLoop:
             u = self.pilot.act(t, 0.0, x)
             Setpoint(i, began, u, self.pilot.target(t)).pack()
             took.append(time.monotonic() - began)
-            self.pilot.accepted(u)
+            self.pilot.accept(u)
             self.pilot.predict(x, u)
             self._fallback.hover.command(x, x[:3])
         self._fallback.rest()
@@ -180,7 +180,7 @@ class ControlLoop:
             if target and np.isfinite(u).all():
                 self._command = self.plan.limits.within(u)
                 if (self._command != u).any():
-                    self.pilot.accepted(self._command)
+                    self.pilot.accept(self._command)
                 self.error = float(np.linalg.norm(sample.state[:3] - self._target))
                 return self._command
             wrong = "the policy's command is not finite" if target else "the target is not finite"
@@ -229,7 +229,7 @@ class ControlLoop:
         if lost_ticks * self.plan.dt > self.plan.limits.state_age:
             self._gap = f"{lost_ticks} measurements were not answered"
         if self.mode == Mode.POLICY and np.abs(accepted_u - self._command).max() > 1e-4:
-            self.pilot.accepted(accepted_u)
+            self.pilot.accept(accepted_u)
         self._finish_row(None if lost_ticks else accepted_u)
         self._commands.append(accepted_u)
         self._end_samples = None if lost_ticks else (before, sample)

@@ -100,14 +100,14 @@ class LivePilot:
         if self._left:
             u = u + self._jump * self._left / BLEND
             self._left -= 1
-            self.accepted(u)
+            self.accept(u)
         return u
 
     def rehearse(self, t: float, age: float, x: np.ndarray) -> None:
         """Compute a command and discard it; the pilot's memory does not change."""
         self._decide.step(self._prepared[1], [*self._memory, self._scalar(t), self._scalar(age), *self._state(x)])
 
-    def accepted(self, u: np.ndarray) -> None:
+    def accept(self, u: np.ndarray) -> None:
         """Correct the memory if the plant accepted ``u`` instead of the last issued command."""
         command = [self._scalar(u[0]), u[1:].astype(self._source.dtype)]
         self._memory = self._acceptance.step(self._prepared[2], [*self._memory, *command])

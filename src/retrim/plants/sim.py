@@ -144,7 +144,7 @@ class Simulation(eqx.Module):
         """
         return jnp.asarray(tick, dtype) * self.model.dt
 
-    def measured(self, s: SimState) -> State:
+    def measure(self, s: SimState) -> State:
         """Return the newest sample that has arrived, as the measurement system reports it."""
         if s.reports is not None:
             return s.reports.reported
@@ -262,12 +262,12 @@ class SimPlant(Plant):
         truth, rotors = simulation.true(state), simulation.model.rotor_state(state.model)
         rates, speeds = simulation.model.body_rates(state.model), None if rotors is None else rotors.motors
         if simulation.sensors is None:
-            x = simulation.measured(state)
+            x = simulation.measure(state)
             return Measurement(t, x, rates, state.a, speeds, truth=truth)
         omega, a = (
             (None, state.a) if rates is None else _inertial(simulation.undisturbed(), state, np.int32(self._ticks))
         )
-        return Measurement(t, simulation.measured(state), omega, a, speeds, age=simulation.age, truth=truth)
+        return Measurement(t, simulation.measure(state), omega, a, speeds, age=simulation.age, truth=truth)
 
     def stop(self) -> None:
         """Discard the flight state."""

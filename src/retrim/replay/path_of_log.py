@@ -34,7 +34,7 @@ def path_of_log(log: FlightLog) -> PathEstimate:
 def _estimate(estimator: PathEstimator, rows: tuple[jax.Array, ...]) -> PathEstimate:
     def tick(s: PathState, row: tuple[jax.Array, ...]) -> tuple[PathState, None]:
         t, p, R, v, c, omega = row
-        return estimator.issued(estimator.measured(s, t, State(p, R, v)), Command(c, omega)), None
+        return estimator.issue(estimator.observe(s, t, State(p, R, v)), Command(c, omega)), None
 
     def batch(s: PathState, part: tuple[jax.Array, ...]) -> tuple[PathState, None]:
         return estimator.estimate_path(jax.lax.scan(tick, s, part)[0]), None

@@ -89,10 +89,10 @@ class AdaptivePilot(Pilot):
             self._apply(t, tick)  # a skip is visible at the tick of its offer
         return u
 
-    def accepted(self, u: Command) -> None:
+    def accept(self, u: Command) -> None:
         """Remember the accepted command in the buffer and in the observation."""
-        self._buffer.accepted(u)
-        self._pilot.accepted(u)
+        self._buffer.accept(u)
+        self._pilot.accept(u)
 
     def learn(self, state: LearnerState, t: float) -> None:
         """Adopt a learner state from a different source, and let the learners continue from it.

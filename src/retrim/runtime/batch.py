@@ -48,7 +48,7 @@ class Ticks(eqx.Module):
 def take_off(simulation: Simulation, controller: AbstractController[Any], x0: State) -> InFlight:
     """Return a flight that begins at ``x0``."""
     sim = simulation.launch(x0)
-    return in_flight(controller, sim, simulation.measured(sim))
+    return in_flight(controller, sim, simulation.measure(sim))
 
 
 def in_flight(controller: AbstractController[Any], sim: SimState, measurement: State) -> InFlight:
@@ -92,14 +92,14 @@ def fly_ticks(
         s, k = flight.sim, flight.tick
         inertial = simulation.inertial(s, k)
         now = controller if inertial is None else controller.with_inertial(*inertial)
-        command, memory = now(flight.memory, simulation.time(k, s.a.dtype), simulation.measured(s))
+        command, memory = now(flight.memory, simulation.time(k, s.a.dtype), simulation.measure(s))
         accepted_command = simulation.within_limits(command)
         is_limited = jnp.any(accepted_command.vector() != command.vector())
-        memory = where(is_limited, controller.accepted(memory, accepted_command), memory)
+        memory = where(is_limited, controller.accept(memory, accepted_command), memory)
         s, condition = simulation.advance(s, accepted_command, k), controller.condition(memory)
         vehicle, clock = controller.vehicle(memory), controller.clock(memory)
         return InFlight(s, memory, k + 1), Ticks(
-            simulation.true(s), simulation.measured(s), command, accepted_command, condition, vehicle, clock
+            simulation.true(s), simulation.measure(s), command, accepted_command, condition, vehicle, clock
         )
 
     def step(i: Array, carry: tuple[InFlight, Ticks]) -> tuple[InFlight, Ticks]:

@@ -142,7 +142,7 @@ def _phases(clocks: Clock, t: np.ndarray) -> np.ndarray:
 def _launch(simulations: Simulation, starts: State) -> tuple[SimState, State]:
     def launch(simulation: Simulation, x0: State) -> tuple[SimState, State]:
         sim = simulation.launch(x0)
-        return sim, jax.tree.map(lambda leaf: leaf[None], simulation.measured(sim))
+        return sim, jax.tree.map(lambda leaf: leaf[None], simulation.measure(sim))
 
     start: tuple[SimState, State] = eqx.filter_vmap(launch)(simulations, starts)
     return start

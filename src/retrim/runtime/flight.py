@@ -226,7 +226,7 @@ def fly(
             u = pilot.act(measurement)
             measurement, accepted_command = plant.step(u)
             if accepted_command is not u:
-                pilot.accepted(accepted_command)
+                pilot.accept(accepted_command)
             _tell(everyone, measurement, accepted_command, pilot.take_events())
             t = measurement.t - start
             phase.append(pilot.task_time(t))

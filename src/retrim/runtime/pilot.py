@@ -44,7 +44,7 @@ class Pilot(abc.ABC):
         self.reset(measurement)
         self.act(measurement)
 
-    def accepted(self, u: Command) -> None:
+    def accept(self, u: Command) -> None:
         """Receive the command ``u`` that the plant accepted instead of the command issued last."""
         del u
 
@@ -110,9 +110,9 @@ class ControllerPilot(Pilot):
             self._events.append(Event(self._t, "vehicle", vehicle.note()))
         return u
 
-    def accepted(self, u: Command) -> None:
+    def accept(self, u: Command) -> None:
         """Correct the controller's memory of its last command."""
-        self._memory = self.controller.accepted(self._memory, u)
+        self._memory = self.controller.accept(self._memory, u)
 
     def task_time(self, t: float) -> float:
         """Return the phase of the controller's clock; for a controller without a clock, return ``t``."""

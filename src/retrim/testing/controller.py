@@ -32,5 +32,5 @@ def check_controller(controller: AbstractController[Any], *, x0: State | None = 
     require(shapes(memory) == shapes(later), "the memory keeps its shapes")
     same, _ = step(controller, memory, t, start)
     close(as_numpy(u), as_numpy(same), 0.0, "the same memory, time and state give the same command")
-    memory_after = controller.accepted(later, Command.hover())
+    memory_after = controller.accept(later, Command.hover())
     require(shapes(memory_after) == shapes(later), "a corrected memory keeps its shapes")

@@ -134,8 +134,8 @@ class DattController(AbstractController[DattState]):
         ahead = jax.vmap(self.task.target)(times)
         mean, _ = self.net(datt_observation(soon, acting, d, ahead))
         u = datt_command(mean, self.low, self.high)
-        return u, DattState(self.prediction.issued(memory.underway, u), estimate, x)
+        return u, DattState(self.prediction.issue(memory.underway, u), estimate, x)
 
-    def accepted(self, memory: DattState, u: Command) -> DattState:
+    def accept(self, memory: DattState, u: Command) -> DattState:
         """Remember the accepted command."""
-        return dataclasses.replace(memory, underway=self.prediction.accepted(memory.underway, u))
+        return dataclasses.replace(memory, underway=self.prediction.accept(memory.underway, u))

@@ -113,7 +113,7 @@ class Channel(eqx.Module):
             zero, zero, response, spread, zero + noise, jnp.array(0), zero, zero, zero, region,
         )  # fmt: skip
 
-    def measured(
+    def observe(
         self, features: Float[Array, "axes m"], sample: Sample, keep: Float[Array, ""], dt: float, *, may_jump: bool
     ) -> "Channel":
         """Return the channel after one tick.

@@ -1,8 +1,8 @@
 """Estimate the command path online: delay, lags, damping and gains between commands and the vehicle's motion.
 
-Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimator.issued` with the new command, and
-:meth:`PathEstimator.accepted` if the plant accepted a different one. For a batch of ticks, call
-:meth:`PathEstimator.measured` in each and :meth:`PathEstimator.estimate_path` at the end. All arrays have fixed shapes.
+Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimator.issue` with the new command, and
+:meth:`PathEstimator.accept` if the plant accepted a different one. For a batch of ticks, call
+:meth:`PathEstimator.observe` in each and :meth:`PathEstimator.estimate_path` at the end. All arrays have fixed shapes.
 """
 
 import dataclasses
@@ -130,10 +130,10 @@ class PathEstimator(eqx.Module):
         a: Float[Array, "3"] | None = None,
         age: Float[Array, ""] | float = 0.0,
     ) -> PathState:
-        """Return the memory after a measurement, with a new estimate; for the arguments, see :meth:`measured`."""
-        return self.estimate_path(self.measured(s, t, x, omega, a, age))
+        """Return the memory after a measurement, with a new estimate; for the arguments, see :meth:`observe`."""
+        return self.estimate_path(self.observe(s, t, x, omega, a, age))
 
-    def measured(
+    def observe(
         self,
         s: PathState,
         t: Float[Array, ""],
@@ -172,8 +172,8 @@ class PathEstimator(eqx.Module):
             turn_reading = Reading(omega, jnp.all(jnp.abs(omega) < RATE), DIRECT, jnp.zeros_like(age), 0.0)
             turning = omega
         now = s.channels
-        rates = now.rates.measured(features[1:3], turn_reading.sample(slice(0, 2), none[1:3]), keep, dt, may_jump=False)
-        yaw = now.yaw.measured(features[3:], turn_reading.sample(slice(2, 3), none[3:]), keep, dt, may_jump=False)
+        rates = now.rates.observe(features[1:3], turn_reading.sample(slice(0, 2), none[1:3]), keep, dt, may_jump=False)
+        yaw = now.yaw.observe(features[3:], turn_reading.sample(slice(2, 3), none[3:]), keep, dt, may_jump=False)
 
         has_settled = certain & (s.elapsed > SETTLING)
         up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype)
@@ -183,7 +183,7 @@ class PathEstimator(eqx.Module):
         other = jnp.concatenate([drag[None], fading])[None]
         lift = jnp.sum(axis * ((x.v - s.x.v) / dt + up)) - STANDARD_GRAVITY
         lift_sample = Reading(lift[None], has_settled, DIFFERENCE, age, dt).sample(slice(0, 1), other)
-        thrust = now.thrust.measured(features[:1], lift_sample, keep, dt, may_jump=True)
+        thrust = now.thrust.observe(features[:1], lift_sample, keep, dt, may_jump=True)
         force = now.force
         if a is not None:
             # The accelerometer has no latency, even if the attitude does.
@@ -192,7 +192,7 @@ class PathEstimator(eqx.Module):
             lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
             usable = has_settled & jnp.all(jnp.abs(a) < ACCELERATION)
             now_read = Reading(lift[None], usable, DIRECT, jnp.zeros_like(age), dt)
-            force = force.measured(features[:1], now_read.sample(slice(0, 1), other), keep, dt, may_jump=True)
+            force = force.observe(features[:1], now_read.sample(slice(0, 1), other), keep, dt, may_jump=True)
         channels = Channels(rates, yaw, thrust, force)
         return PathState(history, x, t, s.elapsed + dt, consistency, channels, s.estimate)
 
@@ -201,11 +201,11 @@ class PathEstimator(eqx.Module):
         channels, estimate = _estimate(s.channels, self.rates, self.yaw, self.thrust, self.dt)
         return dataclasses.replace(s, channels=channels, estimate=estimate)
 
-    def issued(self, s: PathState, u: Command) -> PathState:
+    def issue(self, s: PathState, u: Command) -> PathState:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""
-        return dataclasses.replace(s, history=s.history.issued(_from_hover(u)))
+        return dataclasses.replace(s, history=s.history.issue(_from_hover(u)))
 
-    def accepted(self, s: PathState, u: Command) -> PathState:
+    def accept(self, s: PathState, u: Command) -> PathState:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""
         return dataclasses.replace(s, history=s.history.replaced(_from_hover(u)))
 

@@ -25,7 +25,7 @@ class CommandHistory(eqx.Module):
         """Return the history of a vehicle that has hovered until now."""
         return cls(jnp.zeros((int(ages(dt)[-1]) + 1, 4)))
 
-    def issued(self, u: Float[Array, "4"]) -> "CommandHistory":
+    def issue(self, u: Float[Array, "4"]) -> "CommandHistory":
         """Return the history after one more command."""
         return CommandHistory(jnp.concatenate([self.commands[1:], u[None].astype(self.commands.dtype)]))
 

@@ -124,7 +124,7 @@ def _source(setup: Setup, controller: Any, prediction: Any, parameters: dict[str
         return (u.c, u.omega, condition.stage, condition.cause, clock.phase, clock.pace, clock.growth), after
 
     def accept(parameters: Any, inputs: Any) -> Any:
-        return controller(parameters).accepted(*inputs)
+        return controller(parameters).accept(*inputs)
 
     programs = {
         "init": numpy_program(init, parameters, x),

@@ -149,7 +149,7 @@ def _start(estimator: PathEstimator, x: State) -> EstimatorState:
 def _measure(
     estimator: PathEstimator, s: EstimatorState, t: Float[Array, ""], x: State, age: Float[Array, ""], u: Command
 ) -> EstimatorState:
-    return estimator.issued(estimator.measured(s, t, x, age=age), u)
+    return estimator.issue(estimator.observe(s, t, x, age=age), u)
 
 
 @eqx.filter_jit
