@@ -16,7 +16,7 @@ from retrim.config.vehicles import make_vehicle
 from retrim.evaluation.fleet import Fleet
 from retrim.runkit import Run
 from retrim.runkit.reporter import Silent
-from retrim_paper.tables.hidden import ENTRANTS, entrants_of
+from retrim_paper.tables.hidden_entrants import ENTRANTS, entrants_of
 
 gauntlet = importlib.import_module("retrim_paper.tables.gauntlet")
 
@@ -50,6 +50,21 @@ def test_vehicle_parameters_scale_with_size(population):
     size = [v.size for v in population]
     assert np.corrcoef(size, np.log([v.rate_lag for v in population]))[0, 1] > 0.9
     assert np.corrcoef(size, [v.delay for v in population])[0, 1] > 0.8
+
+
+def test_wrong_vehicle_file_is_wrong_by_up_to_two(population):
+    def values(spec):
+        ratio = spec.thrust_max / spec.mass
+        return np.array(
+            [spec.mass, *spec.inertia, *spec.rate_lag, *spec.rate_damping, spec.motor_tau, spec.command_delay, ratio]
+        )
+
+    pairs = [np.stack([values(v.wrong_spec), values(v.spec)]) for v in population if v.delay > 0.005]
+    factors = np.log2([wrong / true for wrong, true in pairs])
+    assert np.abs(factors).max() < 1.02  # rounded to three digits
+    assert (factors.min(axis=0) < -0.9).all()
+    assert (factors.max(axis=0) > 0.9).all()
+    assert all(make_vehicle(v.wrong_spec).mass > 0.0 for v in population[:20])
 
 
 def test_larger_population_extends_smaller_one(population):
@@ -121,9 +136,25 @@ def test_unflyable_options_are_refused_before_training(tmp_path):
         ({"faults": True}, "--vehicles hidden has one condition"),
         ({"preset": "vision/ideal"}, "hidden vehicles are flown for hover, track"),
         ({"preset": "hover/retrim", "methods": ("base-id",)}, "is for one vehicle"),
+        ({"file": "wrong"}, "--file wrong needs --methods"),
     ):
         with pytest.raises(ConfigError, match=message):
             gauntlet.gauntlet(run, Silent(), vehicles="hidden", **words)
+
+
+@pytest.mark.parametrize("file", ["wrong", "true", "trained"])
+def test_vehicle_file_reaches_method_and_training(tmp_path, imagine, pictures, monkeypatch, population, file):
+    hidden = importlib.import_module("retrim_paper.tables.hidden")
+    pictures(hidden, "vehicle_map")
+    monkeypatch.setattr(hidden.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
+    done = imagine(hidden, lambda spec: 0.01)
+    sizes = {"count": 2, "draw": 5, "starts": 1, "methods": ("base",), "file": file}
+    gauntlet.gauntlet(Run("test", tmp_path), Silent(), preset="hover/fast", vehicles="hidden", **sizes)
+    expected = [each.wrong_spec if file == "wrong" else each.spec for each in population[:2]]
+    assert [study.preset.vehicle for study, *_ in done.flights] == expected
+    trained = [preset.vehicle for preset, _ in done.trainings if preset.vehicle != "small"]
+    assert trained == (expected if file == "trained" else [])
+    assert {row["vehicle_file"] for row in results(tmp_path, "results.json")["rows"]} == {file}
 
 
 def test_published_page_has_every_kind_of_method():
@@ -132,4 +163,5 @@ def test_published_page_has_every_kind_of_method():
         assert result == ENTRANTS[task]
         assert {entrant.method for entrant in result} >= {"base", "base-do", "geometric-i", "indi", "base-id"}
         assert all(entrant.preset in presets.PRESETS for entrant in result)
-        assert any(entrant.knows_vehicle for entrant in result)
+        assert {entrant.file for entrant in result} >= {"none", "wrong", "true"}
+        assert len({entrant.label for entrant in result}) == len(result)

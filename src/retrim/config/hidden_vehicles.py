@@ -4,7 +4,7 @@ One size factor determines each vehicle: small vehicles turn fast and large ones
 and lags grow together. Independent ranges of these values would contain impossible vehicles.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,8 @@ class HiddenVehicle:
     """Size factor: 0 for the lightest vehicle, 1 for the heaviest."""
     thrust_gain: float
     """Ratio of thrust to commanded thrust."""
+    wrong_spec: VehicleSpec
+    """A vehicle file whose mass, inertia, thrust, damping, delay and lags are wrong by up to a factor of two each."""
 
     @property
     def rate_lag(self) -> float:
@@ -117,7 +119,35 @@ def _draw(draw: np.random.Generator, number: int) -> HiddenVehicle:
         rate_damping=(damping, damping, damping),
         command_delay=round(delay, 4),
     )
-    return HiddenVehicle(spec, float(size), gain)
+    return HiddenVehicle(spec, float(size), gain, _distort(draw, spec))
+
+
+def _distort(draw: np.random.Generator, spec: VehicleSpec) -> VehicleSpec:
+    """Return a specification with random errors; the ratio of thrust to weight remains that of a quadrotor."""
+
+    def wrong(value: float) -> float:
+        return _round(value * 2.0 ** draw.uniform(-1.0, 1.0))
+
+    def wrong_alike(values: tuple[float, float, float]) -> tuple[float, float, float]:
+        factor = wrong(1.0)
+        return (values[0] * factor, values[1] * factor, values[2] * factor)
+
+    assert spec.rate_lag is not None
+    assert spec.rate_damping is not None
+    assert spec.command_delay is not None
+    weight = spec.mass * STANDARD_GRAVITY
+    ratio = max(wrong(spec.thrust_max / weight), 1.01 * THRUST_TO_WEIGHT[0])
+    mass = wrong(spec.mass)
+    return replace(
+        spec,
+        mass=mass,
+        inertia=wrong_alike(spec.inertia),
+        thrust_max=ratio * mass * STANDARD_GRAVITY,
+        motor_tau=wrong(spec.motor_tau),
+        rate_lag=wrong_alike(spec.rate_lag),
+        rate_damping=wrong_alike(spec.rate_damping),
+        command_delay=wrong(spec.command_delay),
+    )
 
 
 def _round(value: float) -> float:

@@ -24,7 +24,8 @@ from retrim.viz import plots
 from retrim.viz.panels import Curve, Panel, heat_map, panel_figure
 
 from ..conditions import conditions, fault_conditions
-from .hidden import entrants_of, fly_hidden
+from .hidden import fly_hidden
+from .hidden_entrants import VehicleFile, entrants_of
 from .promise import promise_rows, promise_section
 
 METHODS: dict[str, tuple[str, ...]] = {
@@ -67,6 +68,7 @@ def gauntlet(
     vehicles: Literal["own", "hidden"] = "own",
     count: int = 200,
     draw: int = 0,
+    file: VehicleFile = "none",
 ) -> None:
     """A policy under many changes in the world: recovery, steady error and worst error, as one heat map.
 
@@ -88,14 +90,18 @@ def gauntlet(
             page compares hover/any or track/any with methods for a known vehicle.
         count: Number of hidden vehicles.
         draw: Seed from which the hidden vehicles are drawn.
+        file: Vehicle file that the given methods receive for hidden vehicles: none; wrong, by up to a factor of two;
+            true; or trained, the true one and one policy per vehicle.
     """
     task = load(preset).task
     if vehicles == "hidden":
         if only or faults:
             raise ConfigError("--vehicles hidden has one condition, so that --only and --faults do not apply to it")
-        entrants = entrants_of(task, preset, methods)
+        entrants = entrants_of(task, preset, methods, file)
         sizes: dict[str, Any] = {"count": count, "draw": draw, "seeds": seeds, "starts": starts, "sensors": sensors}
         return fly_hidden(run, reporter, task=task, entrants=entrants, **sizes)
+    if file != "none":
+        raise ConfigError(f"--file {file} needs --vehicles hidden")
     if task not in METHODS:
         raise ConfigError(f"preset {preset!r} is for {task}; the gauntlet is flown for {', '.join(METHODS)}")
     if faults and (task != "hover" or sensors != "ideal"):

@@ -23,6 +23,8 @@ from retrim.runkit.run import Run
 from retrim.viz import plots
 from retrim.viz.vehicle_map import vehicle_map
 
+from .hidden_entrants import KNOWLEDGE, Entrant
+
 MOST_VEHICLES = 10_000
 PUSHED = 4.0  # [s], time of the push at hover
 AFTER = 5.0  # [s], time after the push from which the error is scored for one second
@@ -31,9 +33,11 @@ INTRO = """\
 Made by `retrim gauntlet --vehicles hidden{option}`: {count} vehicles, drawn from one size factor (seed {seed}), from
 30 g to 3 kg: lag of the body rates 15 to 150 ms (second order, damping ratio 0.4 to 1.2), command delay 0 to 60 ms,
 thrust lag 10 to 80 ms, thrust gain 0.6 to 1.6, and at full command 1.4 times the weight or more. Plant `second-order`,
-{sensors} sensors. Vehicle "not known": the method receives no vehicle file. Vehicle "known": the method receives the
-true mass, limits, delay and lags, but not the thrust gain. lost: flights that left the bounds. {metrics} Cells: median
-over all flights, 95th percentile, and worst; a lost flight counts as infinite (∞)."""
+{sensors} sensors. Vehicle "not known": the method receives no vehicle file. "wrong by up to two": it receives a file
+with a random error of up to a factor of two in the mass, inertia, thrust, damping, delay and each lag. "known": it
+receives the true values, but not the thrust gain. "known, own policy": in addition, a policy is trained for each
+vehicle. lost: flights that left the bounds. {metrics} Cells: median over all flights, 95th percentile, and worst; a
+lost flight counts as infinite (∞)."""
 
 
 @dataclass(frozen=True)
@@ -103,48 +107,6 @@ SCORINGS = {
 }
 
 
-@dataclass(frozen=True)
-class Entrant:
-    """A preset and a method in the benchmark."""
-
-    preset: str
-    method: str
-    knows_vehicle: bool = False
-    """Whether the method receives a vehicle file with the true parameters."""
-
-    @property
-    def label(self) -> str:
-        """Name in tables and figures."""
-        return f"{self.method}, vehicle known" if self.knows_vehicle else f"{self.preset} {self.method}"
-
-
-OPPONENTS = ("base", "base-do", "geometric-i", "indi")
-ENTRANTS: dict[str, tuple[Entrant, ...]] = {
-    task: (
-        *(Entrant(f"{task}/retrim", method) for method in OPPONENTS),
-        Entrant(f"{task}/retrim", "indi", knows_vehicle=True),
-        *(Entrant(f"{task}/any", method) for method in ("base", "base-do", "base-id")),
-    )
-    for task in COURSES
-}
-
-
-def entrants_of(task: str, preset: str, methods: Sequence[str]) -> tuple[Entrant, ...]:
-    """Return the entrants for a command: those on the published page, or the given methods with one preset.
-
-    Args:
-        task: Task of the preset.
-        preset: Preset name, or file.
-        methods: Methods to fly; if empty, the published entrants are returned.
-
-    Raises:
-        ConfigError: There is no such benchmark for the task.
-    """
-    if task not in COURSES:
-        raise ConfigError(f"preset {preset!r} is for {task}; hidden vehicles are flown for {', '.join(COURSES)}")
-    return tuple(Entrant(preset, method) for method in methods) if methods else ENTRANTS[task]
-
-
 def fly_hidden(
     run: Run,
     reporter: Reporter,
@@ -195,7 +157,7 @@ def fly_hidden(
             if run.interrupted:
                 break
             reporter.say(f"{course.title}: {entrant.label}, {count} vehicles")
-            flights = _fly(studies[entrant.preset], entrant, course, vehicles, run, reporter, starts, sensors)
+            flights = _fly(studies[entrant.preset], entrant, course, vehicles, run, reporter, seeds, starts, sensors)
             result += [_row(entrant, course, vehicles, flight, scoring) for flight in flights]
         if result:
             document.add(_section(result, entrants, course, scoring, vehicles, run, about), result)
@@ -215,18 +177,20 @@ def _fly(
     vehicles: Sequence[HiddenVehicle],
     run: Run,
     reporter: Reporter,
+    seeds: Sequence[int],
     starts: int,
     sensors: str,
 ) -> list[Flight]:
     """Return the flights of all vehicles by one entrant."""
     scenarios = [_scenario(course, vehicle, sensors) for vehicle in vehicles]
     options: dict[str, Any] = {"methods": (entrant.method,), "starts": starts, "seconds": course.seconds}
-    if not entrant.knows_vehicle:
+    if entrant.file == "none":
         return fly_all(study, scenarios, run, reporter, **options).flights
     flights = list[Flight]()
     for vehicle, scenario in zip(vehicles, scenarios, strict=True):  # each vehicle file needs its own set-up
-        informed_study = replace(study, preset=replace(study.preset, vehicle=vehicle.spec))
-        flights += fly_all(informed_study, [scenario], run, reporter, **options).flights
+        preset = entrant.inform(study.preset, vehicle)
+        own = train_all(preset, seeds, run, reporter) if entrant.file == "trained" else replace(study, preset=preset)
+        flights += fly_all(own, [scenario], run, reporter, **options).flights
     return flights
 
 
@@ -240,7 +204,7 @@ def _row(
         "course": course.title,
         "preset": entrant.preset,
         "method": entrant.method,
-        "vehicle_known": entrant.knows_vehicle,
+        "vehicle_file": entrant.file,
         "seed": flight.spec.seed,
         "start": flight.spec.start,
         "vehicle": number,
@@ -268,16 +232,15 @@ def _section(
     lines, maps, (colour_metric, *_) = list[tuple[str, ...]](), dict[str, np.ndarray](), scoring.columns
     means = colour_metric.startswith("rms")
     for entrant in entrants:
-        key = entrant.preset, entrant.method, entrant.knows_vehicle
-        own = [row for row in rows if (row["preset"], row["method"], row["vehicle_known"]) == key]
+        key = entrant.preset, entrant.method, entrant.file
+        own = [row for row in rows if (row["preset"], row["method"], row["vehicle_file"]) == key]
         if not own:
             continue
         losses, label = sum(row["lost"] for row in own), find_method(entrant.method).label
         cells = [_quantiles([row[name] for row in own], name) for name in scoring.columns]
         finite = [row[colour_metric] for row in own if row[colour_metric] is not None]
         cells += [metres(float(np.mean(finite))) if finite else "-"] if means else []
-        knowledge = "known" if entrant.knows_vehicle else "not known"
-        lines.append((f"`{entrant.preset}`", label, knowledge, f"{losses} of {len(own)}", *cells))
+        lines.append((f"`{entrant.preset}`", label, KNOWLEDGE[entrant.file], f"{losses} of {len(own)}", *cells))
         worst = np.full(len(vehicles), -np.inf)
         for row in own:
             worst[row["vehicle"]] = max(
