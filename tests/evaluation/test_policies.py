@@ -6,6 +6,7 @@ import pytest
 
 from helpers import tiny_preset
 from retrim import load_policy
+from retrim.config.hidden_vehicles import draw_vehicles
 from retrim.evaluation import policies
 from retrim.evaluation.policies import train_policies
 from retrim.evaluation.study import train_all
@@ -44,6 +45,16 @@ def test_policy_is_trained_once_per_folder(tmp_path, requests, monkeypatch):
     train_policies(preset, (0,), Run("test", tmp_path), Silent())
     assert requests[3:] == [(preset.name, 0)] * 2
     assert len(list((tmp_path / "policies").glob("*-seed0.safetensors"))) == 3
+
+
+def test_policy_of_vehicle_file_with_delay_is_trained_once(tmp_path, requests):
+    """The delay of the vehicle file replaces that of the preset when the stored policy is read."""
+    vehicle = draw_vehicles(1)[0].spec
+    assert round(vehicle.command_delay / tiny_preset().dt) != tiny_preset().delay_ticks
+    preset, run = tiny_preset(vehicle=vehicle), Run("test", tmp_path)
+    for _ in range(2):
+        train_policies(preset, (0,), run, Silent())
+    assert requests == [(preset.name, 0)]
 
 
 def test_stored_policy_keeps_preset_and_damaged_one_is_retrained(tmp_path, requests):

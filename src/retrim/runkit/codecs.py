@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import random
 
+from ..config.command_paths import with_delay
 from ..config.loading import dump
 from ..config.presets import Preset
 from ..config.trust import python_names
@@ -89,7 +90,7 @@ def policy_codec(preset: Preset) -> Codec[AbstractPolicy]:
 
     def read(path: Path) -> AbstractPolicy:
         policy, other = load_policy(path, trust=python_names(preset))
-        if dump(other) != dump(preset):
+        if dump(with_delay(other)) != dump(with_delay(preset)):  # a file contains the delay of its vehicle file
             raise CheckpointError(f"{path}: its preset {other.name!r} is not that of the run, {preset.name!r}")
         return policy
 
