@@ -209,6 +209,11 @@ def regimes() -> tuple[Regime, ...]:
             "a third of the mass, 3 cm off the centre",
             hover, (Scenario("off-centre=0.03"),), 20.0, at_rest,
         ),
+        Regime(
+            "S8 far off the centre",
+            "the same load, 10 cm off the centre; at 15.7 cm, two rotors would have to stop",
+            hover, (Scenario("off-centre=0.1"),), 20.0, at_rest,
+        ),
         *_public_benchmark(on_path),
         Regime(
             "S10 weak rotor, 50 %",
