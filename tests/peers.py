@@ -8,13 +8,14 @@ import sys
 @contextlib.contextmanager
 def start_process(*command):
     """Start a process and wait for its first output; at the end, interrupt it."""
-    process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert "Ctrl-C ends it" in process.stdout.readline()
         yield process
     finally:
         process.terminate()
         process.wait(10.0)
+        process.stdin.close()
         process.stdout.close()
 
 

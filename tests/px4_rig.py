@@ -10,8 +10,15 @@ from retrim.plants.bridges.mavlink_link import MavlinkLink
 from retrim.testing.px4 import PAYLOAD
 
 PX4 = os.environ.get("RETRIM_PX4", "")
-SIH = str(Path(__file__).parents[1] / "examples/px4_sih.toml")
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SIH, X500 = str(EXAMPLES / "px4_sih.toml"), str(EXAMPLES / "x500.toml")
 ADDRESS = "mavlink:udp:127.0.0.1:14540"
+
+
+def wait_until(log, when, flight):
+    """Wait until a live flight has written a time to its log [s], or until it is over."""
+    while flight.poll() is None and not (log.exists() and len(rows := read_log(log)) and rows[-1, 1] >= when):
+        time.sleep(0.1)
 
 
 class Changes:

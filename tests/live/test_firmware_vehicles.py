@@ -12,7 +12,7 @@ import pytest
 
 from msp_rig import RETRIM, VEHICLE, flight, identify, run
 from peers import start_process
-from px4_rig import ADDRESS, PX4, SIH, Changes
+from px4_rig import ADDRESS, PX4, SIH, X500, Changes, wait_until
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
 
@@ -114,3 +114,33 @@ def test_px4_with_other_rate_gains_hovers_with_a_load(gain, tmp_path):
     run("pretrain", "hover", "--vehicle", str(tmp_path / "id/vehicle.toml"), "--out", str(tmp_path / "hover"))
     rows = fly_px4(tmp_path / "hover", tmp_path / "second", gain)
     assert error(rows, 13.0).mean() < 0.06
+
+
+@pytest.fixture(scope="module")
+def x500_policy(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("x500")
+    run("pretrain", "hover", "--preset", "hover/any", "--vehicle", X500, "--out", str(folder))
+    return folder
+
+
+@pytest.mark.px4
+@pytest.mark.skipif(not PX4, reason="RETRIM_PX4 names no unpacked PX4")
+@pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
+def test_px4_with_other_rate_gains_hovers_under_large_push(gain, x500_policy, tmp_path):
+    """PX4's firmware flies a vehicle with blade-element rotors; the push begins after 8 s."""
+    options = ["--vehicle", X500, "--disturbance", "large"]
+    options += [word for axis in ("ROLL", "PITCH", "YAW") for word in ("--set", f"MC_{axis}RATE_K={gain}")]
+    command = [*RETRIM, "live", "--policy", str(x500_policy), "--plant", ADDRESS, "--no-page", "--adapt", "base-id"]
+    command += ["--seconds", "20", "--out", str(tmp_path)]
+    with start_process(sys.executable, "-m", "retrim.testing.px4", PX4, *options) as peer:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        wait_until(tmp_path / "flight.csv", 8.0, process)
+        peer.stdin.write("\n")
+        peer.stdin.flush()
+        text = process.communicate(timeout=240)[0]
+    rows = read_log(tmp_path / "flight.csv")
+    print(f"gains x {gain}: mean error {[round(float(error(rows, t, t + 1).mean()), 4) for t in range(20)]}")
+    assert process.returncode == 0, text
+    assert "flight over: landed" in text
+    assert error(rows, 13.0).mean() < 0.006  # the true position is rounded to 11 mm
+    assert error(rows, 13.0).max() < 0.02

@@ -3,22 +3,20 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ...errors import MessageError, PlantError
-from ...physics.bem import BemQuadrotor, BemState
+from ...physics.bem import BemQuadrotor
 from ...physics.disturbance import Disturbance
-from ...physics.motors import CommandedSpeeds
-from ...physics.state import Command, State
+from ...physics.state import State
 from ...physics.substep import SUBSTEP
 from .betaflight_firmware import in_real_time
 from .betaflight_wire import MOTORS, REST, STATE, STICKS, motors_of, state_packet, sticks_packet
+from .rotor_world import compile_step, place_at_rest
 from .vehicle_state import VehicleState
 
 GROUND = 0.0  # [m]
@@ -88,7 +86,7 @@ class World:
         self._model, self._fastest = model, fastest
         self._ears = MotorListener()
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._advance = _compile(model, disturbance)
+        self._advance = compile_step(model, disturbance)
         self._over, self._lock = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._run, name="betaflight world", daemon=True)
         self.motors, self.slip = np.zeros(4), 0.0
@@ -100,7 +98,7 @@ class World:
 
     def place(self, x: State) -> None:
         """Put the vehicle on the stand at a position and heading."""
-        s = _on_the_stand(self._model, x)
+        s = place_at_rest(self._model, x)
         with self._lock:
             self._free, self._s, self._t = False, s, 0.0
             self._output = np.concatenate(
@@ -162,38 +160,3 @@ class World:
             if k % STICKS_EVERY == 0:
                 packet = sticks_packet(*sticks, self._fastest, armed=is_armed, switches=switches)
                 self._out.sendto(packet, (HOST, STICKS))
-
-
-def _on_the_stand(model: BemQuadrotor, x: State) -> BemState:
-    """Return a vehicle at rest with spinning rotors; the leaves have the types that a step returns."""
-    s: BemState = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), model.init(x))
-    return s
-
-
-def _compile(
-    model: BemQuadrotor, disturbance: Disturbance
-) -> Callable[[BemState, np.ndarray, float], tuple[BemState, Array]]:
-    """Return a millisecond of flight: (state, motors, time) -> (state, [p, R, v, omega, specific force])."""
-    vehicle, hover = model.vehicle, Command.hover()
-
-    @jax.jit
-    def advance(s: BemState, motors: Float[Array, "4"], t: Float[Array, ""]) -> tuple[BemState, Array]:
-        speeds = jnp.clip(vehicle.esc.speed(motors), vehicle.motor_min, vehicle.motor_max)
-        model_at_speeds = BemQuadrotor(vehicle, CommandedSpeeds(speeds, model.loop.thrust_map), model.dt)
-        before = model.state(s)
-        after = model_at_speeds.substep(s, hover, disturbance(t, before))
-        x, rotors = model.state(after), model.rotor_state(after)
-        specific_force = x.R.T @ ((x.v - before.v) / SUBSTEP + jnp.asarray(REST, x.v.dtype))
-        return after, jnp.concatenate([x.p, x.R.reshape(9), x.v, rotors.omega, specific_force])
-
-    dtype: Any = jnp.result_type(float)
-
-    def step(s: BemState, motors: np.ndarray, t: float) -> tuple[BemState, Array]:
-        result: tuple[BemState, Array] = advance(s, motors.astype(dtype), np.asarray(t, dtype))
-        return result
-
-    s = _on_the_stand(model, State.at(jnp.array([0.0, 0.0, 1.0])))
-    for _ in range(2):  # compile before the flight, also for the types that a step returns
-        s, output = step(s, np.full(4, 0.3), 0.0)
-    jax.block_until_ready(output)
-    return step
