@@ -107,7 +107,7 @@ test-betaflight: betaflight
 		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m betaflight \
 		--ignore tests/live/test_firmware_vehicles.py'
 
-# The same firmware with other gains of the rate controller, from the flight by hand to the hover, in half an hour.
+# The same firmware with other gains of the rate controller, from the flight by hand to the hover, in forty minutes.
 test-vehicles: betaflight
 	unshare --net $$(test "$$(id -u)" = 0 || echo --map-root-user) \
 		sh -c 'ip link set lo up && exec $(BIN)/pytest -n 0 -s -m "px4 or betaflight" tests/live/test_firmware_vehicles.py'
