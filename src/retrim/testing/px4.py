@@ -43,6 +43,7 @@ MOCAP = {
 With PX4's defaults for the delay (200 ms) and for the filters of the output (0.25 s), the estimated position is 0.2 s
 late.
 """
+START_S, SLIP_S = 10.0, 0.05  # [s]: start of PX4; lost time that is reported
 READY = "PX4 flies at udp:127.0.0.1:14540; Ctrl-C ends it"
 TIMING = {"IMU_INTEG_RATE": 400, "COM_OBL_RC_ACT": 5}
 """PX4 parameters for a state every 10 ms, and for position hold when setpoints stop."""
@@ -183,10 +184,15 @@ def _fly_external(options: argparse.Namespace, run: Path) -> None:
         be_punctual(25, os.sched_getaffinity(0))
         cameras = MotionCapture()
         print(READY, flush=True)
-        every, steps, listens = round(1.0 / (CAPTURE_RATE * STEP)), 0, options.disturbance is not None
+        every, second, starting = (round(interval / STEP) for interval in (1.0 / CAPTURE_RATE, 1.0, START_S))
+        steps, slip, listens = 0, 0.0, options.disturbance is not None
         while not px4.has_ended:
             world.step()
             steps += 1
+            if steps % second == 0:
+                if steps > starting and world.slip - slip > SLIP_S:
+                    print(f"the simulation lost {world.slip - slip:.2f} s in 1 s: the machine is busy", flush=True)
+                slip = world.slip
             if steps % every == 0:
                 cameras.link.pump(time.monotonic())
                 cameras.link.see(world.capture())
