@@ -28,8 +28,8 @@ def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str, *, r
     keep = spec if isinstance(spec, VehicleSpec) else None
     mass = float(base.mass)
     lines = [
-        f"# Identified from {plain_from(log)}; what no line says so of is that of {plain_from(name_of(spec))!r}.",
-        "# Intervals hold 90 %.",
+        f"# Identified from {plain_from(log)}. Values without a remark are those of {plain_from(name_of(spec))!r}.",
+        "# Intervals contain the true value with a probability of 90 %.",
         *([f"# {remark}"] if remark else []),
         *(
             []
