@@ -1,7 +1,9 @@
 """The wire format of Betaflight's simulated board: sent packets have the expected form, and others are refused."""
 
+import os
 import socket
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,3 +117,19 @@ def test_attitudes_are_unit_quaternions_of_the_rotation():
         q = struct.unpack("<18d", state_packet(np.zeros(3), R=rotation.as_matrix()))[7:11]
         assert np.linalg.norm(q) == pytest.approx(1.0, abs=1e-9)
         np.testing.assert_allclose(np.roll(rotation.as_quat(canonical=True), 1), q, atol=1e-6)
+
+
+def test_board_with_silent_command_line_is_started_again(monkeypatch):
+    calls = []
+
+    def configure(self, lines):
+        calls.append("configure")
+        if len(calls) == 2:
+            raise betaflight_firmware.SilentBoard("silent")
+
+    monkeypatch.setattr(betaflight_firmware, "_listens", lambda: False)
+    monkeypatch.setattr(betaflight_firmware, "in_real_time", lambda thread: True)
+    monkeypatch.setattr(betaflight_firmware.Firmware, "_start", lambda self: calls.append("start") or os.getpid())
+    monkeypatch.setattr(betaflight_firmware.Firmware, "_configure", configure)
+    betaflight_firmware.Firmware(Path("board"), 10).stop()
+    assert calls == ["start", "configure", "start", "configure", "start"]

@@ -51,6 +51,10 @@ def find_firmware() -> Path:
     )
 
 
+class SilentBoard(PlantError):
+    """The command line of a board does not answer."""
+
+
 class Firmware:
     """A configured, running board with its own folder."""
 
@@ -71,8 +75,14 @@ class Firmware:
         self._folder = tempfile.TemporaryDirectory(prefix="retrim-betaflight-")
         self._process: subprocess.Popen[bytes] | None = None
         try:
+            lines = [*settings(steps), *more]
             self._start()
-            self._configure([*settings(steps), *more])
+            try:
+                self._configure(lines)
+            except SilentBoard:  # a connection during the start of the board can block all later ones
+                self._end()
+                self._start()
+                self._configure(lines)
             board = self._start()
             for thread in os.listdir(f"/proc/{board}/task"):  # not earlier: its busy loop would starve the others
                 in_real_time(int(thread))
@@ -138,6 +148,10 @@ class Firmware:
         until = time.monotonic() + SAVES_S
         while self.runs and time.monotonic() < until:
             time.sleep(0.02)
+        self._end()
+
+    def _end(self) -> None:
+        """End the process; a process that has ended stays as it is."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -181,7 +195,7 @@ def _answer(line: socket.socket) -> str:
         try:
             part = line.recv(4096)
         except TimeoutError as error:
-            raise PlantError(f"the board's command line is silent after {answer[-80:]!r}") from error
+            raise SilentBoard(f"the board's command line is silent after {answer[-80:]!r}") from error
         if not part or time.monotonic() > until:
             raise PlantError(f"the board's command line ended after {answer[-80:]!r}")
         answer += part
