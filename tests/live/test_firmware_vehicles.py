@@ -80,14 +80,22 @@ def test_unknown_vehicle_hovers_under_large_push(settings, any_policy, tmp_path)
 # ---- PX4
 
 
-def fly_px4(policy, out, gain, *words, seconds=30):
-    """Hover in PX4's simulation, whose rate controllers have other gains; a load of 30 % begins after 10 s."""
-    axes = {f"MC_{axis}RATE_K": gain for axis in ("ROLL", "PITCH", "YAW")}
-    options = [word for name, value in axes.items() for word in ("--set", f"{name}={value}")]
+def start_px4(gain, *words):
+    """Start PX4, whose rate controllers have other gains."""
+    settings = [word for axis in ("ROLL", "PITCH", "YAW") for word in ("--set", f"MC_{axis}RATE_K={gain}")]
+    return start_process(sys.executable, "-m", "retrim.testing.px4", PX4, *settings, *words)
+
+
+def start_flight(policy, out, seconds, *words):
     command = [*RETRIM, "live", "--policy", str(policy), "--plant", ADDRESS, "--no-page"]
     command += ["--seconds", str(seconds), "--out", str(out), *words]
-    with start_process(sys.executable, "-m", "retrim.testing.px4", PX4, *options):
-        changes, process = Changes(), subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def fly_px4(policy, out, gain, *words, seconds=30):
+    """Hover in PX4's own simulation; a load of 30 % begins after 10 s."""
+    with start_px4(gain):
+        changes, process = Changes(), start_flight(policy, out, seconds, *words)
         try:
             changes.set_at(out / "flight.csv", 10.0, process, SIH_MASS=1.3)
         finally:
@@ -128,12 +136,8 @@ def x500_policy(tmp_path_factory):
 @pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
 def test_px4_with_other_rate_gains_hovers_under_large_push(gain, x500_policy, tmp_path):
     """PX4's firmware flies a vehicle with blade-element rotors; the push begins after 8 s."""
-    options = ["--vehicle", X500, "--disturbance", "large"]
-    options += [word for axis in ("ROLL", "PITCH", "YAW") for word in ("--set", f"MC_{axis}RATE_K={gain}")]
-    command = [*RETRIM, "live", "--policy", str(x500_policy), "--plant", ADDRESS, "--no-page", "--adapt", "base-id"]
-    command += ["--seconds", "20", "--out", str(tmp_path)]
-    with start_process(sys.executable, "-m", "retrim.testing.px4", PX4, *options) as peer:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    with start_px4(gain, "--vehicle", X500, "--disturbance", "large") as peer:
+        process = start_flight(x500_policy, tmp_path, 20, "--adapt", "base-id")
         wait_until(tmp_path / "flight.csv", 8.0, process)
         peer.stdin.write("\n")
         peer.stdin.flush()

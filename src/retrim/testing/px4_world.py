@@ -14,7 +14,6 @@ import numpy as np
 
 from ..config.disturbances import disturbance as disturbance_named
 from ..errors import PlantError
-from ..physics import so3
 from ..physics.bem import BemQuadrotor
 from ..physics.disturbance import Disturbance
 from ..physics.state import STANDARD_GRAVITY, State
@@ -79,10 +78,8 @@ class Px4World:
         model = BemQuadrotor.of(vehicle, 0.02, thrust_error=0.0)
         self._advance = compile_step(model, disturbance_named("none"), substeps=STEP_MS, floor=True)
         self._disturbed_advance = compile_step(model, disturbance, substeps=STEP_MS, floor=True)
-        self._s, self._output = (
-            place_at_rest(model, State.at(jnp.zeros(3))),
-            np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(6), REST]),
-        )
+        self._s = place_at_rest(model, State.at(jnp.zeros(3)))
+        self._output = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(6), REST])
         self._motors, self._rng = np.zeros(4), np.random.default_rng(seed)
         self._steps, self._t, self._due = 0, 0.0, time.monotonic()
         self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -134,9 +131,11 @@ class Px4World:
 
     def capture(self) -> Reading:
         """Return the state as motion capture measures it."""
+        from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
+
         p, _, v, omega, _ = np.split(self._output, [3, 12, 15, 18])
         draw = self._rng.normal
-        turn = np.asarray(so3.exp(jnp.asarray(TURN * draw(size=3))), dtype=float)
+        turn = Rotation.from_rotvec(TURN * draw(size=3)).as_matrix()
         return Reading(
             time.monotonic(), p + PLACE * draw(size=3), self._attitude() @ turn, v + SPEED * draw(size=3), omega
         )
