@@ -28,6 +28,9 @@ OPPONENTS: dict[str, tuple[str, ...]] = {
 """Methods of each column; with several methods, the cell shows the worst one."""
 ADAPTED, COMPARABLE = "adapted", ("observer", "geometric + I", "INDI", "MPPI + L1")
 TIE, AS_GOOD = 1e-3, 0.7  # [m]; differences below TIE are ties, and an error below AS_GOOD times another one is better
+SAMPLING, SAMPLING_STARTS = ("l1-mpc",), 2
+"""Methods with thousands of predictions per command, and their largest number of flights per seed. With more flights,
+they would take longer than all other methods together."""
 INTRO = """\
 Made by `retrim reproduce where_learning_pays`. Each row is a regime; each cell is the median over flights [mm, lap
 times in ms], with the 95 % interval of the median (bootstrap over flights) in brackets, and the number of lost flights,
@@ -56,7 +59,7 @@ def where_learning_pays(
         only: Names, or beginnings of names, of the rows to make; all by default.
         columns: Columns of opponents.
         seeds: Training seeds; each also seeds the starts, gusts and learners of its flights.
-        starts: Flights per row, method and seed.
+        starts: Flights per row, method and seed; at most two of them with MPPI.
     """
     check_seeds(seeds)
     selection = [row for row in regimes() if not only or row.name.startswith(only)]
@@ -77,11 +80,7 @@ def where_learning_pays(
         key = dump(row.preset)
         if key not in studies:
             studies[key] = train_all(row.preset, seeds, run, reporter)
-        methods = _methods(row, columns)
-        flights = fly_all(
-            studies[key], list(row.scenarios), run, reporter, methods=methods, starts=starts, seconds=row.seconds
-        ).flights
-        if len(flights) < len(methods) * len(row.scenarios) * len(seeds) * starts:
+        if (flights := _fly(row, studies[key], _methods(row, columns), starts, run, reporter)) is None:
             break
         line, rows = _line(row, flights, columns)
         lines.append(line)
@@ -90,6 +89,23 @@ def where_learning_pays(
     document.add(TableSection(head, tuple(lines)), results)
     if not run.interrupted:
         clear_flights(run)
+
+
+def _fly(
+    row: Regime, study: Study, methods: Sequence[str], starts: int, run: Run, reporter: Reporter
+) -> list[Flight] | None:
+    """Return the flights of a row; None if they were interrupted."""
+    sampling = [method for method in methods if method in SAMPLING]
+    others = [method for method in methods if method not in SAMPLING]
+    flights = list[Flight]()
+    for group, number in ((others, starts), (sampling, min(starts, SAMPLING_STARTS))):
+        if not group:
+            continue
+        new = fly_all(study, row.scenarios, run, reporter, methods=group, starts=number, seconds=row.seconds)
+        if new.interrupted:
+            return None
+        flights += new.flights
+    return flights
 
 
 def _methods(row: Regime, columns: Sequence[str]) -> tuple[str, ...]:
@@ -109,7 +125,7 @@ def _line(
         worst = max(OPPONENTS[column], key=lambda method: (float(np.median(scores[method])), np.sum(scores[method])))
         cells[column], medians[column] = _cell(scores[worst]), float(np.median(scores[worst]))
     cells[ADAPTED], medians[ADAPTED] = _cell(scores[row.adapted]), float(np.median(scores[row.adapted]))
-    verdict = decide(medians, {name: _losses(scores, name, row) for name in medians})
+    verdict = decide(medians, {name: _lost_share(scores, name, row) for name in medians})
     line = (row.name, row.about, row.score.about, *cells.values(), row.published, verdict)
     rows = [
         {"regime": row.name, "method": method, "score_m": [value if np.isfinite(value) else None for value in values]}
@@ -123,9 +139,9 @@ def _scores(row: Regime, flights: Sequence[Flight], method: str) -> np.ndarray:
     return np.array([np.inf if flight.log.terminated else row.score.of(flight) for flight in own])
 
 
-def _losses(scores: dict[str, np.ndarray], name: str, row: Regime) -> int:
+def _lost_share(scores: dict[str, np.ndarray], name: str, row: Regime) -> float:
     methods = (row.adapted,) if name == ADAPTED else OPPONENTS[name]
-    return max(int(np.sum(np.isinf(scores[method]))) for method in methods)
+    return max(float(np.mean(np.isinf(scores[method]))) for method in methods)
 
 
 def _cell(scores: np.ndarray) -> str:
@@ -145,12 +161,12 @@ def _mm(metres: float) -> str:
     return f"{value:.2f}" if value < 1.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
 
 
-def decide(medians: dict[str, float], losses: dict[str, int]) -> str:
+def decide(medians: dict[str, float], losses: dict[str, float]) -> str:
     """Return the verdict for a row.
 
     Args:
         medians: Median score of each column [m]; infinite if most flights were lost.
-        losses: Number of lost flights of each column.
+        losses: Share of lost flights of each column.
     """
     rivals = {name: medians[name] for name in COMPARABLE if name in medians}
     if not rivals:
