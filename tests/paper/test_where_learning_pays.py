@@ -14,7 +14,7 @@ from retrim.runtime.flight import Log, States
 from retrim_paper.regimes import fastest_lap_error, height_error_above_table
 from retrim_paper.tables.where_learning_pays import OPPONENTS, _cell, _methods, decide, regimes, where_learning_pays
 
-NONE_LOST = dict.fromkeys((*OPPONENTS, "adapted"), 0)
+NONE_LOST = dict.fromkeys((*OPPONENTS, "adapted"), 0.0)
 
 
 def medians(**millimetres):
@@ -37,9 +37,9 @@ def test_verdict_follows_from_numbers(figures, verdict):
 
 def test_lost_flights_decide_before_errors():
     figures = medians(observer=5.0, INDI=1.0, adapted=4.0)
-    assert decide(figures, NONE_LOST | {"adapted": 1}) == "use INDI here: adapted flights are lost"
-    assert decide(figures, NONE_LOST | {"observer": 2, "INDI": 1}) == "learning pays: every opponent loses flights"
-    assert "INDI" not in decide(figures, NONE_LOST | {"INDI": 1})
+    assert decide(figures, NONE_LOST | {"adapted": 0.04}) == "use INDI here: adapted flights are lost"
+    assert decide(figures, NONE_LOST | {"observer": 0.08, "INDI": 0.04}) == "learning pays: every opponent loses flights"
+    assert "INDI" not in decide(figures, NONE_LOST | {"INDI": 0.04})
 
 
 def test_cell_shows_lost_flights_and_millimetres():
