@@ -16,7 +16,7 @@ from retrim.config.vehicles import make_vehicle
 from retrim.evaluation.fleet import Fleet
 from retrim.runkit import Run
 from retrim.runkit.reporter import Silent
-from retrim_paper.tables.hidden_entrants import ENTRANTS, entrants_of
+from retrim_paper.tables.hidden_entrants import ENTRANTS, Entrant, entrants_of
 
 gauntlet = importlib.import_module("retrim_paper.tables.gauntlet")
 
@@ -155,6 +155,22 @@ def test_vehicle_file_reaches_method_and_training(tmp_path, imagine, pictures, m
     trained = [preset.vehicle for preset, _ in done.trainings if preset.vehicle != "small"]
     assert trained == (expected if file == "trained" else [])
     assert {row["vehicle_file"] for row in results(tmp_path, "results.json")["rows"]} == {file}
+
+
+@pytest.mark.parametrize("file", ["none", "trained"])
+def test_entrant_that_computes_long_flies_each_vehicle_once(tmp_path, imagine, pictures, monkeypatch, file):
+    hidden = importlib.import_module("retrim_paper.tables.hidden")
+    pictures(hidden, "vehicle_map")
+    monkeypatch.setattr(hidden.plots, "save", lambda figure, folder, stem: (folder / f"{stem}.png", folder / stem))
+    imagine(hidden, lambda spec: 0.01)
+    entrants = (Entrant("hover/fast", "base"), Entrant("hover/fast", "indi", file, once=True))
+    sizes = {"count": 3, "draw": 5, "starts": 2, "seeds": (4, 7), "sensors": "ideal"}
+    hidden.fly_hidden(Run("test", tmp_path), Silent(), task="hover", entrants=entrants, **sizes)
+    rows = results(tmp_path, "results.json")["rows"]
+    assert sum(row["method"] == "base" for row in rows) == 3 * 2 * 2
+    assert [(row["vehicle"], row["seed"], row["start"]) for row in rows if row["method"] == "indi"] == [
+        (number, 4, 0) for number in range(3)
+    ]
 
 
 def test_published_page_has_every_kind_of_method():

@@ -1,8 +1,11 @@
 """The page of regimes: verdicts follow from the numbers, every row can be flown, and lost flights are shown."""
 
+import importlib
+
 import numpy as np
 import pytest
 
+from commands import results
 from retrim.config.methods import find_method
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
@@ -38,7 +41,8 @@ def test_verdict_follows_from_numbers(figures, verdict):
 def test_lost_flights_decide_before_errors():
     figures = medians(observer=5.0, INDI=1.0, adapted=4.0)
     assert decide(figures, NONE_LOST | {"adapted": 0.04}) == "use INDI here: adapted flights are lost"
-    assert decide(figures, NONE_LOST | {"observer": 0.08, "INDI": 0.04}) == "learning pays: every opponent loses flights"
+    losses = NONE_LOST | {"observer": 0.08, "INDI": 0.04}
+    assert decide(figures, losses) == "learning pays: every opponent loses flights"
     assert "INDI" not in decide(figures, NONE_LOST | {"INDI": 0.04})
 
 
@@ -90,3 +94,14 @@ def test_every_regime_can_be_flown(row):
 def test_wrong_names_are_refused_before_training(tmp_path, options):
     with pytest.raises(ConfigError, match="there are"):
         where_learning_pays(Run("reproduce", tmp_path), Silent(), **options)
+
+
+def test_sampling_method_flies_at_most_two_starts_per_seed(tmp_path, imagine):
+    page = importlib.import_module("retrim_paper.tables.where_learning_pays")
+    done = imagine(page, lambda spec: 0.01)
+    options = {"only": ("steady wind",), "columns": ("observer", "MPPI + L1"), "seeds": (0, 1), "starts": 5}
+    where_learning_pays(Run("reproduce", tmp_path), Silent(), **options)
+    requests = [(methods, starts) for *_, methods, starts, _ in done.flights]
+    assert requests == [(("base-do", "full"), 5), (("l1-mpc",), 2)]
+    rows = results(tmp_path, "where_learning_pays.json")["rows"]
+    assert {row["method"]: len(row["score_m"]) for row in rows} == {"base-do": 10, "l1-mpc": 4, "full": 10}

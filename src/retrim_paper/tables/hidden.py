@@ -36,8 +36,8 @@ thrust lag 10 to 80 ms, thrust gain 0.6 to 1.6, and at full command 1.4 times th
 {sensors} sensors. Vehicle "not known": the method receives no vehicle file. "wrong by up to two": it receives a file
 with a random error of up to a factor of two in the mass, inertia, thrust, damping, delay and each lag. "known": it
 receives the true values, but not the thrust gain. "known, own policy": in addition, a policy is trained for each
-vehicle. lost: flights that left the bounds. {metrics} Cells: median over all flights, 95th percentile, and worst; a
-lost flight counts as infinite (∞)."""
+vehicle. MPPI and these policies fly each vehicle once, since they compute for a long time. lost: flights that left the
+bounds. {metrics} Cells: median over all flights, 95th percentile, and worst; a lost flight counts as infinite (∞)."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +182,9 @@ def _fly(
     sensors: str,
 ) -> list[Flight]:
     """Return the flights of all vehicles by one entrant."""
+    if entrant.once:
+        seeds, starts = seeds[:1], 1
+        study = replace(study, policies={seed: study.policies[seed] for seed in seeds if seed in study.policies})
     scenarios = [_scenario(course, vehicle, sensors) for vehicle in vehicles]
     options: dict[str, Any] = {"methods": (entrant.method,), "starts": starts, "seconds": course.seconds}
     if entrant.file == "none":
