@@ -92,6 +92,8 @@ from .physics import SecondOrderQuadrotor as SecondOrderQuadrotor
 from .physics import State as State
 from .physics import StraightThrough as StraightThrough
 from .physics import Vehicle as Vehicle
+from .plants import AbstractSensors as AbstractSensors
+from .plants import CameraSensors as CameraSensors
 from .plants import Measurement as Measurement
 from .plants import Plant as Plant
 from .plants import SensorModel as SensorModel

@@ -9,7 +9,7 @@ import pytest
 from retrim import ConfigError, PlantError
 from retrim.config import Scenario, disturbance
 from retrim.config.disturbances import DISTURBANCES
-from retrim.config.sensors import SENSORS
+from retrim.config.sensors import SENSORS, make_sensors
 from retrim.physics import Command, State
 from retrim.runtime import FunctionPilot, fly
 
@@ -246,7 +246,12 @@ def test_sensors_by_name(name, numbers):
     setup = SENSORS.find(name)()
     result = [float(getattr(setup, field.name)) for field in dataclasses.fields(setup)]
     np.testing.assert_allclose(result, numbers)
-    assert SENSORS.find("ideal")() is None
+    assert make_sensors("ideal") is None
+
+
+def test_thing_that_is_no_sensor_is_refused():
+    with pytest.raises(ConfigError, match="sensors 'builtins:dict' is a dict, expected a"):
+        make_sensors("builtins:dict")
 
 
 # ---- the plant

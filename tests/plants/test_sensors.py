@@ -112,7 +112,7 @@ def test_held_sample_keeps_its_noise(key):
     first = sensors.noisy(START, key)
     queue = jax.tree.map(lambda leaf: leaf[None], first)
     moving = stack([START, random_state(key), random_state(key, 2.0)])
-    assert_equal(sensors.received(queue, jax.tree.map(jnp.asarray, moving), key), queue)
+    assert_equal(sensors.sample(queue, jax.tree.map(jnp.asarray, moving), None, jnp.zeros(3), 0.02, key), queue)
 
 
 def test_seed_repeats_bit_for_bit():

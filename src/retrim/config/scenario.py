@@ -11,7 +11,7 @@ from ..plants.plant import Plant
 from .disturbances import disturbance
 from .faults import NO_FAULT, measurement_fault
 from .plants import find_plant
-from .sensors import SENSORS
+from .sensors import SENSORS, make_sensors
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle, name_of, vehicle_from
 
@@ -143,7 +143,7 @@ class Scenario:
         request = PlantRequest(
             self._simulated_vehicle(trained_for),
             self.make_disturbance(trained_for, seed=seed),
-            SENSORS.find(self.sensors)(),
+            make_sensors(self.sensors),
             self.thrust_error,
             dt,
             seed,

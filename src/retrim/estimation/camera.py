@@ -10,6 +10,8 @@ from ..physics.state import State
 
 DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 """Body to camera: the camera's z looks along body -z; camera x is body -y, camera y is body -x."""
+PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
+"""Keypoints on the ground [m]: the corners of a square and three mid-points of its sides."""
 D_MIN = 0.05  # smallest denominator of the projection, for points far off the axis or behind the camera
 
 

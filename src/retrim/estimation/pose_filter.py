@@ -1,8 +1,8 @@
 """Estimate the camera's pose and the disturbance with an error-state extended Kalman filter.
 
-The filter uses the ground pattern, the commands and Eq. (1) of the paper, but not the state. While no point is
-visible, the filter only predicts; one visible point is enough for a correction. Errors in Eq. (1) are modelled as a
-slow acceleration.
+The filter uses the ground pattern, the commands and Eq. (1) of the paper, but not the state. With an inertial unit, it
+needs neither the commands nor the vehicle. While no point is visible, the filter only predicts; one visible point is
+enough for a correction. Errors in Eq. (1) are modelled as a slow acceleration.
 """
 
 import equinox as eqx
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Key
 from ..physics import so3
 from ..physics.actuators import apply_lag
 from ..physics.dynamics import PointMass
-from ..physics.state import Command, State
+from ..physics.state import STANDARD_GRAVITY, Command, State
 from .camera import Camera, in_camera
 
 START = (0.1, 0.05, 0.2)  # uncertainty of the pose at hand-over: m, rad, m/s
@@ -69,6 +69,37 @@ class PoseFilter(eqx.Module):
         walk = jnp.full(3, dt**0.5 * WANDER, dtype=dtype)
         Q = jnp.diag(jnp.concatenate([drift, walk]) ** 2)
         return PoseFilter(PointMass(dt).step(x, u, self.d), self.d, F @ self.P @ F.T + Q, end)
+
+    def predict_by_unit(
+        self,
+        omega: Float[Array, "3"],
+        force: Float[Array, "3"],
+        dt: float,
+        noise: tuple[Float[Array, ""], Float[Array, ""]],
+    ) -> "PoseFilter":
+        """Return the filter ``dt`` seconds later, by an inertial unit in place of the commands and Eq. (1).
+
+        The disturbance keeps its estimate, since the unit measures its effect.
+
+        Args:
+            omega: Mean body rates during that time [rad/s].
+            force: Mean specific force during that time, in the body axes at its end [m/s^2].
+            dt: Time step [s].
+            noise: Standard deviation per axis of these rates [rad/s] and of this force [m/s^2].
+        """
+        x, dtype = self.x, self.P.dtype
+        zero, eye = jnp.zeros((3, 3), dtype=dtype), jnp.eye(3, dtype=dtype)
+        R = x.R @ so3.exp(dt * omega)
+        a = so3.act(R, force) - jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=dtype)
+        turn = so3.exp(-dt * omega)
+        lean = -dt * R @ so3.hat(force) @ turn
+        F = jnp.block(
+            [[eye, zero, dt * eye, zero], [zero, turn, zero, zero], [zero, lean, eye, zero], [zero] * 3 + [eye]]
+        )
+        exact, (rate, push) = jnp.zeros(3, dtype=dtype), (jnp.full(3, value, dtype=dtype) for value in noise)
+        steps = dt * jnp.concatenate([exact, rate, push, exact])
+        after = State(x.p + dt * x.v + 0.5 * dt**2 * a, R, x.v + dt * a)
+        return PoseFilter(after, self.d, F @ self.P @ F.T + jnp.diag(steps**2), self.acting)
 
     def correct(
         self,

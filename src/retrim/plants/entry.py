@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from ..physics.disturbance import Disturbance
 from ..physics.vehicle import Vehicle
 from .measurement_faults import AbstractMeasurementFault
 from .plant import Plant, as_numpy
-from .sensors import SensorModel
+from .sensors import AbstractSensors
 
 DELAY = 0.02  # [s]: default command delay of plants with a configurable delay
 
@@ -20,7 +21,7 @@ class PlantRequest:
 
     vehicle: Vehicle
     disturbance: Disturbance
-    sensors: SensorModel | None
+    sensors: AbstractSensors[Any] | None
     thrust_error: float
     """Relative thrust error; 0.1 means 10 % more thrust than commanded."""
     dt: float

@@ -1,4 +1,7 @@
-"""Sensor model: an inertial unit, and state samples at a fixed rate with latency, noise and dropouts."""
+"""Sensors: their interface, and a model of an inertial unit with noisy, late and lost state samples at a fixed rate."""
+
+import abc
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,8 +12,66 @@ from jaxtyping import Array, Bool, Float, Key
 from ..physics import so3
 from ..physics.state import State, where
 
+M = TypeVar("M")
 
-class SensorModel(eqx.Module):
+
+class AbstractSensors(eqx.Module, Generic[M]):
+    """Sensors of a simulated vehicle, with the estimator that makes a state from their samples. ``M`` is its memory."""
+
+    @property
+    @abc.abstractmethod
+    def period(self) -> int:
+        """Time between the true states that the sensors receive [ms]; a tick is a multiple of it."""
+
+    @property
+    def age(self) -> float:
+        """Age of a measurement at the end of a tick [s]; by default 0."""
+        return 0.0
+
+    @abc.abstractmethod
+    def init(self, x: State, key: Key[Array, ""]) -> M:
+        """Return the memory of a vehicle that hovers at ``x``; the key is consumed."""
+
+    @abc.abstractmethod
+    def sample(
+        self,
+        memory: M,
+        xs: State,
+        omega: Float[Array, "3"] | None,
+        a: Float[Array, "3"],
+        dt: float,
+        key: Key[Array, ""],
+    ) -> M:
+        """Return the memory after a tick.
+
+        Args:
+            memory: Memory at the start of the tick.
+            xs: True states in the tick, one per :attr:`period` (leading axis).
+            omega: True body rates at the end of the tick [rad/s]; None for a plant without body rates.
+            a: True mean acceleration in the tick, world [m/s^2].
+            dt: Length of the tick [s].
+            key: Random key, consumed.
+        """
+
+    @abc.abstractmethod
+    def state(self, memory: M) -> State:
+        """Return the measured state."""
+
+    @abc.abstractmethod
+    def inertial(
+        self, memory: M, omega: Float[Array, "3"], a: Float[Array, "3"], key: Key[Array, ""]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Return the measured body rates [rad/s] and acceleration, world [m/s^2].
+
+        Args:
+            memory: Memory after the tick.
+            omega: True body rates [rad/s].
+            a: True mean acceleration in the tick, world [m/s^2].
+            key: Random key, consumed.
+        """
+
+
+class SensorModel(AbstractSensors[State]):
     """Model of a motion-capture system or a state estimator, by default at 100 Hz as in the paper."""
 
     position: Float[Array, ""]
@@ -95,17 +156,23 @@ class SensorModel(eqx.Module):
         p, v, r = (random.normal(k, (3,), dtype) for k in (kp, kv, kr))
         return State(x.p + self.position * p, x.R @ so3.exp(self.attitude * r), x.v + self.velocity * v)
 
-    def received(self, queue: State, xs: State, key: Key[Array, ""]) -> State:
-        """Sample true states, and add the samples to the queue.
+    def init(self, x: State, key: Key[Array, ""]) -> State:
+        """Return a queue of :attr:`held` equal samples of ``x``; the key is consumed."""
+        first = self.noisy(x, key)
+        queue: State = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (self.held, *leaf.shape)), first)
+        return queue
 
-        Args:
-            queue: The :attr:`hold_last` samples, oldest first.
-            xs: True states, one per period (leading axis).
-            key: Seed of the noise and dropouts; consumed.
-
-        Returns:
-            The queue after the last sample.
-        """
+    def sample(
+        self,
+        memory: State,
+        xs: State,
+        omega: Float[Array, "3"] | None,
+        a: Float[Array, "3"],
+        dt: float,
+        key: Key[Array, ""],
+    ) -> State:
+        """Return the queue of samples, oldest first, after new samples of the true states."""
+        del omega, a, dt
 
         def one(queue: State, step: tuple[State, Key[Array, ""]]) -> tuple[State, None]:
             x, key = step
@@ -115,5 +182,18 @@ class SensorModel(eqx.Module):
             new = where(is_lost, last, self.noisy(x, k_noise))
             return jax.tree.map(lambda old, n: jnp.concatenate([old[1:], n[None]]), queue, new), None
 
-        after, _ = lax.scan(one, queue, (xs, random.split(key, xs.p.shape[0])))
+        after, _ = lax.scan(one, memory, (xs, random.split(key, xs.p.shape[0])))
         return after
+
+    def state(self, memory: State) -> State:
+        """Return the newest sample that has arrived."""
+        return jax.tree.map(lambda leaf: leaf[0], memory)  # type: ignore[no-any-return]
+
+    def inertial(
+        self, memory: State, omega: Float[Array, "3"], a: Float[Array, "3"], key: Key[Array, ""]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Return the body rates and the acceleration with noise; the inertial unit has no latency."""
+        del memory
+        k_gyro, k_accelerometer = random.split(key)
+        gyro = self.gyro * random.normal(k_gyro, (3,), a.dtype)
+        return omega + gyro, a + self.accelerometer * random.normal(k_accelerometer, (3,), a.dtype)

@@ -19,7 +19,7 @@ from ..physics.state import Command, State
 from ..physics.substep import SUBSTEP, AbstractSubstepDynamics
 from .measurement_faults import AbstractMeasurementFault
 from .plant import Measurement, Plant, as_numpy, check_command, limit_command
-from .sensors import SensorModel
+from .sensors import AbstractSensors
 
 FIRST_SAMPLE, INERTIAL, FAULT = 2**31 - 1, 2**31 - 2, 2**31 - 3  # folded into keys; no tick has these numbers
 
@@ -40,8 +40,8 @@ class SimState(eqx.Module):
     """State of the model."""
     queue: CommandQueue
     """Issued commands, including those that have already acted."""
-    samples: State
-    """State samples, oldest first: the sample that has arrived, and the samples still in transit."""
+    samples: Any
+    """Memory of the sensors; without sensors, the true state."""
     a: Float[Array, "3"]
     """Mean acceleration over the last tick in the world frame [m/s^2]."""
     reports: Reports | None = None
@@ -57,8 +57,8 @@ class Simulation(eqx.Module):
     """The vehicle."""
     disturbance: Disturbance
     """External effects, as a function of the time since the start of the flight and the state."""
-    sensors: SensorModel | None
-    """Sensor model; None for exact measurements."""
+    sensors: AbstractSensors[Any] | None
+    """Sensors; None for exact measurements."""
     key: Key[Array, ""]
     """Seed of noise and dropouts; they depend only on the seed and the tick, so a flight is reproducible."""
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.02))
@@ -74,7 +74,7 @@ class Simulation(eqx.Module):
         if self.sensors is not None and round(self.model.dt / SUBSTEP) % self.sensors.period:
             raise ValueError(
                 f"SimPlant: a tick of {self.model.dt} s is not a multiple of "
-                f"the {self.sensors.period} ms of SensorModel"
+                f"the {self.sensors.period} ms of {type(self.sensors).__name__}"
             )
 
     @property
@@ -90,9 +90,8 @@ class Simulation(eqx.Module):
     def launch(self, x0: State) -> SimState:
         """Return the state of a plant that hovers at ``x0``, with queued hover commands and one sample of ``x0``."""
         queue = CommandQueue.of(Command.hover(x0.p.dtype), self.model.dt, longest=self.longest_delay)
-        queue_length = 1 if self.sensors is None else self.sensors.held
-        sample = x0 if self.sensors is None else self.sensors.noisy(x0, random.fold_in(self.key, FIRST_SAMPLE))
-        samples = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (queue_length, *leaf.shape)), sample)
+        samples = x0 if self.sensors is None else self.sensors.init(x0, random.fold_in(self.key, FIRST_SAMPLE))
+        sample = self._measured(samples)
         reports = None
         if self.fault is not None:
             rows = self.fault.memory + 1
@@ -121,19 +120,24 @@ class Simulation(eqx.Module):
         times = self.time(tick, s.a.dtype) + SUBSTEP * jnp.arange(per_tick, dtype=s.a.dtype)
         acting = queue.substeps(self.delay, self.model.dt, per_tick)
         (inner, outer), path = lax.scan(millisecond, (s.model, s.disturbance), (times, acting))
-        if (sensors := self.sensors) is None:
-            samples = jax.tree.map(lambda leaf: leaf[-1:], path)
-        else:
-            on_samples = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
-            samples = sensors.received(s.samples, on_samples, random.fold_in(self.key, tick))
         a = (self.model.state(inner).v - self.model.state(s.model).v) / self.model.dt
+        if (sensors := self.sensors) is None:
+            samples = jax.tree.map(lambda leaf: leaf[-1], path)
+        else:
+            xs = jax.tree.map(lambda leaf: leaf[sensors.period - 1 :: sensors.period], path)
+            rates, key = self.model.body_rates(inner), random.fold_in(self.key, tick)
+            samples = sensors.sample(s.samples, xs, rates, a, self.model.dt, key)
         reports = self._reports(s.reports, samples, jnp.asarray(tick) + 1)
         return SimState(inner, queue, samples, a, reports, outer)
 
-    def _reports(self, before: Reports | None, samples: State, tick: Int[Array, ""]) -> Reports | None:
+    def _measured(self, samples: Any) -> State:
+        return samples if self.sensors is None else self.sensors.state(samples)
+
+    def _reports(self, before: Reports | None, samples: Any, tick: Int[Array, ""]) -> Reports | None:
         if before is None or self.fault is None:
             return None
-        past = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[:1]]), before.past, samples)
+        new_state = self._measured(samples)
+        past = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), before.past, new_state)
         key = random.fold_in(random.fold_in(self.key, tick), FAULT)
         return Reports(past, self.fault(past, tick, key))
 
@@ -148,7 +152,7 @@ class Simulation(eqx.Module):
         """Return the newest sample that has arrived, as the measurement system reports it."""
         if s.reports is not None:
             return s.reports.reported
-        return jax.tree.map(lambda leaf: leaf[0], s.samples)  # type: ignore[no-any-return]
+        return self._measured(s.samples)
 
     def inertial(self, s: SimState, tick: Int[ArrayLike, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]] | None:
         """Return the measured body rates [rad/s] and world acceleration [m/s^2]; None for a model without body rates.
@@ -160,9 +164,8 @@ class Simulation(eqx.Module):
         rates = self.model.body_rates(s.model)
         if rates is None or self.sensors is None:
             return None if rates is None else (rates, s.a)
-        k_gyro, k_accelerometer = random.split(random.fold_in(random.fold_in(self.key, tick), INERTIAL))
-        gyro = self.sensors.gyro * random.normal(k_gyro, (3,), s.a.dtype)
-        return rates + gyro, s.a + self.sensors.accelerometer * random.normal(k_accelerometer, (3,), s.a.dtype)
+        key = random.fold_in(random.fold_in(self.key, tick), INERTIAL)
+        return self.sensors.inertial(s.samples, rates, s.a, key)
 
     def true(self, s: SimState) -> State:
         """Return the vehicle's true state."""
@@ -192,7 +195,7 @@ class SimPlant(Plant):
         disturbance: Disturbance,
         *,
         delay_s: float = 0.02,
-        sensors: SensorModel | None = None,
+        sensors: AbstractSensors[Any] | None = None,
         fault: AbstractMeasurementFault | None = None,
         seed: int = 0,
     ) -> None:
@@ -202,7 +205,7 @@ class SimPlant(Plant):
             model: The vehicle.
             disturbance: External effects, as a function of the time since the reset and the state.
             delay_s: Transport delay of commands [s].
-            sensors: Sensor model; None for exact measurements.
+            sensors: Sensors; None for exact measurements.
             fault: Measurement fault; None for correct measurements.
             seed: Seed of sensor noise and dropouts; they depend only on the seed and the tick, so a flight is
                 reproducible.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Bool, Float, Key
 
-from ..estimation.camera import Camera, in_camera
+from ..estimation.camera import PATTERN, Camera, in_camera
 from ..physics import so3
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import STANDARD_GRAVITY, Command, State
@@ -20,8 +20,6 @@ from .observation import POSITION_SCALE, VELOCITY_SCALE, AbstractObservation
 
 Statistics = tuple[Float[Array, "70"], Float[Array, "70 70"]]
 """Mean and whitening matrix of the pixels."""
-PATTERN = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (-0.5, 0.0), (0.0, 0.5), (0.5, 0.0))
-"""Keypoints, relative to the point below the goal [m]: the corners of a square and three mid-points of its sides."""
 BELOW = 1.0  # [m], from the goal to the ground
 FRAMES, COMMANDS = 5, 3
 FRAME_TIME = 0.06  # [s] between frames, as published
