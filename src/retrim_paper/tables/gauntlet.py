@@ -82,7 +82,7 @@ def gauntlet(
         seeds: Training seeds; each also seeds the starts, gusts and learners of its flights.
         seconds: Length of a flight [s]; flights of hidden vehicles last 10 s, or 25 s on figure-8s.
         starts: Flights per condition, method and seed.
-        sensors: Sensors of the conditions that do not name their own: ideal, mocap, onboard or rough.
+        sensors: Sensors of the conditions that do not name their own: ideal, mocap, onboard, rough or camera.
         faults: Instead, fly measurement and vehicle faults at hover, and check that adapting is never worse than not
             adapting; the default methods are then base, base-do, geometric-i, indi, full and lora.
         vehicles: own flies the preset's vehicle under all conditions; hidden flies many vehicles that are unknown to
