@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from ...physics.state import STANDARD_GRAVITY, Command, State, where
+from .linear_systems import solve_positive
 from .targets import Targets
 
 SIZE = 19
@@ -89,9 +90,8 @@ class LinearModel(eqx.Module):
     ) -> LinearState:
         """Return the state for the given information."""
         eye = jnp.eye(SIZE, dtype=precision.dtype)
-        factor = jax.scipy.linalg.cho_factor(eye + precision)
-        weights = self.prior[:, None] * jax.scipy.linalg.cho_solve(factor, moment)
-        covariance = self.prior[:, None] * jax.scipy.linalg.cho_solve(factor, eye) * self.prior[None]
+        mean, covariance = solve_positive(eye + precision, moment, eye)
+        weights, covariance = self.prior[:, None] * mean, self.prior[:, None] * covariance * self.prior[None]
         return LinearState(precision, moment, weights, covariance, fits)
 
     def predict(self, state: LinearState, x: State, u: Command) -> Float[Array, "3"]:

@@ -15,6 +15,7 @@ from jax import lax, random
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ...physics.state import Command, State, where
+from .linear_systems import solve_positive
 from .model import ResidualModel
 from .rates import RateFit
 from .targets import Targets
@@ -239,8 +240,8 @@ class PlaceModel(eqx.Module):
         return PlaceMap(place_map.centres, place_map.visited, precision, moment, self._solve(precision, moment))
 
     def _solve(self, precision: Float[Array, "n n"], moment: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        weights: Array = self.prior * jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(precision), moment)
-        return weights
+        (weights,) = solve_positive(precision, moment)
+        return self.prior * weights
 
     def _place_centres(
         self, before: PlaceMap, p: Float[Array, "rows 3"], new: Bool[Array, " rows"], fits: Int[Array, ""]

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, Key
 from ...physics import so3
 from ...physics.actuators import is_unsaturated
 from ...physics.state import STANDARD_GRAVITY, Command, State, where
+from .linear_systems import solve_positive
 from .rates import RateFit, RateModel
 from .targets import Targets
 
@@ -151,11 +152,8 @@ class RegressionModel(eqx.Module):
         )  # parameters of order one: well conditioned in single precision
         eye = jnp.eye(SIZE, dtype=scaled_features.dtype)
         precision = eye + jnp.einsum("n,nik,nil->kl", weight, scaled_features, scaled_features) / self.noise**2
-        factor = jax.scipy.linalg.cho_factor(precision)
-        mean = jax.scipy.linalg.cho_solve(
-            factor, jnp.einsum("n,nik,ni->k", weight, scaled_features, target) / self.noise**2
-        )
-        covariance = jax.scipy.linalg.cho_solve(factor, eye)
+        moment = jnp.einsum("n,nik,ni->k", weight, scaled_features, target) / self.noise**2
+        mean, covariance = solve_positive(precision, moment, eye)
         return Normal(self.prior * mean, self.prior[:, None] * covariance * self.prior[None])
 
     def _weigh_changes(
