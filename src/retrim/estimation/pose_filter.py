@@ -22,6 +22,7 @@ PUSH = 1.0  # [m/s^2], uncertainty of the disturbance at hand-over
 DRIFT = (0.0, 0.5, 1.0)  # further errors in Eq. (1): rates [rad/s] and acceleration [m/s^2], held over a tick
 WANDER = 1.0  # [m/s^2] after one second, random walk of the disturbance
 ITERATIONS = 3  # a first estimate may be far off, so the projection is linearised again at the last result
+LEAST_NOISE = 0.5  # [px], smallest noise that the filter assumes for a camera
 GATE = 4.0  # standard deviations; a point farther off corrects no more than one at this distance
 
 
@@ -96,8 +97,9 @@ class PoseFilter(eqx.Module):
         F = jnp.block(
             [[eye, zero, dt * eye, zero], [zero, turn, zero, zero], [zero, lean, eye, zero], [zero] * 3 + [eye]]
         )
-        exact, (rate, push) = jnp.zeros(3, dtype=dtype), (jnp.full(3, value, dtype=dtype) for value in noise)
-        steps = dt * jnp.concatenate([exact, rate, push, exact])
+        exact = jnp.zeros(3, dtype=dtype)
+        rate_noise, force_noise = (jnp.full(3, value, dtype=dtype) for value in noise)
+        steps = dt * jnp.concatenate([exact, rate_noise, force_noise, exact])
         after = State(x.p + dt * x.v + 0.5 * dt**2 * a, R, x.v + dt * a)
         return PoseFilter(after, self.d, F @ self.P @ F.T + jnp.diag(steps**2), self.acting)
 
@@ -144,6 +146,11 @@ class PoseFilter(eqx.Module):
 
         off, P = lax.fori_loop(0, ITERATIONS, look, here)
         return PoseFilter(_perturb(self.x, off), self.d + off[9:], 0.5 * (P + P.T), self.acting)
+
+
+def assumed_noise(camera: Camera, noise: Float[Array, ""]) -> Float[Array, "2"]:
+    """Return the normalised standard deviation that the filter assumes for pixels with a noise of ``noise`` [px]."""
+    return 2.0 * jnp.maximum(noise, LEAST_NOISE) / camera.size
 
 
 def _perturb(x: State, off: Float[Array, " n"]) -> State:

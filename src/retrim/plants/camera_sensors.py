@@ -1,7 +1,7 @@
 """Sensors: a camera above keypoints on the ground, an inertial unit, and the filter that estimates the state from both.
 
 The filter needs neither commands nor the vehicle's parameters, so every policy and controller that needs a state can
-fly from keypoints, with vehicles that are not known.
+fly from keypoints, also with unknown vehicles.
 """
 
 from typing import Any
@@ -14,13 +14,12 @@ from jaxtyping import Array, Float, Key
 
 from ..errors import PlantError
 from ..estimation.camera import PATTERN, Camera, in_camera
-from ..estimation.pose_filter import PoseFilter
+from ..estimation.pose_filter import PoseFilter, assumed_noise
 from ..physics import so3
 from ..physics.state import STANDARD_GRAVITY, State
 from .sensors import AbstractSensors
 
-LEAST_NOISE = 0.5  # [px], smallest noise of a pixel that the filter assumes
-# Errors of the mean rates [rad/s] and of the mean force [m/s^2] of a tick beside the noise of the inertial unit.
+# Errors of the mean rates [rad/s] and of the mean force [m/s^2] of a tick, beyond the noise of the inertial unit.
 RATE_ERROR, FORCE_ERROR = 0.1, 0.3
 
 
@@ -103,9 +102,8 @@ class CameraSensors(AbstractSensors[CameraMemory]):
         dtype, gravity = a.dtype, jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=a.dtype)
         k_gyro, k_accelerometer, k_frame = random.split(key, 3)
         rates = omega + self.gyro.astype(dtype) * random.normal(k_gyro, (3,), dtype)
-        force = so3.act(x.R.T, a - gravity) + self.accelerometer.astype(dtype) * random.normal(
-            k_accelerometer, (3,), dtype
-        )
+        deviation = self.accelerometer.astype(dtype) * random.normal(k_accelerometer, (3,), dtype)
+        force = so3.act(x.R.T, a - gravity) + deviation
         noise = jnp.hypot(self.gyro, RATE_ERROR), jnp.hypot(self.accelerometer, FORCE_ERROR)
         prior = memory.pose.predict_by_unit(0.5 * (memory.omega + rates), force, dt, noise)
         pose = self._correct(prior, x, k_frame)
@@ -131,5 +129,5 @@ class CameraSensors(AbstractSensors[CameraMemory]):
         off = (2.0 * self.pixel_noise / camera.size).astype(dtype)
         pixels = points.pixel + off[None] * random.normal(k_noise, points.pixel.shape, dtype)
         is_visible = points.visible & (random.uniform(k_dropout, points.visible.shape, dtype) >= self.dropout)
-        sharpness = 2.0 * jnp.maximum(self.pixel_noise, LEAST_NOISE) / camera.size
-        return prior.correct(camera, ground, pixels, is_visible, sharpness.astype(dtype))
+        sharpness = assumed_noise(camera, self.pixel_noise).astype(dtype)
+        return prior.correct(camera, ground, pixels, is_visible, sharpness)

@@ -32,7 +32,7 @@ class PlantRequest:
     address: str = ""
     """Address of the vehicle; if empty, the default address of the link."""
     fault: AbstractMeasurementFault | None = None
-    """Measurement fault; None for a plant without faults."""
+    """Measurement fault, if any."""
 
     @property
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +49,7 @@ class PlantEntry:
     about: str
     """Short description of the simulated system."""
     own_vehicle: str | None = None
-    """Name of the plant's built-in vehicle; None if the plant can simulate any vehicle."""
+    """Name of the plant's built-in vehicle; by default, the plant can simulate any vehicle."""
     has_sensors: bool = False
     """Whether the plant supports sensor models."""
     has_faults: bool = False
@@ -69,7 +69,7 @@ class PlantEntry:
     awaits: str = "the vehicle, which takes off"
     """Subject of the message while a vehicle is not at the start yet."""
     check_address: Callable[[str], object] | None = None
-    """Function that raises ConfigError if the address after a vehicle's name is invalid; None for no check."""
+    """Function that raises ConfigError if the address after a vehicle's name is invalid, if there is such a check."""
     needs: Callable[[], object] | None = None
-    """Function that raises an error if a required program or package is missing, called before training; None if the
+    """Function that raises an error if a required program or package is missing, called before training; by default, a
     plant has no requirements."""

@@ -45,7 +45,7 @@ class SimState(eqx.Module):
     a: Float[Array, "3"]
     """Mean acceleration over the last tick in the world frame [m/s^2]."""
     reports: Reports | None = None
-    """Memory of the measurement fault; None without a fault."""
+    """Memory of the measurement fault, if any."""
     disturbance: tuple[Any, ...] = ()
     """States of those parts of the disturbance that have one, such as a load on a cable."""
 
@@ -58,13 +58,13 @@ class Simulation(eqx.Module):
     disturbance: Disturbance
     """External effects, as a function of the time since the start of the flight and the state."""
     sensors: AbstractSensors[Any] | None
-    """Sensors; None for exact measurements."""
+    """Sensors; without them, measurements are exact."""
     key: Key[Array, ""]
     """Seed of noise and dropouts; they depend only on the seed and the tick, so a flight is reproducible."""
     delay: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.02))
     """Transport delay of commands [s]; a change does not cause recompilation."""
     fault: AbstractMeasurementFault | None = None
-    """Measurement fault; None for correct measurements."""
+    """Measurement fault, if any."""
     longest_delay: float = eqx.field(static=True, default=LONGEST_DELAY)
     """Longest delay that the command queue can hold [s]."""
 
@@ -205,8 +205,8 @@ class SimPlant(Plant):
             model: The vehicle.
             disturbance: External effects, as a function of the time since the reset and the state.
             delay_s: Transport delay of commands [s].
-            sensors: Sensors; None for exact measurements.
-            fault: Measurement fault; None for correct measurements.
+            sensors: Sensors; by default, measurements are exact.
+            fault: Measurement fault; by default, measurements are correct.
             seed: Seed of sensor noise and dropouts; they depend only on the seed and the tick, so a flight is
                 reproducible.
 

@@ -10,14 +10,12 @@ import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Bool, Float, Key
 
-from ..estimation.pose_filter import PoseFilter
+from ..estimation.pose_filter import PoseFilter, assumed_noise
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.state import Command, State
 from .keypoints import COMMANDS, Keypoints, key_of
 from .observation import AbstractObservation
 from .state_estimate import StateEstimate
-
-LEAST_NOISE = 0.5  # [px], smallest noise that the filter assumes for a camera
 
 
 class OccludedMemory(NamedTuple):
@@ -102,7 +100,7 @@ class OccludedKeypoints(AbstractObservation[OccludedMemory]):
         key, k_noise, k_drop = random.split(memory.key, 3)
         true, inside = full.pixels(x)
         is_visible = inside & (random.uniform(k_drop, (7,), true.dtype) >= self.dropout)
-        sharpness = 2.0 * jnp.maximum(full.noise, LEAST_NOISE) / full.camera.size
+        sharpness = assumed_noise(full.camera, full.noise)
         prior = memory.pose.predict(command, full.dt, self.lag)
         pose = prior.correct(
             full.camera, full.ground(), true + full.deviation(k_noise, true.dtype), is_visible, sharpness

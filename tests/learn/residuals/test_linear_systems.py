@@ -67,5 +67,5 @@ def test_batch_of_batches(key):
 
 
 def test_threads_that_solve_batches_at_once_do_not_wait_for_ever():
-    """A batch of LAPACK calls waits inside a thread of JAX; one such batch per core used to stop the process."""
+    """A batch of LAPACK calls waits inside a thread of JAX; one such batch per core stopped the process before."""
     subprocess.run([sys.executable, "-c", BATCHES_AT_ONCE], timeout=90.0, check=True)

@@ -1,8 +1,8 @@
 """Solve systems with positive definite matrices, one by one on a CPU.
 
-On a CPU, releases of JAX before 0.11.2 distribute a batch of LAPACK calls to the threads of the process and wait for
-them inside one of these threads. If programs of several threads do so at the same time, no thread is left, and all of
-them wait for ever. A call for a single system runs in its own thread.
+On a CPU, JAX 0.10 distributes a batch of LAPACK calls to a pool of threads, one per core, and waits for them inside one
+of these threads. If several programs do so at the same time, no thread is left, and all of them wait for ever. A call
+for a single system needs no other thread.
 """
 
 from collections.abc import Sequence
@@ -44,14 +44,10 @@ def _solve_batch(
 ) -> tuple[tuple[Array, ...], tuple[bool, ...]]:
     """Solve a batch: as one call on an accelerator, and one system after another on a CPU."""
     parts, flags = (matrix, *right), (is_batched[0], *is_batched[1])
-    batched_parts = [part if flag else _repeat(part, size) for part, flag in zip(parts, flags, strict=True)]
+    batched_parts = [part if flag else lax.broadcast(part, (size,)) for part, flag in zip(parts, flags, strict=True)]
     matrices, sides = batched_parts[0], tuple(batched_parts[1:])
     if jax.default_backend() == "cpu":
         solutions = lax.map(lambda system: _solve(*system), (matrices, sides))
     else:
         solutions = jax.vmap(_factor_and_solve)(matrices, sides)
     return solutions, (True,) * len(right)
-
-
-def _repeat(part: Array, size: int) -> Array:
-    return lax.broadcast(part, (size,))
