@@ -1,5 +1,7 @@
 """NearTarget leaves a controller unchanged near the target, and limits the error that it sees from far away."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,10 +10,14 @@ import pytest
 from jax import random
 
 from helpers import hover_task, random_state
+from retrim.config.families import policy_controller
+from retrim.config.loading import changed, load
+from retrim.config.setup import Setup
 from retrim.control import Policy, PolicyController
-from retrim.control.near_target import NearTarget
+from retrim.control.near_target import LARGEST_REACH, WEAK_REACH, NearTarget, safe_reach
 from retrim.physics import State, small
 from retrim.physics.effective_gravity import EffectiveGravityFrame
+from retrim.physics.state import STANDARD_GRAVITY
 
 REACH = 0.3
 
@@ -56,3 +62,28 @@ def test_near_target_is_equivariant(controller):
         rtol=1e-5,
         atol=1e-5,
     )
+
+
+def test_reach_grows_with_thrust():
+    """The reach grows with the thrust, from a positive value to a constant for strong vehicles."""
+    weight = small().mass * STANDARD_GRAVITY
+    ratios = [1.1, 1.3, 1.8, 2.5, 3.2, 5.0, 10.0]
+    reaches = [float(safe_reach(dataclasses.replace(small(), thrust_max=ratio * weight))) for ratio in ratios]
+    assert 0.0 < reaches[0] < reaches[1] < reaches[2] < reaches[3] < reaches[4] == reaches[5] == reaches[6]
+    np.testing.assert_allclose([reaches[2], reaches[-1]], [WEAK_REACH, LARGEST_REACH], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_limited"),
+    [
+        ("hover/retrim", True),
+        ("hover/any", True),
+        ("track/retrim", True),
+        ("hover/paper", False),
+        ("vision/retrim", False),
+    ],
+)
+def test_limit_applies_to_measured_distance_outside_loop_of_paper(name, is_limited):
+    setup = Setup.from_preset(changed(load(name), pretrain={"hidden_sizes": (8, 8)}))
+    controller = policy_controller(setup.preset, setup.flight_task, setup.new_policy(random.key(0)))
+    assert isinstance(controller, NearTarget) == is_limited

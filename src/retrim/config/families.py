@@ -9,7 +9,7 @@ from ..control.actuator_tracking import ActuatorTracking
 from ..control.belief_flight import IdentifiedFlight
 from ..control.controller import AbstractController, PolicyController
 from ..control.excitation import Excitation
-from ..control.near_target import NearTarget
+from ..control.near_target import WEAK_REACH, NearTarget, safe_reach
 from ..control.policy import AbstractPolicy
 from ..control.resting import RestingController
 from ..errors import ConfigError
@@ -19,10 +19,9 @@ from ..tasks.task import AbstractTask
 from .presets import Preset
 from .tasks import find_task
 from .vehicle_file import VehicleSpec
+from .vehicles import make_vehicle
 
 TRUST = 2.0  # assumed error factor of a delay or lag in a vehicle file
-# [m]: largest distance from the target in the policy's input. Beyond it, a policy tilts too far for a weak vehicle.
-REACH = 0.5
 LEAST = 0.01  # [s]: assumed error of a short delay or lag
 
 
@@ -75,17 +74,20 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy
     """Return a policy with the observation used in flight.
 
     Args:
-        preset: Preset of the policy. For a family and a task without a reference, the observed distance from the target
-            is limited. If this task rests at home, the policy is also shifted so that it commands hover at home.
+        preset: Preset of the policy. Except in the paper's own loop, which flies in the world frame, the observed
+            distance from the target is limited if the task permits it. A policy for a family is also shifted so that it
+            commands hover at home, if the task rests there.
         task: Task of the flight.
         policy: Policy of the flight.
     """
     observation = task.observation_in_flight
-    if preset.family is None or find_task(preset.task).has_reference:
-        return PolicyController(observation, policy)
-    plain = PolicyController(observation, policy)
-    inner = RestingController(observation, policy, task.home()) if task.rests else plain
-    return NearTarget(inner, task, jnp.array(REACH))
+    controller = PolicyController(observation, policy)
+    if preset.family is not None and task.rests and not find_task(preset.task).has_reference:
+        controller = RestingController(observation, policy, task.home())
+    if preset.adapt.frame == "world" or not task.approaches_target or not observation.measures_state:
+        return controller
+    reach = safe_reach(make_vehicle(preset.vehicle)) if preset.family is None else jnp.array(WEAK_REACH)
+    return NearTarget(controller, task, reach)
 
 
 def track_actuators(controller: AbstractController[Any], preset: Preset) -> AbstractController[Any]:

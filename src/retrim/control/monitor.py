@@ -134,11 +134,7 @@ class Monitor(AbstractController[MonitorState]):
         slow = memory.stage == Stage.SLOW
         flying = dataclasses.replace(
             self.frame,
-            inner=NearTarget(
-                dataclasses.replace(self._inner, policy=where(is_adapted, self._inner.policy, memory.base)),
-                self.task,
-                self._reach(memory),
-            ),
+            inner=self._limited(where(is_adapted, self._inner.policy, memory.base), self._reach(memory)),
             trust_estimate=observes.astype(x.p.dtype) * self._trust(memory, t),
             trust_residual=is_adapted.astype(x.p.dtype),
             steady=slow.astype(x.p.dtype) * memory.d,
@@ -172,9 +168,20 @@ class Monitor(AbstractController[MonitorState]):
         grows, since the policy needs an error to hold against an uncompensated push.
         """
         swung = (memory.cause == Cause.OSCILLATION) & (memory.stage == Stage.BASE)
-        own = jnp.where(swung, REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), jnp.inf)
+        return jnp.where(
+            swung,
+            jnp.minimum(REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), self._own_reach),
+            self._own_reach,
+        )
+
+    @property
+    def _own_reach(self) -> Float[Array, ""]:
+        """Limit of a flight without an oscillation [m]; infinite if there is none."""
         inner = self.frame.inner
-        return jnp.minimum(own, inner.reach) if isinstance(inner, NearTarget) else own
+        return inner.reach if isinstance(inner, NearTarget) else jnp.array(jnp.inf)
+
+    def _limited(self, policy: AbstractPolicy, reach: Float[Array, ""]) -> NearTarget:
+        return NearTarget(dataclasses.replace(self._inner, policy=policy), self.task, reach)
 
     @property
     def _inner(self) -> PolicyController:
@@ -232,7 +239,7 @@ class Monitor(AbstractController[MonitorState]):
 
     def _step(self, s: MonitorState, t: Float[Array, ""], x: State, allowance: Float[Array, ""]) -> Twin:
         """Return the twin one tick later; the vehicle's error may exceed that of the twin by ``allowance`` [m]."""
-        nominal, base = self.frame.observer.nominal, dataclasses.replace(self._inner, policy=s.base)
+        nominal, base = self.frame.observer.nominal, self._limited(s.base, self._own_reach)
         excess = self.task.error(t, x) - self.task.error(t, s.twin.x)
         near = self.task.error(t, s.twin.x) < LOST  # also false for an error that is not a number
         at, memory, path = where(near, (s.twin.x, s.twin.memory, s.twin.path), (x, base.init(x), self._at_hover(x)))

@@ -1,5 +1,6 @@
 """Limit the distance from the target in a controller's input."""
 
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,16 +10,34 @@ from ..physics.actuator_response import ActuatorState
 from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
-from ..physics.state import Command, State
+from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..physics.vehicle import Vehicle
 from ..tasks.task import AbstractTask
 from .controller import AbstractController
+
+WEAK_REACH = 0.5  # [m], for a vehicle whose thrust is 1.8 times its weight; from 0.8 m, such vehicles fall
+REACH_PER_G = WEAK_REACH / math.sqrt(1.8**2 - 1.0)  # [m] per horizontal acceleration of 1 g that the vehicle can hold
+LARGEST_REACH = 1.0  # [m]: an unknown load may take a large part of a strong vehicle's thrust
+
+
+def safe_reach(vehicle: Vehicle) -> Float[Array, ""]:
+    """Return the largest distance from the target at which a policy does not tilt too far for the vehicle's thrust [m].
+
+    A vehicle whose thrust is r times its weight can hold its height up to a horizontal acceleration of sqrt(r^2 - 1) g.
+    The reach is proportional to this acceleration, and at most :data:`LARGEST_REACH`.
+
+    Args:
+        vehicle: Vehicle with its mass and its largest thrust.
+    """
+    ratio = vehicle.thrust_max / (vehicle.mass * STANDARD_GRAVITY)
+    return jnp.minimum(REACH_PER_G * jnp.sqrt(jnp.maximum(ratio**2 - 1.0, 0.04)), LARGEST_REACH)
 
 
 class NearTarget(AbstractController[Any]):
     """Limits the position that a controller receives to within ``reach`` of the target.
 
-    A policy's commands grow with this distance. If measurements are late, a policy that is stable near its target may
-    oscillate and crash when it is far away.
+    A policy's commands grow with this distance. From far away, a policy may tilt so far that a weak vehicle falls. If
+    measurements are late, it may oscillate and crash there, although it is stable near its target.
     """
 
     inner: AbstractController[Any]

@@ -49,6 +49,11 @@ class AbstractHover(AbstractTask):
         """Whether the vehicle comes to rest at the goal."""
         return type(self).target is AbstractHover.target
 
+    @property
+    def approaches_target(self) -> bool:
+        """Whether a policy may observe a limited distance from the goal; true."""
+        return True
+
     def home(self) -> Float[Array, "3"]:
         """Return the goal in the world frame [m]."""
         return self.goal

@@ -84,6 +84,11 @@ class MovingGoal(AbstractTask):
         """Observation of the relative state, used in flight."""
         return GoalObs(self.inner.observation_in_flight, self.path, self.frame)
 
+    @property
+    def approaches_target(self) -> bool:
+        """Whether a policy may observe a limited distance from the goal; true."""
+        return True
+
     def home(self) -> Float[Array, "3"]:
         """Return the goal's initial position [m]."""
         return self.target(jnp.zeros_like(self.inner.goal[0]))

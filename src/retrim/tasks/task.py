@@ -86,6 +86,15 @@ class AbstractTask(eqx.Module):
         return type(self).target is AbstractTask.target
 
     @property
+    def approaches_target(self) -> bool:
+        """Whether a policy may observe a limited distance from the target; by default, false.
+
+        True for a task that only brings the vehicle to its target. From far away, the limit prevents a tilt at which a
+        weak vehicle falls.
+        """
+        return False
+
+    @property
     def metric(self) -> str:
         """Name of the error metric in results."""
         return "steady_error_m"

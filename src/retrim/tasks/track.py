@@ -51,6 +51,11 @@ class AbstractTrack(AbstractTask):
         return Start(t, State(p, R, here.v + 0.3 * random.normal(kv, (3,), here.p.dtype)))
 
     @property
+    def approaches_target(self) -> bool:
+        """Whether a policy may observe a limited distance from the reference; true."""
+        return True
+
+    @property
     def metric(self) -> str:
         """Name of the error metric in results."""
         return "tracking_error_m"
