@@ -250,9 +250,9 @@ def test_pilot_has_schedule_of_preset(case, latency, monkeypatch):
         assert float(flight.observer.path.delay) == pytest.approx(declaration if preset.family is None else unknown)
         assert eqx.tree_equal(flight.known_residual.model, result.learner.residual_model)
         flight = flight.inner
-    if preset.family is not None and preset.task == "hover":
+    if a.frame == "gravity" and preset.task != "vision":
         assert isinstance(flight, NearTarget)
-        assert float(flight.reach) == pytest.approx(0.5)
+        assert float(flight.reach) == pytest.approx(1.0 if preset.family is None else 0.5)
         flight = flight.inner
     assert isinstance(flight, PolicyController)
     if a.lap_learning:  # on the reference that the laps shift
