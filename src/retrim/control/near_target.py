@@ -30,7 +30,8 @@ def safe_reach(vehicle: Vehicle) -> Float[Array, ""]:
         vehicle: Vehicle with its mass and its largest thrust.
     """
     ratio = vehicle.thrust_max / (vehicle.mass * STANDARD_GRAVITY)
-    return jnp.minimum(REACH_PER_G * jnp.sqrt(jnp.maximum(ratio**2 - 1.0, 0.04)), LARGEST_REACH)
+    level = jnp.sqrt(jnp.maximum(ratio**2 - 1.0, 0.04))  # [g]; the policy of a vehicle that cannot hover still steers
+    return jnp.minimum(REACH_PER_G * level, LARGEST_REACH)
 
 
 class NearTarget(AbstractController[Any]):
