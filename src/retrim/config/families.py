@@ -26,7 +26,7 @@ LEAST = 0.01  # [s]: assumed error of a short delay or lag
 
 
 def make_family(preset: Preset) -> PathFamily | None:
-    """Return the family of a preset, or None for a preset with one vehicle.
+    """Return the family of a preset, if it has one.
 
     Raises:
         ConfigError: A range is empty or impossible.
@@ -82,7 +82,7 @@ def policy_controller(preset: Preset, task: AbstractTask, policy: AbstractPolicy
     """
     observation = task.observation_in_flight
     controller = PolicyController(observation, policy)
-    if preset.family is not None and task.rests and not find_task(preset.task).has_reference:
+    if preset.family is not None and task.rests:
         controller = RestingController(observation, policy, task.home())
     if preset.adapt.frame == "world" or not task.approaches_target or not observation.measures_state:
         return controller
@@ -134,7 +134,7 @@ def identify_vehicle(controller: AbstractController[Any], preset: Preset) -> Ide
 
 
 def declared_vehicle(preset: Preset) -> Float[Array, "2"] | None:
-    """Return the command delay and rate lag from the vehicle file [s], or None if the file does not state both."""
+    """Return the command delay and rate lag from the vehicle file [s], if the file states both."""
     vehicle = preset.vehicle
     if not isinstance(vehicle, VehicleSpec) or vehicle.command_delay is None or vehicle.rate_lag is None:
         return None
@@ -146,7 +146,7 @@ def _lag(vehicle: VehicleSpec) -> float | None:
 
 
 def _interval(value: float | None) -> tuple[float, float]:
-    """Return the interval of a time constant from a vehicle file [s]; unbounded if the file states none."""
+    """Return the interval of a time constant from a vehicle file [s]; unbounded if the file does not state it."""
     if value is None:
         return 0.0, jnp.inf
     return min(value / TRUST, max(value - LEAST, 0.0)), max(value * TRUST, value + LEAST)

@@ -32,7 +32,7 @@ class GoalObs(AbstractWrappedObservation[M]):
 
     path: GoalPath = eqx.field(static=True)
     frame: EffectiveGravityFrame | None = None
-    """Frame of the states; None for the world frame."""
+    """Frame of the states; by default, the world frame."""
 
     def __call__(self, memory: M, t: Float[Array, ""], x: State, last: Command) -> tuple[Float[Array, " o"], M]:
         """Return the observation of the relative state."""
@@ -62,7 +62,7 @@ class MovingGoal(AbstractTask):
     """Hover task whose goal is the origin."""
     path: GoalPath = eqx.field(static=True)
     frame: EffectiveGravityFrame | None = None
-    """Frame of the states; None for the world frame."""
+    """Frame of the states; by default, the world frame."""
 
     @property
     def dt(self) -> float:
@@ -86,8 +86,8 @@ class MovingGoal(AbstractTask):
 
     @property
     def approaches_target(self) -> bool:
-        """Whether a policy may observe a limited distance from the goal; true."""
-        return True
+        """Whether a policy may observe a limited distance from the goal, as in the hover task."""
+        return self.inner.approaches_target
 
     def home(self) -> Float[Array, "3"]:
         """Return the goal's initial position [m]."""
@@ -148,7 +148,7 @@ def relative_state(path: GoalPath, frame: EffectiveGravityFrame | None, t: Float
 
     Args:
         path: Path of the goal.
-        frame: Frame of the state; None for the world.
+        frame: Frame of the state; without one, the world frame.
         t: Time [s].
         x: State.
     """
