@@ -30,7 +30,7 @@ from retrim import Setup, load_learner_state, load_policy
 from retrim.adapt.updates import PolicyUpdate, ResidualUpdate, Skip, pack_update, unpack_update
 from retrim.config import changed, load, overlaid, read_vehicle
 from retrim.config.loading import dump, values
-from retrim.config.names import PLAIN
+from retrim.config.names import PLAIN_NAME
 from retrim.config.references import make_reference
 from retrim.evaluation.sweep import Sweep, read_sweep
 from retrim.io.checkpoint import architecture, load_delta, lora_header
@@ -48,7 +48,7 @@ from retrim.onboard.messages import (
     pack_note,
     unpack_note,
 )  # fmt: skip
-from retrim.onboard.topics import INTO, OUT
+from retrim.onboard.topics import INPUT_TOPICS, OUTPUT_TOPICS
 from retrim.runkit.codecs import rows_codec
 from retrim.transport import wire
 from retrim.transport.message import pack_arrays
@@ -186,7 +186,7 @@ def variants(tables: dict, *, toml: bool, free=()) -> Iterator[tuple[str, Callab
 
 
 def _plain(path, name) -> bool:
-    return path[-1] == "name" and PLAIN.fullmatch(TEXTS[name]) is not None
+    return path[-1] == "name" and PLAIN_NAME.fullmatch(TEXTS[name]) is not None
 
 
 def write(about: dict) -> dict[str, str]:
@@ -365,7 +365,7 @@ class CaseMaker:
             "time": {"field": "t", "unit": "s", "age": "age"}, "position": {"fields": ["px", "py", "pz"], "unit": "m"},
             "velocity": {"fields": ["vx", "vy", "vz"]}, "attitude": {"fields": ["q"], "form": "xyzw"},
             "thrust": {"fields": ["c"], "unit": "share", "hover": 0.4}, "rates": {"fields": ["w"]},
-            "acceleration": {"fields": ["a"], "axes": "body", "gravity": "felt"},
+            "acceleration": {"fields": ["a"], "axes": "body", "gravity": "included"},
             "frames": {"world": "ENU", "body": "FLU"}, "part": {"start": 0.0, "end": 5.0},
         }  # fmt: skip
         assert {each.name for each in dataclasses.fields(LogMap)} >= tables.keys()
@@ -439,7 +439,7 @@ class CaseMaker:
         )
         fields = {
             "number": 1, "reference": "circle", "seed": 0, "base": "abc", "layers": ["policy"], "floor": 0,
-            "capacities": dict.fromkeys((*OUT[:2], INTO[0]), 1000),
+            "capacities": dict.fromkeys((*OUTPUT_TOPICS[:2], INPUT_TOPICS[0]), 1000),
         }  # fmt: skip
 
         def case(name, text, start=start, fine=False):

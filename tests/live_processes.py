@@ -15,7 +15,7 @@ from retrim.onboard.guard import UP, G
 from retrim.onboard.heartbeat import Heart
 from retrim.onboard.messages import Parameters, Sample, Setpoint, pack_note
 from retrim.onboard.realtime import ParentWatch, be_punctual, sleep_until
-from retrim.onboard.topics import OUT
+from retrim.onboard.topics import OUTPUT_TOPICS
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
 
@@ -135,5 +135,5 @@ class LocalAddress(Address):
 
     def join(self, capacities, *, listen, writes=()):
         assert listen
-        assert set(writes) == set(OUT)
+        assert set(writes) == set(OUTPUT_TOPICS)
         return NetworkStandIn(self.folder)

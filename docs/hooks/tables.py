@@ -1,6 +1,6 @@
-"""Parts of the site that are made from the code when it is built: tables of keys, of presets and of public names.
+"""Tables of keys, presets and public names, generated from the code when the site is built.
 
-A page asks for a table by a comment: ``<!-- keys: module:Class -->``, ``<!-- presets -->``, ``<!-- names -->`` or
+A comment on a page requests a table: ``<!-- keys: module:Class -->``, ``<!-- presets -->``, ``<!-- names -->`` or
 ``<!-- primitives -->``.
 """
 
@@ -23,7 +23,7 @@ ROLE = re.compile(r":(?:class|func|meth|mod|data|attr):<code>~?(?P<target>[\w.]+
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in the tables that a page asks for."""
+    """Insert the tables that a page requests."""
     markdown = KEYS.sub(lambda match: _keys(match["module"], match["name"]), markdown)
     if "<!-- presets -->" in markdown:
         markdown = markdown.replace("<!-- presets -->", _presets())
@@ -35,18 +35,18 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Turn roles of docstrings, as in :class:`retrim.Plant`, into links."""
+    """Replace roles of docstrings, such as :class:`retrim.Plant`, by links."""
     return ROLE.sub(lambda match: _link(match["target"]), html)
 
 
 def _link(target: str) -> str:
     name = target.removeprefix("retrim.")
-    where = f"{getattr(retrim, name).__module__}.{name}" if name in retrim.__all__ else target
-    return f'<autoref optional identifier="{where}"><code>{target}</code></autoref>'
+    identifier = f"{getattr(retrim, name).__module__}.{name}" if name in retrim.__all__ else target
+    return f'<autoref optional identifier="{identifier}"><code>{target}</code></autoref>'
 
 
 def _keys(module: str, name: str) -> str:
-    """All keys of a configuration class, with type, bounds, default and meaning."""
+    """Return a table of the keys of a configuration class: type, bounds, default and meaning."""
     cls = getattr(importlib.import_module(module), name)
     schema = TypeAdapter(cls).json_schema()["properties"]
     meaning = _meanings(cls)
@@ -58,10 +58,10 @@ def _keys(module: str, name: str) -> str:
 
 
 def _meanings(cls: type) -> dict[str, str]:
-    """The docstring below each field of a class."""
+    """Return the docstring below each field of a class."""
     body = ast.parse(inspect.getsource(cls)).body[0]
     assert isinstance(body, ast.ClassDef)
-    found = dict[str, str]()
+    meanings = dict[str, str]()
     for above, below in zip(body.body, body.body[1:], strict=False):
         if (
             isinstance(above, ast.AnnAssign)
@@ -69,12 +69,12 @@ def _meanings(cls: type) -> dict[str, str]:
             and isinstance(below, ast.Expr)
             and isinstance(below.value, ast.Constant)
         ):
-            found[above.target.id] = " ".join(str(below.value.value).split()).replace("|", "\\|")
-    return found
+            meanings[above.target.id] = " ".join(str(below.value.value).split()).replace("|", "\\|")
+    return meanings
 
 
 def _value(about: dict[str, Any]) -> str:
-    """Type and bounds of a key, in words."""
+    """Describe the type and bounds of a key."""
     if "$ref" in about:
         return "a table, see below"
     if "anyOf" in about:
@@ -106,7 +106,7 @@ def _default(field: Any, about: dict[str, Any]) -> str:
 
 
 def _toml(value: Any) -> str:
-    """A value as a TOML file has it."""
+    """Return a value in the syntax of TOML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -117,7 +117,7 @@ def _toml(value: Any) -> str:
 
 
 def _presets() -> str:
-    """What distinguishes the presets: each key whose value is not the same in all of them."""
+    """Return tables of the keys in which the presets differ."""
     flat = {name: _flat(dataclasses.asdict(preset)) for name, preset in PRESETS.items()}
     keys = [key for key in dict.fromkeys(k for values in flat.values() for k in values) if key != "name"]
     parts = list[str]()
@@ -133,31 +133,31 @@ def _presets() -> str:
 
 
 def _flat(tables: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    found = dict[str, str]()
+    rows = dict[str, str]()
     for key, value in tables.items():
         if isinstance(value, dict):
-            found |= _flat(value, f"{prefix}{key}.")
+            rows |= _flat(value, f"{prefix}{key}.")
         elif not (value is None and key in ("track", "vision")):
-            found[prefix + key] = _toml(value)
-    return found
+            rows[prefix + key] = _toml(value)
+    return rows
 
 
 def _names() -> str:
-    """Every public name with the page that documents it."""
+    """Return a table of the public names with links to their documentation."""
     stub = Path(retrim.__file__).with_suffix(".pyi").read_text()
-    rooms = {name: room for room, name in re.findall(r"^from \.(\w+) import \w+ as (\w+)$", stub, re.M)}
-    rows = ["| name | room | what it is |", "|---|---|---|"]
-    for name, room in sorted(rooms.items(), key=lambda pair: (pair[1], pair[0])):
-        thing = getattr(retrim, name)
-        documented = inspect.getdoc(thing) if inspect.isclass(thing) or inspect.isroutine(thing) else None
-        own = getattr(thing, "__module__", "").startswith("retrim")
+    packages = {name: package for package, name in re.findall(r"^from \.(\w+) import \w+ as (\w+)$", stub, re.M)}
+    rows = ["| name | package | description |", "|---|---|---|"]
+    for name, package in sorted(packages.items(), key=lambda pair: (pair[1], pair[0])):
+        entry = getattr(retrim, name)
+        documented = inspect.getdoc(entry) if inspect.isclass(entry) or inspect.isroutine(entry) else None
+        own = getattr(entry, "__module__", "").startswith("retrim")
         line = (documented or "").split("\n\n")[0].replace("\n", " ").replace("|", "\\|") if documented and own else ""
-        if inspect.ismethod(thing):
+        if inspect.ismethod(entry):
             line = f"Add a {name.removeprefix('register_')} under a new name, so that commands and files can use it."
-            where = ""
+            target = ""
         else:
-            where = f"{thing.__module__}.{name}" if hasattr(thing, "__module__") and own else ""
-        shown = f"[`{name}`][{where}]" if where else f"`{name}`"
+            target = f"{entry.__module__}.{name}" if hasattr(entry, "__module__") and own else ""
+        link = f"[`{name}`][{target}]" if target else f"`{name}`"
         plain = re.sub(r":\w+:", "", line)
-        rows.append(f"| {shown} | {room} | {plain} |")
+        rows.append(f"| {link} | {package} | {plain} |")
     return "\n".join(rows)

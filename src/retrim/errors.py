@@ -10,7 +10,7 @@ R = TypeVar("R")
 
 LONGEST = 480
 """Maximum length of a message [characters]; invalid input can be megabytes long."""
-CUT = " ... "
+ELLIPSIS = " ... "
 
 
 class RetrimError(Exception):
@@ -29,12 +29,12 @@ def one_line(text: str, most: int = LONGEST) -> str:
         most: Maximum length of the line [characters].
     """
     if len(text) > 4 * most:  # escaping megabytes is slow
-        text = text[: 2 * most] + CUT + text[-most:]
+        text = text[: 2 * most] + ELLIPSIS + text[-most:]
     line = printable(" ".join(text.split()))
     if len(line) <= most:
         return line
     tail = most // 3
-    return line[: most - tail - len(CUT)] + CUT + line[-tail:]
+    return line[: most - tail - len(ELLIPSIS)] + ELLIPSIS + line[-tail:]
 
 
 def printable(text: str) -> str:

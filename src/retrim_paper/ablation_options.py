@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-LONG = {"num_updates": 30, "update_every": 5.0, "learning_rate": 1e-3, "update_latency": 1.0}
-SHORT = {"num_updates": 5, "update_every": 0.5, "learning_rate": 1e-4, "update_latency": 0.1}
+LONG_UPDATES = {"num_updates": 30, "update_every": 5.0, "learning_rate": 1e-3, "update_latency": 1.0}
+SHORT_UPDATES = {"num_updates": 5, "update_every": 0.5, "learning_rate": 1e-4, "update_latency": 0.1}
 ENSEMBLE = {"residual": "ensemble", "fit_every": 3.0, "fit_steps": 100, "fit_latency": 0.2}
 REGRESSION = {"residual": "regression", "fit_every": 0.2, "fit_latency": 0.02}
-NEVER = {"update_every": 3600.0}
+NO_UPDATES = {"update_every": 3600.0}
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ CONTROL = (
 LAYERS_OFF = (
     Lever("**all levers**"),
     Lever("disturbance observer alone", method="base-do"),
-    Lever("observer and regression, no bursts", {"adapt": NEVER}),
+    Lever("observer and regression, no bursts", {"adapt": NO_UPDATES}),
     Lever("bursts alone: no frame, no trim", {"adapt": {"frame": "world", "trim": "free"}}),
     Lever("ensemble instead of regression", {"adapt": ENSEMBLE}),
-    Lever("long updates instead of bursts", {"adapt": LONG}),
+    Lever("long updates instead of bursts", {"adapt": LONG_UPDATES}),
     Lever("all starts from the task", {"adapt": {"task_starts": None}}),
     Lever("a new Adam for each burst", {"adapt": {"optimiser": "fresh"}}),
 )
@@ -65,7 +65,7 @@ ON: dict[str, tuple[Lever, ...]] = {
         Lever("+ disturbance observer alone", method="base-do"),
         Lever("+ frame", {"adapt": {"frame": "gravity"}}),
         Lever("+ regression", {"adapt": REGRESSION}),
-        Lever("+ bursts, one Adam", {"adapt": {**SHORT, "optimiser": "carried"}}),
+        Lever("+ bursts, one Adam", {"adapt": {**SHORT_UPDATES, "optimiser": "carried"}}),
         Lever("+ starts from flight", {"adapt": {"task_starts": 2}}),
         Lever("+ sharp reward", {"reward": "l2"}),
         Lever("+ past commands and delay", {"command_history": 2, "delay_ticks": 1}),
@@ -73,7 +73,7 @@ ON: dict[str, tuple[Lever, ...]] = {
     "track": (
         Lever("**as printed**"),
         Lever("+ regression", {"adapt": REGRESSION}),
-        Lever("+ bursts, one Adam", {"adapt": {**SHORT, "optimiser": "carried"}}),
+        Lever("+ bursts, one Adam", {"adapt": {**SHORT_UPDATES, "optimiser": "carried"}}),
         Lever("+ starts from flight", {"adapt": {"task_starts": 2}}),
         Lever("+ steeper reward", {"reward": "l2"}),
         Lever("+ reference seen ahead", {"track": {"observation": "preview"}}),

@@ -24,8 +24,8 @@ from .tables.hover import PAPER
 from .tables.levels import LEVELS, level_table
 
 REPORT_METHODS = ("base", "full")
-MOST = 4  # largest number of starts for the second quadrotor
-WHY = {
+MOST_STARTS = 4  # largest number of starts for the second quadrotor
+REASONS = {
     "hover/retrim": "an observer answers within milliseconds; a closed-form residual and short updates follow",
     "hover/fast": "the paper's loop with a command delay in the model, trained in seconds",
     "hover/released": "the delay, observation and training size of the authors' code",
@@ -83,7 +83,7 @@ def demonstrate(
     scenario, setup = Scenario("large", plant=plant), Setup.from_preset(preset)
     count = len(LEVELS) * 2 * starts
     reporter.say(f"{count} flights of {seconds:g} s; about a minute on two cores with those of a second quadrotor")
-    reporter.say(f"preset {preset.name}: {WHY.get(preset.name, 'your choice')}")
+    reporter.say(f"preset {preset.name}: {REASONS.get(preset.name, 'your choice')}")
     reporter.say(f"{scenario.vehicle_name(preset.vehicle)} quadrotor on plant {plant}: {scenario.entry.about}")
     policy, losses = train(setup, seed, reporter=reporter, stop=run.stop)
     if losses:
@@ -99,7 +99,7 @@ def demonstrate(
     second = None
     if slow and not run.interrupted:
         family = changed(load_for("hover", "hover/any"), pretrain={"num_updates": UPDATES})
-        second = fly_slow_vehicle(study, family, run, reporter, starts=min(starts, MOST), seed=seed, gif=gif)
+        second = fly_slow_vehicle(study, family, run, reporter, starts=min(starts, MOST_STARTS), seed=seed, gif=gif)
     result += [] if second is None else second.rows
     with interrupts_only_set(run.stop):
         run.write_results(result, seeds=[seed], preset=preset.name, losses=losses)

@@ -35,7 +35,7 @@ PUSH, PLANT = "push-x=2", "bem"  # the paper's push: 2 m/s^2 along +x
 ROLLOUTS, ROLLOUT_S = 50, 3.0
 FIT_EPOCHS, POLICY_EPOCHS, ENVS = 200, 100, 100
 CHUNK = 10  # epochs per program
-SCORED_S = 10.0  # [s]
+SCORE_S = 10.0  # [s]
 
 
 class Choice(NamedTuple):

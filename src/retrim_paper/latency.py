@@ -22,10 +22,10 @@ from retrim.transport.shared_memory import SharedMemoryBus
 SIZES = {"a measurement": 500, "the policy of hover/retrim": 74_000, "the policy of hover/paper": 1_100_000}
 """Size of each kind of message [bytes]."""
 COUNT = 200  # number of messages of each size
-EVERY = 0.02  # [s], time between two messages
+PERIOD = 0.02  # [s], time between two messages
 TOPICS = {"message": 2_000_000}
 FIRST = 10  # number of messages at the start that do not count, since connections are still being made
-JOINED = 0.5  # [s], time in which both ends find each other
+DISCOVERY_TIME = 0.5  # [s], time in which both ends find each other
 LONGEST, ANSWERS = 60.0, 20.0  # [s], time limits for all messages of a size, and for a rosmaster's answer
 
 
@@ -57,13 +57,13 @@ def measure_latencies(bus: Bus, words: Sequence[str], size: int) -> list[float]:
 
 def write(bus: Bus, size: int) -> None:
     """Send messages that contain their send times."""
-    time.sleep(JOINED)
+    time.sleep(DISCOVERY_TIME)
     rest = bytes(size - 16)
     for number in range(FIRST + COUNT):
-        time.sleep(EVERY)
+        time.sleep(PERIOD)
         stamp = number.to_bytes(8, "little") + time.monotonic_ns().to_bytes(8, "little")
         bus.publish("message", stamp + rest)
-    time.sleep(JOINED)
+    time.sleep(DISCOVERY_TIME)
 
 
 def free_port() -> int:

@@ -49,13 +49,13 @@ class SteadyRotor:
     """Forces and induced velocity of one rotor in steady air."""
 
     def __init__(self, prop: Propeller, omega: float, v_hor: float, v_ver: float) -> None:
-        forces, inflow = settled_rotor(prop, jnp.array(omega), jnp.array(v_hor), jnp.array(v_ver))
+        forces, inflow = steady_rotor(prop, jnp.array(omega), jnp.array(v_hor), jnp.array(v_ver))
         self.thrust, self.in_plane, self.torque = (float(f) for f in forces)
         self.v_i = float(vortex_ring(inflow, jnp.array(v_ver)))
 
 
 @eqx.filter_jit
-def settled_rotor(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> tuple[BladeForces, Inflow]:
+def steady_rotor(prop: Propeller, omega: Array, v_hor: Array, v_ver: Array) -> tuple[BladeForces, Inflow]:
     """Return the forces and the inflow of a rotor in steady air.
 
     Args:

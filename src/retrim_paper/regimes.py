@@ -19,7 +19,7 @@ from retrim.config.scenario import Scenario
 from retrim.physics import State, TableEdge
 from retrim.runkit.flights import Flight
 
-from .rotor_benchmark.benchmark import PUBLISHED, SECONDS, benchmark_preset, title_of
+from .rotor_benchmark.benchmark import PUBLISHED_ERRORS, SECONDS, benchmark_preset, title_of
 from .slung_load import END, seconds_to_calm
 from .vehicles import DELAY, THRUST_TO_WEIGHT, heavy_quadrotor, slow_quadrotor
 
@@ -254,5 +254,5 @@ def _public_benchmark(score: Score) -> tuple[Regime, ...]:
             score,
             published=values.text(),
         )
-        for name, values in PUBLISHED.items()
+        for name, values in PUBLISHED_ERRORS.items()
     )

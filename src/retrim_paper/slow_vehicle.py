@@ -21,7 +21,7 @@ from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 from retrim.runkit.training import train
 
-from .tables.hidden import PUSHED
+from .tables.hidden import PUSH_TIME
 from .vehicles import DELAY, slow_quadrotor
 
 UPDATES = 200  # a fifth of the preset's training: less agile, and trained in ten seconds
@@ -110,7 +110,7 @@ def _fly(each: Entrant, scenario: Scenario, run: Run, reporter: Reporter, starts
 
 def _line(each: Entrant, flights: Sequence[Flight]) -> tuple[str, ...]:
     left = [flight for flight in flights if not flight.log.terminated]
-    peak = metres(max(float(np.max(flight.error[flight.log.t >= PUSHED])) for flight in left)) if left else "-"
+    peak = metres(max(float(np.max(flight.error[flight.log.t >= PUSH_TIME])) for flight in left)) if left else "-"
     error = metres(float(np.mean([flight.steady for flight in left]))) if left else "-"
     label = find_method(each.method).label
     return label, each.vehicle, f"{len(flights) - len(left)} of {len(flights)}", error, peak

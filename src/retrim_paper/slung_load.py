@@ -17,7 +17,7 @@ from retrim.tasks.reference import Reference
 from retrim.tasks.shapes import smooth_start
 
 STOP, BRAKING, END = 14.0, 0.6, 26.0  # [s]: begin of the stop, its duration, and the end of the reference
-CALM = math.radians(5.0)  # swing below which the load is at rest
+REST_SWING = math.radians(5.0)  # swing below which the load is at rest
 
 
 def circle_and_stop() -> Reference:
@@ -56,7 +56,7 @@ def seconds_to_calm(flight: Flight) -> float:
     A flight whose swing never remains below this angle has the time until its end.
     """
     t, angles = np.asarray(flight.log.t)[1:], swing_angles(flight)
-    large = t[(angles > CALM) & (t > STOP + BRAKING)]
+    large = t[(angles > REST_SWING) & (t > STOP + BRAKING)]
     return float(large[-1] - STOP - BRAKING) if len(large) else 0.0
 
 

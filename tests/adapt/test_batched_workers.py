@@ -7,7 +7,7 @@ import pytest
 from jax import random
 
 from helpers import draw_starts, random_field_flight, tiny_preset
-from retrim.adapt.batched_workers import learn_base, learn_together, refused_by_all, shared_base
+from retrim.adapt.batched_workers import all_refuse, learn_base, learn_together, shared_base
 from retrim.adapt.updates import PolicyUpdate, Rejection, Skip
 from retrim.adapt.worker import Worker
 from retrim.adapt.workers import PolicyWorker, ResidualWorker
@@ -139,5 +139,5 @@ def test_unstack_inverts_stack():
 
 def test_refused_by_all(fleet):
     better = PolicyUpdate(0.0, 1.0, 2.0, fleet[1][0].state.policy)
-    assert refused_by_all([Rejection(0.0, "policy", "worse"), Skip(0.0, "policy")])
-    assert not refused_by_all([Rejection(0.0, "policy", "worse"), better])
+    assert all_refuse([Rejection(0.0, "policy", "worse"), Skip(0.0, "policy")])
+    assert not all_refuse([Rejection(0.0, "policy", "worse"), better])

@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 
 from retrim.control.controller import AbstractController
-from retrim.control.lap_learning import LARGEST, NEAR, LapLearning
+from retrim.control.lap_learning import LARGEST, LARGEST_ERROR, LapLearning
 from retrim.physics import Command, State
 from retrim.tasks.abstract_reference import AbstractReference
 from retrim.tasks.reference import Reference
@@ -65,12 +65,12 @@ def test_noise_is_not_learned():
 
 
 def test_large_error_is_not_learned():
-    _, shift = errors(circle(), seconds=20.0, off=2.0 * NEAR)
+    _, shift = errors(circle(), seconds=20.0, off=2.0 * LARGEST_ERROR)
     assert (shift == 0.0).all()
 
 
 def test_shift_is_bounded():
-    _, shift = errors(circle(), off=0.8 * NEAR)
+    _, shift = errors(circle(), off=0.8 * LARGEST_ERROR)
     assert np.abs(shift).max() <= LARGEST
     assert np.abs(shift[2]).max() == pytest.approx(LARGEST)
 

@@ -13,7 +13,7 @@ from helpers import CheapModel
 from retrim.config import Setup, changed, load
 from retrim.config.faults import measurement_fault
 from retrim.control.condition import Cause, Stage, describe_condition
-from retrim.control.monitor import HOLD, INTERVAL, MARGIN, STRIKES, Monitor, Twin
+from retrim.control.monitor import HOLD, INTERVAL, INTERVALS, MARGIN, Monitor, Twin
 from retrim.control.swings import Swings
 from retrim.learn import PolicyState
 from retrim.physics import Constant, LinearDragQuadrotor, State, small
@@ -73,7 +73,7 @@ def test_worse_policy_is_abandoned(hover_case):
     changes = stage_events(ticks.condition, DT * np.arange(450.0))
     assert changes[0].kind == "stage"
     assert changes[0].note == describe_condition(Stage.OBSERVED, Cause.ERROR)
-    assert 2.0 + (STRIKES - 1) * INTERVAL < changes[0].t < 2.0 + (STRIKES + 1) * INTERVAL + DT
+    assert 2.0 + (INTERVALS - 1) * INTERVAL < changes[0].t < 2.0 + (INTERVALS + 1) * INTERVAL + DT
     worst = error[(changes[0].t > DT * np.arange(450)) & (DT * np.arange(450) > 2.5)].max()
     assert worst > MARGIN
     assert error[-25:].max() < 0.02 < worst
@@ -116,12 +116,12 @@ def test_steps_back_are_ordered_and_grow_longer(hover_case):
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
     waits = []
     for stage in (Stage.OBSERVED, Stage.SLOW, Stage.BASE):
-        memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES)
+        memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=INTERVALS)
         assert int(memory.stage) == stage
         assert int(memory.cause) == Cause.ERROR
         waits.append(float(memory.wait))
     np.testing.assert_allclose(waits, [HOLD, 2 * HOLD, 4 * HOLD], atol=0.1)
-    memory = judge_excess(monitor, memory, excess=0.9 * MARGIN, ticks=STRIKES)
+    memory = judge_excess(monitor, memory, excess=0.9 * MARGIN, ticks=INTERVALS)
     assert int(memory.stage) == Stage.BASE
     ready = dataclasses.replace(memory, wait=jnp.zeros_like(memory.wait))
     back = judge_excess(monitor, ready, excess=0.0)
@@ -130,7 +130,7 @@ def test_steps_back_are_ordered_and_grow_longer(hover_case):
 
 def step_back_to_base(monitor, excess):
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
-    memory = judge_excess(monitor, memory, excess=excess, ticks=3 * STRIKES)
+    memory = judge_excess(monitor, memory, excess=excess, ticks=3 * INTERVALS)
     assert int(memory.stage) == Stage.BASE
     return memory
 
@@ -138,17 +138,17 @@ def step_back_to_base(monitor, excess):
 def test_error_shared_by_base_policy_is_tolerated(hover_case):
     """The state estimate of an autopilot may wander by centimetres under every policy."""
     _, _, monitor = hover_case
-    memory = judge_excess(monitor, step_back_to_base(monitor, 0.06), excess=0.05, ticks=STRIKES)
+    memory = judge_excess(monitor, step_back_to_base(monitor, 0.06), excess=0.05, ticks=INTERVALS)
     assert (int(memory.stage), int(memory.cause)) == (Stage.ADAPTED, Cause.NO_GAIN)
-    memory = judge_excess(monitor, memory, excess=0.1, ticks=2 * STRIKES)
+    memory = judge_excess(monitor, memory, excess=0.1, ticks=2 * INTERVALS)
     assert int(memory.stage) == Stage.ADAPTED
-    memory = judge_excess(monitor, memory, excess=0.2, ticks=STRIKES)
+    memory = judge_excess(monitor, memory, excess=0.2, ticks=INTERVALS)
     assert int(memory.stage) == Stage.OBSERVED
 
 
 def test_better_base_policy_is_kept(hover_case):
     _, _, monitor = hover_case
-    memory = judge_excess(monitor, step_back_to_base(monitor, 0.2), excess=0.09, ticks=2 * STRIKES)
+    memory = judge_excess(monitor, step_back_to_base(monitor, 0.2), excess=0.09, ticks=2 * INTERVALS)
     assert int(memory.stage) == Stage.BASE
 
 
@@ -156,14 +156,14 @@ def test_oscillation_is_not_tolerated(hover_case):
     _, _, monitor = hover_case
     memory = step_back_to_base(monitor, 0.06)
     memory = dataclasses.replace(memory, best=jnp.array(int(Stage.SLOW)))
-    assert int(judge_excess(monitor, memory, excess=0.06, ticks=2 * STRIKES).stage) == Stage.BASE
+    assert int(judge_excess(monitor, memory, excess=0.06, ticks=2 * INTERVALS).stage) == Stage.BASE
 
 
 def test_few_bad_intervals_change_nothing(hover_case):
     _, _, monitor = hover_case
     memory = begin(monitor, State.at(jnp.array([0.0, 0.0, 1.0], jnp.float32)))
     for _ in range(3):
-        memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=STRIKES - 1)
+        memory = judge_excess(monitor, memory, excess=2.0 * MARGIN, ticks=INTERVALS - 1)
         memory = judge_excess(monitor, memory, excess=0.5 * MARGIN)
     assert int(memory.stage) == Stage.ADAPTED
     # a large error: one interval suffices

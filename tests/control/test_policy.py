@@ -32,9 +32,9 @@ def test_parameter_count_of_the_residual(key):
 def test_output_is_bounded_and_centred(make, key):
     vehicle = make()
     policy = Policy.of(15, vehicle, key=key, hidden=(8,))
-    np.testing.assert_allclose(policy.bounded(jnp.zeros(4)).vector(), [9.81, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(policy.limit(jnp.zeros(4)).vector(), [9.81, 0, 0, 0], atol=1e-12)
     for y in (jnp.full(4, 1e3), jnp.full(4, -1e3)):
-        u = policy.bounded(y).vector()
+        u = policy.limit(y).vector()
         limit = (vehicle.command_max if y[0] > 0 else vehicle.command_min).vector()
         np.testing.assert_allclose(u, limit, rtol=1e-12)
 
@@ -42,7 +42,7 @@ def test_output_is_bounded_and_centred(make, key):
 def test_every_output_has_a_gradient_near_its_limit(key):
     policy = Policy.of(15, small(), key=key, hidden=(8,))
     for y in (-6.0, 0.0, 6.0):
-        J = jax.jacobian(lambda y: policy.bounded(y).vector())(jnp.full(4, y))
+        J = jax.jacobian(lambda y: policy.limit(y).vector())(jnp.full(4, y))
         assert (np.diag(J) > 1e-3).all()
         assert np.count_nonzero(J - np.diag(np.diag(J))) == 0
 
@@ -67,6 +67,6 @@ def test_zero_perturbations_have_no_effect(key):
     policy: PolicyType = Policy.of(15, small(), key=key, hidden=(8, 8))
     policy = jax.tree.map(lambda leaf: leaf + 0.2, policy)
     o = random.normal(key, (15,))
-    u, inputs = policy.perturbed(o, tuple(jnp.zeros(n) for n in (8, 8, 4)))
+    u, inputs = policy.perturb(o, tuple(jnp.zeros(n) for n in (8, 8, 4)))
     np.testing.assert_array_equal(u.vector(), policy(o).vector())
     assert [len(h) for h in inputs] == [15, 8, 8]

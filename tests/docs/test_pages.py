@@ -20,7 +20,7 @@ from retrim.evaluation.metrics import CONDITIONS, failed_record, record, summary
 from retrim.evaluation.sweep import Sweep, read_sweep
 from retrim.io.logs import read_map
 from retrim.io.logs.named_maps import names
-from retrim.io.logs.plausibility import DOUBTFUL, REFUSED
+from retrim.io.logs.plausibility import DOUBT_LIMITS, REFUSAL_LIMITS
 from retrim.replay.report import WORDS
 
 ROOT = Path(__file__).parents[2]
@@ -66,8 +66,8 @@ def test_replay_page_states_limits_and_maps():
     rows = re.findall(r"^\| ([^|]+?) \| (-?\d* ?%?) ?\| (\d+) % \|$", page, re.M)
     for name, words in WORDS.items():
         (result,) = [row for row in rows if row[0].startswith(words)]
-        refusal = f"{round(100 * REFUSED[name])} %" if name in REFUSED else ""
-        assert result[1:] == (refusal, f"{round(100 * DOUBTFUL[name])}")
+        refusal = f"{round(100 * REFUSAL_LIMITS[name])} %" if name in REFUSAL_LIMITS else ""
+        assert result[1:] == (refusal, f"{round(100 * DOUBT_LIMITS[name])}")
     command = (ROOT / "src" / "retrim" / "replay" / "replay.py").read_text()
     for name in names():
         assert f"`{name}`" in page

@@ -89,7 +89,7 @@ def test_step_response_solves_its_differential_equation(lag, damping, width):
 channel_before = jax.jit(posterior.channel_before, static_argnums=(0, 2))
 log_likelihood = jax.jit(posterior.log_likelihood, static_argnums=3)
 path_posterior = jax.jit(lambda channel, prior: posterior.path_posterior(channel, prior, None, DT))
-predicted = jax.jit(lambda channel, prior: channel.predicted_by(path_posterior(channel, prior)))
+predicted = jax.jit(lambda channel, prior: channel.predict(path_posterior(channel, prior)))
 responses = jax.jit(lambda cells, hover: posterior.responses(cells, jnp.zeros(()), jnp.zeros(()), hover, DT))
 yaw_features = jax.jit(lambda history: history.features(DT)[3:])
 issue = jax.jit(CommandHistory.issue)

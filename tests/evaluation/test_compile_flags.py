@@ -34,7 +34,8 @@ def test_short_command_compiles_quickly_and_keeps_user_flags(flags_of):
 
 @pytest.mark.parametrize(
     ("command", "about"),
-    [(name, {}) for name in compile_flags.LONG] + [("fly", {"jaxlib": "0.11.0"}), ("fly", {"plugins": ("cuda",)})],
+    [(name, {}) for name in compile_flags.LONG_COMMANDS]
+    + [("fly", {"jaxlib": "0.11.0"}), ("fly", {"plugins": ("cuda",)})],
 )
 def test_flags_are_unchanged_for_long_commands_unknown_compilers_and_accelerators(flags_of, command, about):
     assert flags_of(command, "--xla_dump_to=x", **about) == ["--xla_dump_to=x"]

@@ -53,7 +53,7 @@ def test_plot_labels_methods(tmp_path):
 
 def test_manual_disturbances_are_marked_at_their_times(tmp_path):
     acts = [
-        Event(2.0, "asked", "method lora $x_$"),
+        Event(2.0, "request", "method lora $x_$"),
         Event(4.0, "knobs", "push 1 0 0"),
         Event(5.0, "guard", "hold: gone"),
     ]

@@ -12,7 +12,7 @@ from retrim.errors import LogError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.log_map import Time
 from retrim.io.logs.message_times import evenly
-from retrim.io.logs.named_maps import USUAL, names
+from retrim.io.logs.named_maps import USUAL_NAMES, names
 from retrim.replay import rows_of
 
 FLIGHT = fly_once(8.0)
@@ -34,7 +34,7 @@ def assert_is_flight(log, places=1e-4, command=True):
 
 
 def test_every_name_is_a_map():
-    assert {name for usual in USUAL.values() for name in usual} <= set(names())
+    assert {name for usual in USUAL_NAMES.values() for name in usual} <= set(names())
     for name in names():
         read_map(name)
 

@@ -12,10 +12,10 @@ from retrim.live.processes import bridge as bridge_process
 from retrim.live.processes.bridge import BridgePlan
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import last_note, pack_note
-from retrim.onboard.topics import INTO, OUT
+from retrim.onboard.topics import INPUT_TOPICS, OUTPUT_TOPICS
 from retrim.transport.shared_memory import SharedMemoryBus
 
-ROOM = dict.fromkeys((*OUT, *INTO, "sample", "ready.bridge"), 1000)
+ROOM = dict.fromkeys((*OUTPUT_TOPICS, *INPUT_TOPICS, "sample", "ready.bridge"), 1000)
 
 
 @pytest.fixture

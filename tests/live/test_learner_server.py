@@ -24,12 +24,12 @@ from retrim.live.spec import PageSpec
 from retrim.onboard.guard import Mode
 from retrim.onboard.launch import launch
 from retrim.onboard.messages import last_note, pack_note
-from retrim.onboard.topics import INTO, OUT
-from retrim.transport.bridge import EVERY, Bridge
+from retrim.onboard.topics import INPUT_TOPICS, OUTPUT_TOPICS
+from retrim.transport.bridge import LEAST_INTERVAL, Bridge
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.message import pack_arrays
 from retrim.transport.remote import Address
-from retrim.transport.session import FOREIGN, MISSING, UNSIGNED
+from retrim.transport.session import FOREIGN_KEY, MISSING_KEY, UNSIGNED
 from retrim.transport.shared_key import SharedKey
 from retrim_paper.latency import free_port as unused_port
 
@@ -120,7 +120,7 @@ def test_flight_uses_remote_learners(tmp_path, controller, gap):  # noqa: F811
 
 @pytest.mark.parametrize(
     ("here", "there", "error_here", "error_there"),
-    [(KEY, OTHER, FOREIGN, FOREIGN), (None, KEY, MISSING, UNSIGNED), (KEY, None, UNSIGNED, MISSING)],
+    [(KEY, OTHER, FOREIGN_KEY, FOREIGN_KEY), (None, KEY, MISSING_KEY, UNSIGNED), (KEY, None, UNSIGNED, MISSING_KEY)],
     ids=("another", "none here", "none there"),
 )
 def test_wrong_or_missing_key_prevents_flight_and_both_ends_report_it(
@@ -170,12 +170,12 @@ def pack_learner_state(preset):
 
 def make_mission(folder, base, number=1, start=None, reference=None):
     (folder / "start").write_bytes(start or pack_learner_state(PRESETS["hover/retrim"]))
-    capacities = dict.fromkeys((*OUT, *INTO), 10_000)
+    capacities = dict.fromkeys((*OUTPUT_TOPICS, *INPUT_TOPICS), 10_000)
     return LearnerMission.of(number, reference, 0, base, ("residual", "policy"), 0, capacities, folder / "start").pack()
 
 
 def test_new_flight_replaces_learners(tmp_path, monkeypatch):
-    network, starts = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000)), []
+    network, starts = InProcessBus(dict.fromkeys((*OUTPUT_TOPICS, *INPUT_TOPICS), 100_000)), []
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
     class RecordingServer(LearnerServer):
@@ -203,7 +203,7 @@ def test_new_flight_replaces_learners(tmp_path, monkeypatch):
 
 
 def test_hung_learner_is_restarted(tmp_path, monkeypatch):
-    network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
+    network = InProcessBus(dict.fromkeys((*OUTPUT_TOPICS, *INPUT_TOPICS), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
     with DrillGround(Address("zenoh", "127.0.0.1", 1)) as ground:
         network.publish("mission", make_mission(tmp_path, "first"))
@@ -223,7 +223,7 @@ def test_hung_learner_is_restarted(tmp_path, monkeypatch):
 @pytest.fixture
 def bus_case(tmp_path, monkeypatch):
     """Return a network, and a ground station with idle learners."""
-    network = InProcessBus(dict.fromkeys((*OUT, *INTO), 100_000))
+    network = InProcessBus(dict.fromkeys((*OUTPUT_TOPICS, *INPUT_TOPICS), 100_000))
     monkeypatch.setattr(Address, "join", lambda *_, **__: network)
 
     class IdleServer(LearnerServer):
@@ -347,9 +347,9 @@ def test_mission_survives_round_trip_and_damaged_bytes_are_refused(tmp_path):
 
 def test_bridge_forwards_each_topic_in_one_direction_at_limited_rate():
     now = 0.0
-    topics = dict.fromkeys((*OUT, *INTO), 100)
+    topics = dict.fromkeys((*OUTPUT_TOPICS, *INPUT_TOPICS), 100)
     here, there = InProcessBus(topics), InProcessBus(topics | {"status": 1})
-    bridge = Bridge(here, there, out=OUT, into=INTO, slowly=("flight",), clock=lambda: now)
+    bridge = Bridge(here, there, out=OUTPUT_TOPICS, into=INPUT_TOPICS, slowly=("flight",), clock=lambda: now)
     here.publish("flight", b"1")
     here.publish("parameters.policy", b"stays")
     there.publish("parameters.residual", b"comes")
@@ -360,7 +360,7 @@ def test_bridge_forwards_each_topic_in_one_direction_at_limited_rate():
     here.publish("flight", b"2")
     assert bridge.step() == 0
     here.publish("flight", b"3")
-    now += EVERY
+    now += LEAST_INTERVAL
     assert bridge.step() == 1
     assert there.latest("flight").data == b"3"
     here.publish("status", b"too long for there")

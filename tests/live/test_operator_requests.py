@@ -68,16 +68,16 @@ def send_wish(requests, **fields):
 
 
 def test_landing_request_lands_vehicle(requests):
-    assert send_wish(requests, land=True) == ["asked: land"]
+    assert send_wish(requests, land=True) == ["request: land"]
     assert requests._supervisor.messages == ["land"]
     assert requests.obey(status()) == []
 
 
 def test_pause_keeps_learned_parameters_and_none_removes_them(requests):
     assert send_wish(requests, method="full", paused=False) == []
-    assert send_wish(requests, method="full", paused=True) == ["asked: method full, paused"]
-    assert send_wish(requests, method="none", paused=False) == ["asked: method none"]
-    assert send_wish(requests, method="full", paused=False) == ["asked: method full"]
+    assert send_wish(requests, method="full", paused=True) == ["request: method full, paused"]
+    assert send_wish(requests, method="none", paused=False) == ["request: method none"]
+    assert send_wish(requests, method="full", paused=False) == ["request: method full"]
     assert requests._supervisor.messages == [(True, True), (True, False), (False, True)]
     assert send_wish(requests, method="magic") == ["refused: method 'magic': there are full, lora, none"]
     assert send_wish(requests, method=1, land=True) == []

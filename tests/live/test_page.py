@@ -87,7 +87,7 @@ def hover(bus, seconds, until=lambda: False):
     while time.monotonic() < start + seconds and not until():
         sample = Sample(tick, tick * DT, time.monotonic(), 0.0, level(), level(), np.array([9.81, 0.0, 0.0, 0.0]))
         bus.publish("sample", sample.pack())
-        fields = {"error": 0.02, "missed": 0, "target": list(HOME), "felt": [0.5, 0.0, 0.0]}
+        fields = {"error": 0.02, "missed": 0, "target": list(HOME), "disturbance": [0.5, 0.0, 0.0]}
         bus.publish("status", pack_note("status", mode="policy", **fields))
         tick += 1
         time.sleep(DT)

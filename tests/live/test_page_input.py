@@ -124,7 +124,7 @@ def test_page_and_restarted_page_survive_any_note(bus, topic):
         hostile += [pack_note(name, **{field: value}) for value in ODD]
         hostile += [pack_note(name, **dict.fromkeys(FIELDS[kind], 1) | {field: ODD[-1]})]
     sample = Sample(1, 0.0, 0.0, 0.0, level(), level(), np.array([9.81, 0.0, 0.0, 0.0]))
-    good = {name: [0.0, 0.0, 1.0] for name in ("felt", "estimate", "target")}
+    good = {name: [0.0, 0.0, 1.0] for name in ("disturbance", "estimate", "target")}
     before, watch = _Page(SPEC, bus, MagicMock()), RefusedNotes(bus, TOPICS)
     bus.publish("status", pack_note("status", mode="policy", error=0.0, missed=0, **good))
     for tick, data in enumerate(hostile):

@@ -201,7 +201,7 @@ def test_choice_is_sent_as_table_and_followed_once_accepted(setups, tmp_path):
     )  # fmt: skip
     assert result.computed_from <= time.monotonic() - supervisor.epoch
     assert poll_requests(switcher, supervisor, lambda: len(switcher.pieces) > 1, 1) == [
-        "reference: transition tofigure8", "asked: reference star",
+        "reference: transition tofigure8", "request: reference star",
     ]  # fmt: skip
     assert switcher.name == last_note(bus, "followed")["name"] == "figure8"
     at, table = switcher.pieces[-1]
@@ -246,7 +246,7 @@ def test_reference_outside_fence_or_not_accepted_is_reported(setups, tmp_path, m
     events = poll_requests(
         switcher, supervisor, lambda: switcher._attempts == 3 and switcher._coming is switcher._pending is None
     )
-    assert events == ["asked: reference star cannot be followed: it was not taken"]
+    assert events == ["request: reference star cannot be followed: it was not taken"]
     assert switcher.name == "circle"
     last, controller = supervisor.bus.latest("parameters.reference").data, supervisor.spec.controller
     back = Parameters.unpack(last, controller.parameters[REFERENCE], half=REFERENCE, base=controller.base, after=3)

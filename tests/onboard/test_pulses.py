@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from retrim.onboard.heartbeat import EVERY, Heart, Pacemaker
+from retrim.onboard.heartbeat import PERIOD, Heart, Pacemaker
 from retrim.onboard.messages import last_note
 from retrim.onboard.pulses import LOOK, SILENCE, Pulses
 from retrim.transport.in_process import InProcessBus
@@ -76,7 +76,7 @@ def test_heartbeat_is_sent_by_loop_at_ten_hertz(bus):
     for _ in range(1000):
         clock.now += 0.002
         heart.beat()
-    assert last_note(bus, "beat.recorder")["count"] == pytest.approx(2.0 / EVERY, abs=1)
+    assert last_note(bus, "beat.recorder")["count"] == pytest.approx(2.0 / PERIOD, abs=1)
     Heart(bus, "watchdog", clock).beat()  # a bus without its topic
 
 

@@ -249,9 +249,9 @@ def test_planned_tables_have_planned_options():
 def test_resumable_command_has_fixed_folder():
     """A quick run has a separate folder; otherwise it would overwrite the complete pages."""
     setup = {make.__name__: make for make in (*tables.TABLES, tables.everything)}
-    assert set(quick.GO_ON) <= set(setup)
-    folders = {str(quick.folder_of(setup[name], quick=look)) for name in quick.GO_ON for look in (False, True)}
-    assert len(folders) == 2 * len(quick.GO_ON) - 1  # the command for all tables has one folder for quick runs
+    assert set(quick.PIECES) <= set(setup)
+    folders = {str(quick.folder_of(setup[name], quick=look)) for name in quick.PIECES for look in (False, True)}
+    assert len(folders) == 2 * len(quick.PIECES) - 1  # the command for all tables has one folder for quick runs
     assert str(quick.folder_of(tables.everything)) == "runs/reproduce-all"
     assert quick.folder_of(tables.design) is None
     assert "runs/reproduce-hover, where the command resumes by default" in quick.help_of(tables.hover)

@@ -166,7 +166,7 @@ def test_design_study_covers_every_choice_and_seed(tmp_path, presets, monkeypatc
     for k, seed in enumerate(SEEDS):
         first, *others = log_records[k * (n + 1) : (k + 1) * (n + 1)]
         assert first == (f"policy {seed}", design.ROLLOUTS, design.ROLLOUT_S, 1000 + seed)
-        assert others == [(f"re-policy {seed}", 5, design.SCORED_S, seed)] * n
+        assert others == [(f"re-policy {seed}", 5, design.SCORE_S, seed)] * n
         mine = trainings[k * n : (k + 1) * n]
         assert [choice for _, _, choice, *_ in mine] == list(design.CHOICES.values())
         assert all(

@@ -319,9 +319,9 @@ def test_datt_file_depends_on_vehicle_lag_steps_and_seed(tmp_path, monkeypatch):
     assert len(calls) == before
     for one, other in zip(weights(again[3]), weights(nets[3]), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert rivals.rounded_steps(1) == size
-    assert rivals.rounded_steps(2 * size) == 2 * size
-    assert rivals.rounded_steps(2 * size + 1) == 3 * size
+    assert rivals.round_steps(1) == size
+    assert rivals.round_steps(2 * size) == 2 * size
+    assert rivals.round_steps(2 * size + 1) == 3 * size
 
 
 @pytest.mark.usefixtures("small_datt")

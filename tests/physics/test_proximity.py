@@ -10,7 +10,7 @@ from retrim.config.scenario import Scenario
 from retrim.physics import Downwash, State, TableEdge, large
 from retrim.physics.downwash import half_width, jet_speed
 from retrim.physics.propeller import AIR_DENSITY
-from retrim.physics.proximity import BELOW, ceiling_gain, ground_gain
+from retrim.physics.proximity import LANDING_GEAR, ceiling_gain, ground_gain
 from retrim.physics.state import STANDARD_GRAVITY, Command
 
 RADIUS = jnp.array(0.065)
@@ -54,8 +54,8 @@ def test_gain_is_continuous_across_edge():
 
 def test_clearance_is_measured_from_lowest_point():
     table = TableEdge.of(0.9, 1.0)
-    np.testing.assert_allclose(table.clearance(State.at(jnp.array([1.5, 0.0, 1.0]))), 0.1 - BELOW, atol=1e-6)
-    np.testing.assert_allclose(table.clearance(State.at(jnp.array([0.5, 0.0, 1.0]))), 1.0 - BELOW, atol=1e-6)
+    np.testing.assert_allclose(table.clearance(State.at(jnp.array([1.5, 0.0, 1.0]))), 0.1 - LANDING_GEAR, atol=1e-6)
+    np.testing.assert_allclose(table.clearance(State.at(jnp.array([0.5, 0.0, 1.0]))), 1.0 - LANDING_GEAR, atol=1e-6)
 
 
 @pytest.mark.parametrize("below", [0.0, 0.5, 2.0])

@@ -71,11 +71,11 @@ def test_simulated_step_response_equals_prediction(name, motor_tau):
     """The overshoot is below 40 % from 35 g to 10 kg; with the platform's settings it is up to 200 %."""
     vehicle = size_of(name, motor_tau)
     model = BemQuadrotor.of(vehicle, 0.02)
-    for axis, foretold in enumerate(step_responses(vehicle)):
+    for axis, prediction in enumerate(step_responses(vehicle)):
         rate = np.asarray(fly_once(model, axis))
         assert rate.max() - 1.0 < 0.4
-        assert foretold.overshoot == pytest.approx(max(0.0, rate.max() - 1.0), abs=0.1)
-        assert foretold.rise == pytest.approx(1e-3 * np.argmax(rate >= 0.632), rel=0.05, abs=0.004)
+        assert prediction.overshoot == pytest.approx(max(0.0, rate.max() - 1.0), abs=0.1)
+        assert prediction.rise == pytest.approx(1e-3 * np.argmax(rate >= 0.632), rel=0.05, abs=0.004)
 
 
 @pytest.mark.parametrize("motor_tau", [0.02, 0.05, 0.1])

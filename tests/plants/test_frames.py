@@ -19,14 +19,14 @@ def about(axis, angle):
 
 @given(vectors)
 def test_frame_conversion_is_involution(v):
-    np.testing.assert_allclose(frames.turned_world(frames.turned_world(v)), v)
-    np.testing.assert_allclose(frames.turned_body(frames.turned_body(v)), v)
-    assert frames.turned_heading(frames.turned_heading(v[0])) == pytest.approx(v[0])
+    np.testing.assert_allclose(frames.turn_world(frames.turn_world(v)), v)
+    np.testing.assert_allclose(frames.turn_body(frames.turn_body(v)), v)
+    assert frames.turn_heading(frames.turn_heading(v[0])) == pytest.approx(v[0])
 
 
 @given(vectors, vectors)
 def test_frames_are_right_handed(a, b):
-    for rotation in (frames.turned_world, frames.turned_body):
+    for rotation in (frames.turn_world, frames.turn_body):
         np.testing.assert_allclose(rotation(np.cross(a, b)), np.cross(rotation(a), rotation(b)), atol=1e-9)
 
 
@@ -44,8 +44,8 @@ def test_attitudes_survive_round_trip(q):
 def test_body_vector_is_equal_in_both_worlds(q, v):
     w, xyz = q[0], q[1:]
     in_ned = (2 * np.outer(xyz, xyz) + (w * w - xyz @ xyz) * np.eye(3)) @ v + 2 * w * np.cross(xyz, v)
-    in_enu = frames.attitude_of(q) @ frames.turned_body(v)
-    np.testing.assert_allclose(in_enu, frames.turned_world(in_ned / (q @ q)), atol=1e-6)
+    in_enu = frames.attitude_of(q) @ frames.turn_body(v)
+    np.testing.assert_allclose(in_enu, frames.turn_world(in_ned / (q @ q)), atol=1e-6)
 
 
 def test_level_attitude_to_the_north():
@@ -60,4 +60,4 @@ def test_rotations_have_expected_signs(axis, in_our_body):
     rate = (level.T @ rotation - np.eye(3)) / 1e-4
     result = np.array([rate[2, 1], rate[0, 2], rate[1, 0]])
     np.testing.assert_allclose(result, in_our_body, atol=1e-3)
-    np.testing.assert_allclose(result, frames.turned_body(np.eye(3)[axis]), atol=1e-3)
+    np.testing.assert_allclose(result, frames.turn_body(np.eye(3)[axis]), atol=1e-3)

@@ -87,7 +87,7 @@ def test_state_is_converted_to_retrim_frames(px4, link):
 def test_body_velocity_is_converted(px4, link):
     px4.odometry()
     world, R = link.reading.v, link.reading.R
-    px4.odometry(v=frames.turned_body(R.T @ world), child=12)
+    px4.odometry(v=frames.turn_body(R.T @ world), child=12)
     np.testing.assert_allclose(link.reading.v, world, atol=1e-6)
 
 

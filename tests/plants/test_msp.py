@@ -31,7 +31,7 @@ def vehicle():
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), small())
 
 
-def tuning(*, kind=msp.ACTUAL, throttle_expo=0, limit=0):
+def tuning(*, kind=msp.ACTUAL_RATES, throttle_expo=0, limit=0):
     row = bytearray(24)
     row[0] = row[11] = row[12] = 20  # 200 deg/s at the centre
     row[1], row[10], row[13] = 50, 0, 50  # expo

@@ -135,8 +135,8 @@ def test_px4_and_mavros_give_same_state(remote, network):
 
     vehicle(remote, p=p, q=q, v=v, rates=rates)
     odometry(
-        remote, p=frames.turned_world(p), q=Rotation.from_matrix(R).as_quat(), rates=frames.turned_body(rates),
-        v=R.T @ frames.turned_world(v),
+        remote, p=frames.turn_world(p), q=Rotation.from_matrix(R).as_quat(), rates=frames.turn_body(rates),
+        v=R.T @ frames.turn_world(v),
     )  # fmt: skip
     for mine, other in zip(px4.reading[1:], mavros.reading[1:], strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-5)

@@ -11,7 +11,7 @@ from fake_blackbox import blackbox
 from fake_body_flight import DT, BodyFlight, Truth, fly_body
 from fake_dataflash import body_messages, dataflash
 from retrim.config.setup import Setup
-from retrim.config.validation import validated
+from retrim.config.validation import validate
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.errors import ConfigError, LogError
 from retrim.estimation.command_path.response import mean_step_response
@@ -139,7 +139,7 @@ def test_report_has_values_and_reasons_for_missing_ones(tmp_path):
     result = json.loads((tmp_path / "out" / "replay.json").read_text())
     assert result["identified"]["rate_lag"][0] == pytest.approx(Truth().lag, rel=TENTH)
     assert result["identified"]["hover"][0] == pytest.approx(Truth().hover, rel=TENTH)
-    spec = validated(VehicleSpec, tomllib.loads((tmp_path / "out" / "vehicle.toml").read_text()), source="vehicle")
+    spec = validate(VehicleSpec, tomllib.loads((tmp_path / "out" / "vehicle.toml").read_text()), source="vehicle")
     assert spec.rate_lag[0] == pytest.approx(Truth().lag, rel=TENTH)
     assert spec.rate_damping[0] == pytest.approx(Truth().damping, rel=TENTH)
     assert spec.command_delay == pytest.approx(Truth().delay, abs=2e-3)

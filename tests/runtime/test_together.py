@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers import CheapModel, tiny_preset
-from retrim.adapt.batched_workers import AT_ONCE, IN_CACHE, at_once
+from retrim.adapt.batched_workers import BATCH, IN_CACHE, at_once
 from retrim.adapt.updates import Rejection, Skip
 from retrim.adapt.worker import Worker
 from retrim.config import Setup, disturbance
@@ -55,7 +55,7 @@ def test_offers_equal_those_of_virtual_clock(period, latency):
 @given(n=st.integers(1, 400), size=st.integers(1, 2 * IN_CACHE))
 def test_rounds_have_limited_size_and_little_padding(n, size):
     few = at_once(n, size)
-    assert 1 <= few <= AT_ONCE
+    assert 1 <= few <= BATCH
     assert few == 1 or few * size <= IN_CACHE
     assert -n % few <= n % 2
     assert few > 1 or n == 1 or 2 * size > IN_CACHE

@@ -7,7 +7,7 @@ import pytest
 
 from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import Reference
-from retrim.tasks.paced_reference import GROWING, Clock, PacedReference, pace_references, set_clock
+from retrim.tasks.paced_reference import PACE_CHANGE_TIME, Clock, PacedReference, pace_references, set_clock
 from retrim.tasks.shapes import figure8
 
 
@@ -54,7 +54,7 @@ def test_phase_is_integral_of_pace():
     assert float(pace.min()) > 0.0  # also for a clock without a successor
     phase = jax.vmap(c.phase_at)(jnp.asarray(times))
     np.testing.assert_allclose(phase, 1.0 + np.concatenate([[0.0], np.cumsum(pace[1:] + pace[:-1]) * 5e-4]), atol=1e-5)
-    later = times > 2.0 + GROWING
+    later = times > 2.0 + PACE_CHANGE_TIME
     np.testing.assert_allclose(pace[later], pace[-1])
 
 

@@ -9,7 +9,7 @@ from helpers import at
 from retrim.physics import small
 from retrim.tasks import Reference, smooth_start
 from retrim.tasks.shapes import circle, figure8, figure8_at, star
-from retrim.tasks.transition import BEFORE, LASTING, splice, transition_between
+from retrim.tasks.transition import DURATIONS, LEAD_TIME, splice, transition_between
 
 AT = 7.3
 
@@ -34,7 +34,7 @@ def end_of_transition(table):
 
 
 def test_equals_old_reference_before_and_new_one_after(references, table):
-    before = np.linspace(AT - BEFORE, AT - 0.02, 40)
+    before = np.linspace(AT - LEAD_TIME, AT - 0.02, 40)
     for leaf, other in zip(at(table, before), at(references["circle"], before), strict=True):
         np.testing.assert_allclose(leaf, other, atol=0.02)  # both are linear between their own rows
     after = end_of_transition(table) + np.linspace(0.0, 20.0, 200)
@@ -65,7 +65,7 @@ def test_sufficient_duration_makes_transition_feasible(references):
     table = transition_between(references["circle"], far, AT, vehicle)
     assert rows(table)[:, 6].max() <= float(vehicle.command_max.c)
     assert (np.abs(rows(table)[:, 7:10]) <= np.asarray(vehicle.omega_max)).all()
-    assert end_of_transition(table) - AT >= LASTING[0]
+    assert end_of_transition(table) - AT >= DURATIONS[0]
 
 
 def test_transition_replaces_old_reference_without_compilation(references, table):
@@ -103,7 +103,7 @@ def test_heading_turns_steadily(references, winds, fold, begins):
         heading_along_path(fold) if winds in (which, "both") else references["figure8"] for which in ("old", "new")
     )
     table = transition_between(old, new, begins, small())
-    t = np.arange(begins - BEFORE, end_of_transition(table) + 7.0, 1e-3)
+    t = np.arange(begins - LEAD_TIME, end_of_transition(table) + 7.0, 1e-3)
     result = at(table, t)
     turns = np.remainder(np.diff(result.heading) + np.pi, 2.0 * np.pi) - np.pi
     np.testing.assert_allclose(turns / 1e-3, 0.5 * (result.heading_rate[1:] + result.heading_rate[:-1]), atol=0.1)
@@ -114,7 +114,7 @@ def test_roll_outs_start_on_new_lap(references, table):
     once = transition_between(
         references["circle"], Reference.of(lambda t: [0.1 * np.sin(t) ** 4, 0.0, 1.0], seconds=np.pi), 5.0, small()
     )
-    assert float(once.lap[0]) == float(once.lap[1]) >= 5.0 + LASTING[0]
+    assert float(once.lap[0]) == float(once.lap[1]) >= 5.0 + DURATIONS[0]
     np.testing.assert_allclose(at(once, [30.0]).v, 0.0, atol=1e-12)
 
 

@@ -13,7 +13,7 @@ import pytest
 from bus_ends import LOCAL, NETWORK, await_message, network_address, two_ends
 from live_processes import answer, write_for_ever
 from retrim.errors import ConfigError, MessageError
-from retrim.onboard.topics import INTO, OUT
+from retrim.onboard.topics import INPUT_TOPICS, OUTPUT_TOPICS
 from retrim.ros1 import bus as ros
 from retrim.ros2.node import check_topic
 from retrim.transport.network import NetworkBus
@@ -173,7 +173,7 @@ def test_ros_topics_have_subscribers_before_first_message(monkeypatch):
 
 
 def test_every_bridge_topic_has_a_ros_2_name():
-    names = [name_of(topic) for topic in (*OUT, *INTO, *GREETINGS)]
+    names = [name_of(topic) for topic in (*OUTPUT_TOPICS, *INPUT_TOPICS, *GREETINGS)]
     for name in names:
         check_topic(f"/retrim/quad1/{name}")
     assert len(set(names)) == len(names)

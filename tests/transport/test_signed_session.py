@@ -11,7 +11,7 @@ from retrim.errors import ConfigError
 from retrim.transport import session as sessions
 from retrim.transport.network import NetworkBus
 from retrim.transport.remote import Address
-from retrim.transport.session import FOREIGN, GREETINGS, HEAD, MISSING, UNSIGNED, Session
+from retrim.transport.session import FOREIGN_KEY, GREETINGS, HEAD, MISSING_KEY, UNSIGNED, Session
 from retrim.transport.shared_key import SharedKey, read_key
 
 KEY, OTHER = SharedKey(b"k" * 32), SharedKey(b"o" * 32)
@@ -195,7 +195,7 @@ def test_vehicles_with_same_key_refuse_messages_for_other_vehicle(wire):
 
 
 @pytest.mark.parametrize(
-    ("here", "there", "fault"), [(KEY, OTHER, FOREIGN), (KEY, None, UNSIGNED), (None, KEY, MISSING)]
+    ("here", "there", "fault"), [(KEY, OTHER, FOREIGN_KEY), (KEY, None, UNSIGNED), (None, KEY, MISSING_KEY)]
 )
 def test_different_or_missing_key_gives_one_line_at_both_ends(wire, here, there, fault):
     flight, ground = End(wire, 0, here), End(wire, 1, there)

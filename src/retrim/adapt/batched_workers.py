@@ -23,7 +23,7 @@ from .learner_state import FitReport, LearnerState
 from .updates import PolicyUpdate, Update, policy_update, residual_update
 from .worker import BatchUpdate, Worker, WorkerBatch
 
-AT_ONCE = 4  # largest number of updates that a core computes at once
+BATCH = 4  # largest number of updates that a core computes at once
 IN_CACHE = 750_000  # bytes of the policies that a core trains at once, without their activations
 
 
@@ -140,7 +140,7 @@ def learn_base(
     return to_default_device(new_base)  # the next step may be shared by other devices
 
 
-def refused_by_all(updates: Sequence[Update]) -> bool:
+def all_refuse(updates: Sequence[Update]) -> bool:
     """Return whether every vehicle refused its update; the step of the shared base is then undone."""
     return not any(isinstance(update, PolicyUpdate) for update in updates)
 
@@ -157,7 +157,7 @@ def at_once(n: int, size: int) -> int:
         n: Number of updates.
         size: Size of a policy [bytes].
     """
-    most = min(n, AT_ONCE, IN_CACHE // size)
+    most = min(n, BATCH, IN_CACHE // size)
     return max(range(2, most + 1), key=lambda few: (-(-n % few), few), default=1)
 
 

@@ -27,7 +27,7 @@ class Verdict(eqx.Module):
     trusted: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.array(True))
     """True if enough measurements in the window are consistent with each other."""
 
-    def provided(self, trusted: Bool[Array, ""]) -> "Verdict":
+    def require(self, trusted: Bool[Array, ""]) -> "Verdict":
         """Return a verdict that admits the candidate only if the measurements are also trusted."""
         return Verdict(self.admitted & trusted, self.finite, self.candidate, self.incumbent, trusted)
 

@@ -29,7 +29,7 @@ from .vehicles import AbstractVehicles, OwnVehicle
 from .views import AbstractView, WorldView
 from .worker import Worker
 
-HELD_OUT = 8  # number of starts for the roll-outs of the gate
+GATE_STARTS = 8  # number of starts for the roll-outs of the gate
 RETRAIN = 2**30 + 6  # folded into the key of an update for the random numbers of its training
 VEHICLES = 2**30 + 5  # folded into the keys of starts to draw the vehicles at these starts
 
@@ -144,13 +144,13 @@ class OnlineLearner(eqx.Module):
         trained_state = PolicyState(self.trim(candidate.policy, corrected_env, window), candidate.optimiser)
         test_starts = jax.tree.map(
             lambda a, b: jnp.concatenate([a, b]),
-            jax.vmap(self.env.task.reset)(random.split(k_gate, HELD_OUT // 2)),
-            self.starts.recent(self.env.task, window, k_window, HELD_OUT // 2),
+            jax.vmap(self.env.task.reset)(random.split(k_gate, GATE_STARTS // 2)),
+            self.starts.recent(self.env.task, window, k_window, GATE_STARTS // 2),
         )
         incumbent = state.policy if active is None else active
         test_starts = self.vehicles.assign_vehicles(test_starts, vehicle, random.fold_in(k_gate, VEHICLES))
         verdict = judge(trained_state.policy.merged(), incumbent.merged(), corrected_env, test_starts)
-        return trained_state, verdict.provided(screening.trusted)
+        return trained_state, verdict.require(screening.trusted)
 
     def retrain(self, state: PolicyState, env: Env, starts: Start, key: Key[Array, ""]) -> PolicyState:
         """Train the policy in the corrected model by back-propagation through time; JAX traces this method.

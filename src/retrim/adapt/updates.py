@@ -17,7 +17,7 @@ from .learner_state import FitReport, LearnerState
 Layer = Literal["residual", "policy"]
 """The two layers of learning."""
 Counts = tuple[int, ...]
-NOTHING: Counts = (0,) * len(REASONS)
+NO_REJECTIONS: Counts = (0,) * len(REASONS)
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ResidualUpdate:
     """Root mean square of the fit's error [m/s^2]."""
     state: Any
     """New state of the residual model."""
-    excluded: Counts = NOTHING
+    excluded: Counts = NO_REJECTIONS
     """Number of steps that were excluded from the fit, by reason; see :class:`~retrim.learn.screening.Screening`."""
 
     def note(self) -> str:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax, random
 from jaxtyping import Array, Float, Key
 
-from ..control.belief_flight import belief_from, bounded_gain
+from ..control.belief_flight import belief_from, limit_gain
 from ..estimation.command_path import PathEstimate, PathEstimator, PathState
 from ..learn.window import Window
 from ..physics.command_path import CommandPath
@@ -92,7 +92,7 @@ class IdentifiedVehicle(AbstractVehicles):
         estimate = estimate_path(self.estimator, window)
         belief = belief_from(self.family, estimate)
         path = self.family.path(belief.centre)
-        response = dataclasses.replace(path.response, thrust_gain=bounded_gain(estimate))
+        response = dataclasses.replace(path.response, thrust_gain=limit_gain(estimate))
         return Identification(belief, dataclasses.replace(path, response=response))
 
     def apply_path(self, window: Window) -> Window:

@@ -14,7 +14,7 @@ from ..runkit.document import Document, TableSection
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from .machine import UNIT_FLOP
-from .workloads import WORKS
+from .workloads import WORKLOADS
 
 CORES = ("one", "all") if hasattr(os, "sched_setaffinity") and len(os.sched_getaffinity(0)) > 1 else ("all",)
 COLUMNS = (
@@ -30,7 +30,7 @@ of a unit, as a share of its time. If there is an accelerator, the process for a
 one core does not. paper: reported for an RTX 4090. peak: memory of the process, JAX included."""
 
 
-def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) -> bool:
+def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKLOADS)) -> bool:
     """Run benchmarks and write ``bench.md`` and ``bench.json``.
 
     Returns:
@@ -39,14 +39,14 @@ def bench(run: Run, reporter: Reporter, *, works: Sequence[str] = tuple(WORKS)) 
     Raises:
         ConfigError: There is no such benchmark.
     """
-    if unknown := [name for name in works if name not in WORKS]:
-        raise ConfigError(f"no work {', '.join(unknown)}; there are {', '.join(WORKS)}")
+    if unknown := [name for name in works if name not in WORKLOADS]:
+        raise ConfigError(f"no work {', '.join(unknown)}; there are {', '.join(WORKLOADS)}")
     rows, machine, failures = list[dict[str, Any]](), dict[str, dict[str, float]](), False
     with tempfile.TemporaryDirectory() as cache, reporter.progress("bench") as advance:
         # The warm benchmark comes last, because it fills the cache folder in which the others run cold.
         for i, name in enumerate(sorted(works, key=lambda name: name == "programs-warm")):
-            advance(i / len(works), WORKS[name].title)
-            if WORKS[name].two_cores and "one" not in CORES:
+            advance(i / len(works), WORKLOADS[name].title)
+            if WORKLOADS[name].two_cores and "one" not in CORES:
                 reporter.say(f"{name}: left out, it needs two cores that a process may choose")
                 continue
             try:
@@ -93,13 +93,13 @@ def _measure(name: str, cache: Path) -> dict[str, Any]:
     The folder ``cache`` is empty at first; a benchmark uses it only on request.
     """
     environment = {"RETRIM_COMPILE_CACHE": "0", "TF_CPP_MIN_LOG_LEVEL": "3"}
-    if WORKS[name].cached:
+    if WORKLOADS[name].cached:
         environment |= {
             "JAX_COMPILATION_CACHE_DIR": str(cache),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
     row = {"name": name, **_process(name, "all", environment)}
-    if WORKS[name].one_core and "one" in CORES:
+    if WORKLOADS[name].one_core and "one" in CORES:
         row["one_core"] = _process(name, "one", environment)
     return row
 

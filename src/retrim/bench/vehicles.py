@@ -35,7 +35,7 @@ from ..plants.sim import SimPlant, SimState, Simulation
 from ..transport.shared_memory import SharedMemoryBus
 from .machine import last_core, on_core
 
-PRESET, SECONDS, SETTLES_S = "hover/retrim", 15.0, 3.0
+PRESET, SECONDS, SETTLING_S = "hover/retrim", 15.0, 3.0
 PUSH = "small"
 
 
@@ -166,11 +166,11 @@ def _fly_all(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
     while air.tick * air.dt < SECONDS:
         sleep_until(epoch + air.tick * air.dt)
         air.fly()
-        if air.tick * air.dt <= SETTLES_S:
+        if air.tick * air.dt <= SETTLING_S:
             before = air.updates()
         for i, loop in enumerate(air.loops):
             version = loop.intake.newest.get("policy", 0)
-            if version != versions[i] and air.tick * air.dt > SETTLES_S:
+            if version != versions[i] and air.tick * air.dt > SETTLING_S:
                 ages += [age for _, half, _, age in list(loop.intake.swaps)[-2:] if half == "policy"][-1:]
             versions[i] = version
         behind = time.monotonic() - (epoch + air.tick * air.dt)
@@ -182,8 +182,8 @@ def _fly_all(air: Air, fleet: FleetProcess, place: Path) -> dict[str, Any]:
         )
     return {
         "warm_s": warm_s,
-        "updates_per_s": (air.updates() - before) / (SECONDS - SETTLES_S),
-        "policies_per_s": len(ages) / (SECONDS - SETTLES_S),
+        "updates_per_s": (air.updates() - before) / (SECONDS - SETTLING_S),
+        "policies_per_s": len(ages) / (SECONDS - SETTLING_S),
         "swap_s": float(np.median(ages)) if ages else float("nan"),
         "worst_swap_s": max(ages, default=float("nan")),
         "steady_m": float(np.mean([loop.error for loop in air.loops])),

@@ -11,7 +11,7 @@ from typing import Any
 
 from jax import random
 
-from ..adapt.learner import HELD_OUT, OnlineLearner
+from ..adapt.learner import GATE_STARTS, OnlineLearner
 from ..config.loading import load
 from ..config.scenario import Scenario
 from ..config.setup import Setup
@@ -40,7 +40,7 @@ def _update(name: str, *, lora: bool = False) -> dict[str, Any]:
     arguments = learner, state.policy, residual, window, random.key(0)
     program, compile_s = compile_function(OnlineLearner.update_policy, *arguments)
     weights = sum(layer.weight.size for layer in state.policy.policy.merged().linear_layers())
-    ticks = learner.env.task.horizon * (3 * learner.num_updates * learner.num_envs + 2 * HELD_OUT)
+    ticks = learner.env.task.horizon * (3 * learner.num_updates * learner.num_envs + 2 * GATE_STARTS)
     return time_runs(compile_s, lambda: program(*arguments), 9) | {"flop": 2.0 * weights * ticks}
 
 
@@ -103,7 +103,7 @@ def _with_latency(title: str, name: str) -> Work:
     return Work(title, f"{load(name).adapt.update_latency:g} s, its latency", lambda: _update(name))
 
 
-WORKS: dict[str, Work] = {
+WORKLOADS: dict[str, Work] = {
     "pretrain-retrim": Work(
         "pretrain hover/retrim, 300 x 16 x 150", "2.5 s, to 5 mm", lambda: pretrain("hover/retrim", 3), one_core=True
     ),
@@ -171,7 +171,7 @@ def main() -> None:
     if sys.argv[1] == "machine":
         print(json.dumps(rates()))
         return
-    work = WORKS[sys.argv[1]]
+    work = WORKLOADS[sys.argv[1]]
     result = work.do()
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     unit = 1024.0 if sys.platform != "darwin" else 1024.0**2

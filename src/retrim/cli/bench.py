@@ -5,12 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..bench.measure import bench as measure
-from ..bench.workloads import WORKS
+from ..bench.workloads import WORKLOADS
 from ..runkit.run import Run
 from .console import RichReporter, report_start, show_paths
 
 
-def bench(works: tuple[str, ...] = tuple(WORKS), out: Path | None = None) -> Callable[[threading.Event], int]:
+def bench(works: tuple[str, ...] = tuple(WORKLOADS), out: Path | None = None) -> Callable[[threading.Event], int]:
     """Measure the run times of the paper's and this project's workloads, each in its own process.
 
     Args:

@@ -10,7 +10,7 @@ from ..errors import ConfigError
 from ..physics.disturbance import Constant, Disturbance, Kick, RandomWalk, Reversing, Step, SumOfDisturbances
 from ..physics.downwash import Downwash
 from ..physics.faults import BatterySag, Payload, WeakRotor
-from ..physics.proximity import BELOW, Ceiling, TableEdge
+from ..physics.proximity import LANDING_GEAR, Ceiling, TableEdge
 from ..physics.slung_load import SlungLoad
 from ..physics.wind import Dryden, Fan, SteadyWind
 from .registry import Registry
@@ -83,7 +83,7 @@ def _fan(key: Key[Array, ""], size: float | None) -> Disturbance:
 def _table_edge(key: Key[Array, ""], size: float | None) -> Disturbance:
     # The table begins under the centre of the built-in circle, and its top is below the height of the built-in goal.
     clearance = _check_size(size, 0.02, 0.0, 0.5, "m")
-    return TableEdge.of(GOAL_HEIGHT - BELOW - clearance, 1.0)
+    return TableEdge.of(GOAL_HEIGHT - LANDING_GEAR - clearance, 1.0)
 
 
 def _ceiling(key: Key[Array, ""], size: float | None) -> Disturbance:

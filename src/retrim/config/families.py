@@ -21,7 +21,7 @@ from .tasks import find_task
 from .vehicle_file import VehicleSpec
 from .vehicles import make_vehicle
 
-TRUST = 2.0  # assumed error factor of a delay or lag in a vehicle file
+FILE_ERROR_FACTOR = 2.0  # assumed error factor of a delay or lag in a vehicle file
 LEAST = 0.01  # [s]: assumed error of a short delay or lag
 
 
@@ -62,7 +62,7 @@ def prior_belief(preset: Preset, family: PathFamily) -> PathBelief:
     least, most = (0.0, 1.0)
     if vehicle.rate_damping is not None:
         damping = min(vehicle.rate_damping[:2])
-        least, most = float(ringing_of(damping * TRUST)), float(ringing_of(damping / TRUST))
+        least, most = float(ringing_of(damping * FILE_ERROR_FACTOR)), float(ringing_of(damping / FILE_ERROR_FACTOR))
     ends = [
         family.coordinates(*(jnp.array(value) for value in values))
         for values in ((low_delay, low_lag, least, low_thrust), (high_delay, high_lag, most, high_thrust))
@@ -149,4 +149,4 @@ def _interval(value: float | None) -> tuple[float, float]:
     """Return the interval of a time constant from a vehicle file [s]; unbounded if the file does not state it."""
     if value is None:
         return 0.0, jnp.inf
-    return min(value / TRUST, max(value - LEAST, 0.0)), max(value * TRUST, value + LEAST)
+    return min(value / FILE_ERROR_FACTOR, max(value - LEAST, 0.0)), max(value * FILE_ERROR_FACTOR, value + LEAST)

@@ -160,7 +160,7 @@ def effective_gravity_frame(
     )
 
 
-def adapted_flight(
+def make_adapted_flight(
     preset: Preset, task: AbstractTask, vehicle: Vehicle, policy: AbstractPolicy, residual: FittedResidual
 ) -> AbstractController[Any]:
     """Return the controller of an adapting policy, with the policy's observation and in the preset's frame.

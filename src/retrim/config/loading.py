@@ -17,7 +17,7 @@ from .names import plain_from
 from .presets import BUILT_IN_TASKS, Preset
 from .renamed_keys import text_with_new_keys, with_new_keys
 from .trust import check_trust
-from .validation import read_toml, suggestion, validated
+from .validation import read_toml, suggestion, validate
 from .vehicle_file import VehicleSpec, read_vehicle
 from .vehicles import vehicle_from
 
@@ -67,7 +67,7 @@ def overlaid(preset: Preset, overlay: Path, *, trust: Collection[str] = ()) -> P
             Python name.
     """
     above = with_new_keys(beside(read_toml(overlay), overlay.parent), source=str(overlay))
-    whole = validated(Preset, merged(values(preset), above), source=str(overlay))
+    whole = validate(Preset, merged(values(preset), above), source=str(overlay))
     check_trust(above, trust, source=str(overlay))
     return whole
 
@@ -113,7 +113,7 @@ def parse(text: str | bytes, *, source: str) -> Preset:
     Raises:
         ConfigError: The text is not a valid preset.
     """
-    return validated(Preset, text_with_new_keys(text, source=source), source=source)
+    return validate(Preset, text_with_new_keys(text, source=source), source=source)
 
 
 def missing_defaults(preset: Preset, text: str | bytes) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def changed(preset: Preset, **tables: Any) -> Preset:
     Raises:
         ConfigError: A key or value is invalid.
     """
-    return validated(Preset, merged(values(preset), tables), source="preset")
+    return validate(Preset, merged(values(preset), tables), source="preset")
 
 
 def dump(preset: Preset) -> str:

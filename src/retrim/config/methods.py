@@ -81,7 +81,7 @@ class MethodRequest:
             )
         return controller
 
-    def needed_key(self) -> Key[Array, ""]:
+    def require_key(self) -> Key[Array, ""]:
         """Return the key.
 
         Raises:
@@ -138,7 +138,7 @@ def learning_method(label: str, learns: Prepare) -> MethodEntry:
     """
 
     def make(request: MethodRequest) -> Pilot:
-        k_policy, key = random.split(request.needed_key())
+        k_policy, key = random.split(request.require_key())
         policy = learns(request.setup, request.policy, k_policy)
         return request.setup.adaptive_pilot(policy, key, request.latency, request.state)
 
@@ -182,7 +182,7 @@ def _without_policy(name: str, baseline: Baseline, request: MethodRequest) -> Pi
 
 
 def _full(request: MethodRequest) -> Pilot:
-    return request.setup.adaptive_pilot(request.policy, request.needed_key(), request.latency, request.state)
+    return request.setup.adaptive_pilot(request.policy, request.require_key(), request.latency, request.state)
 
 
 def _all_weights(setup: "Setup", policy: AbstractPolicy, key: Key[Array, ""]) -> AbstractPolicy:

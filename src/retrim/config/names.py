@@ -10,8 +10,8 @@ from pydantic import AfterValidator
 
 from ..errors import excerpt
 
-MOST = 64
-PLAIN = re.compile(rf"[\w./+ -]{{1,{MOST}}}", re.ASCII)
+LONGEST_NAME = 64
+PLAIN_NAME = re.compile(rf"[\w./+ -]{{1,{LONGEST_NAME}}}", re.ASCII)
 PYTHON = re.compile(r"[\w.]{1,100}:\w{1,64}")
 LONGEST = 1024
 """Maximum length of a path, or of several joined names [characters]."""
@@ -23,8 +23,8 @@ def plain(name: str) -> str:
     Raises:
         ValueError: The name contains other characters, is empty, or is too long.
     """
-    if not PLAIN.fullmatch(name):
-        raise ValueError(f"{excerpt(name)} must be 1 to {MOST} characters: A-Z a-z 0-9 _ . / + - and spaces")
+    if not PLAIN_NAME.fullmatch(name):
+        raise ValueError(f"{excerpt(name)} must be 1 to {LONGEST_NAME} characters: A-Z a-z 0-9 _ . / + - and spaces")
     return name
 
 
@@ -50,7 +50,7 @@ def printable(name: str) -> str:
 
 def plain_from(text: str) -> str:
     """Return the text as a plain name, with invalid characters replaced."""
-    return re.sub(r"[^\w./+ -]", ".", text, flags=re.ASCII)[:MOST] or "unnamed"
+    return re.sub(r"[^\w./+ -]", ".", text, flags=re.ASCII)[:LONGEST_NAME] or "unnamed"
 
 
 Plain = Annotated[str, AfterValidator(plain)]

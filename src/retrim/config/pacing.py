@@ -17,7 +17,7 @@ SUFFIX = "=max"
 """End of the name of a reference that is followed as fast as the vehicle permits."""
 RESERVE = 0.1  # share of thrust and rates that is left for feedback
 CORNER = 0.05  # [m], largest distance between the vehicle and a corner
-TURNING = 10.0  # [m/s^2], acceleration with which a vehicle turns at a corner
+TURN_ACCELERATION = 10.0  # [m/s^2], acceleration with which a vehicle turns at a corner
 SHARES = (0.6, 1.0)  # shares of the feasible pace in training
 RISE = 0.15  # [1/s], relative growth of this share
 DT, SECONDS = 0.02, 20.0  # [s], time between rows and duration of a training table
@@ -46,7 +46,7 @@ def pace_limits(preset: Preset, vehicle: Vehicle) -> PaceLimits:
         share * vehicle.omega_max,
         jnp.zeros(3) if lag is None else lag.omega,
         jnp.array(CORNER),
-        jnp.array(TURNING),
+        jnp.array(TURN_ACCELERATION),
     )
 
 

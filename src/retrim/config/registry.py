@@ -65,7 +65,7 @@ class Registry(Mapping[str, T], Generic[T]):
                 type.
         """
         self._check_name(name)
-        self._objects[name] = self._checked(name, thing)
+        self._objects[name] = self._check(name, thing)
         return thing
 
     def register_place(self, name: str, place: str) -> None:
@@ -91,10 +91,10 @@ class Registry(Mapping[str, T], Generic[T]):
         if name in self:
             return self[name]
         if ":" in name:
-            return self._checked(name, self._import(name))
+            return self._check(name, self._import(name))
         for entry in self._entries():
             if entry.name == name:
-                return self._checked(name, entry.load())
+                return self._check(name, entry.load())
         names = (*self, *self.plugins())
         raise ConfigError(f"no {self._kind} {name!r}; {suggestion(name, names)}, or {self._example}")
 
@@ -111,7 +111,7 @@ class Registry(Mapping[str, T], Generic[T]):
         if name in self:
             raise ConfigError(f"{self._kind} {name!r} is already registered")
 
-    def _checked(self, name: str, thing: Any) -> T:
+    def _check(self, name: str, thing: Any) -> T:
         if not self._accepts(thing):
             raise ConfigError(f"{self._kind} {name!r} is a {type(thing).__name__}, not {self._expected}")
         result: T = thing
@@ -134,7 +134,7 @@ class Registry(Mapping[str, T], Generic[T]):
         """Return the object that is registered under ``name``."""
         thing = self._objects[name]
         if isinstance(thing, _Place):
-            thing = self._objects[name] = self._checked(name, thing.load())
+            thing = self._objects[name] = self._check(name, thing.load())
         return thing
 
     def __contains__(self, name: object) -> bool:

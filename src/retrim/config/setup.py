@@ -39,7 +39,7 @@ from ..tasks.task import AbstractTask
 from .command_paths import longest_delay, model_path, with_delay
 from .families import make_family
 from .initialisers import flight_starts, low_rank
-from .learners import adapted_flight, nominal_model, pretraining_optimiser
+from .learners import make_adapted_flight, nominal_model, pretraining_optimiser
 from .loading import load
 from .networks import NETWORKS, NetworkRequest, make_policy
 from .online_learners import LearnerRequest, make_learner
@@ -237,7 +237,7 @@ class Setup:
         """
         residual = FittedResidual(self.learner.residual_model, state.residual)
         policy = state.policy.policy.merged()
-        return self.choose_pace(adapted_flight(self.preset, self.flight_task, self.vehicle, policy, residual))
+        return self.choose_pace(make_adapted_flight(self.preset, self.flight_task, self.vehicle, policy, residual))
 
     def choose_pace(self, controller: AbstractController[Any]) -> AbstractController[Any]:
         """Return a controller that also chooses the pace of a paced reference; unchanged for any other reference.

@@ -17,7 +17,7 @@ from ..errors import ConfigError, excerpt
 
 CSV_FILE = re.compile(r"[^:]*\.csv(:(laps|once))?", re.IGNORECASE)
 """Name of a trajectory file. Its colon precedes a choice between laps and one pass, not a Python name."""
-FREE = "options"
+FREE_TABLE = "options"
 """Table of a custom task, in which this package does not look up names."""
 
 
@@ -55,12 +55,12 @@ def _names(values: Any) -> Iterator[str]:
         yield from (part for part in parts if ":" in part and not CSV_FILE.fullmatch(part))
     elif isinstance(values, Mapping):
         for key, value in values.items():
-            if key != FREE:
+            if key != FREE_TABLE:
                 yield from _names(value)
     elif isinstance(values, list | tuple):
         for value in values:
             yield from _names(value)
     elif dataclasses.is_dataclass(values) and not isinstance(values, type):
         for field in dataclasses.fields(values):
-            if field.name != FREE:
+            if field.name != FREE_TABLE:
                 yield from _names(getattr(values, field.name))

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 MAX_CHECKS, MAX_LINES = 100, 8
 """Largest number of mistakes per file that are examined, and largest number that are listed."""
-UNKNOWN = "unknown key"
+UNKNOWN_KEY = "unknown key"
 NO_NAME = "Input should be a valid string"
 MAX_TOML_BYTES = 1_000_000
 
@@ -41,7 +41,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def validated(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: str) -> T:
+def validate(kind: type[T], tables: dict[str, Any] | str | bytes, *, source: str) -> T:
     """Build a dataclass from tables or JSON.
 
     Args:
@@ -73,14 +73,14 @@ def _explain(kind: type[Any], error: ValidationError) -> str:
         where = ".".join(path)
         message = each["msg"].removeprefix("Value error, ")
         if each["type"] == "unexpected_keyword_argument":
-            message = f"{UNKNOWN}; {suggestion(path[-1], _keys(kind, path[:-1]))}"
+            message = f"{UNKNOWN_KEY}; {suggestion(path[-1], _keys(kind, path[:-1]))}"
         elif each["type"] in ("missing", "missing_argument"):
             message = "is missing"
         elif each["type"] in ("tuple_type", "list_type"):
             message = f"must be a list of values in brackets, not {excerpt(str(each['input']), quotes=False)}"
         if result.get(where) in (None, NO_NAME):  # a table and a name are valid here: prefer the mistake in the table
             result[where] = message
-    order = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN))  # typos explain missing keys
+    order = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN_KEY))  # typos explain missing keys
     lines = [f"{where}: {message}" if where else message for where, message in order][:MAX_LINES]
     more = len(result) - len(lines) + max(len(mistakes) - MAX_CHECKS, 0)
     return "; ".join(lines) + (f"; and {more} more" if more else "")

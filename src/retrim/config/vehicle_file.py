@@ -15,7 +15,7 @@ from ..physics.step_response import step_responses
 from ..physics.vehicle import Vehicle, kingfisher, small
 from .names import Plain, plain_from
 from .units import Positive, Three, at_most, likely
-from .validation import read_toml, validated
+from .validation import read_toml, validate
 
 INCH = 0.0254  # [m]
 MILLI = (("ms", 1e-3),)
@@ -27,7 +27,7 @@ Lag = Annotated[Positive, AfterValidator(at_most(2.0, "s", *MILLI))]
 OVERSHOOT, SLOWEST = 0.6, (0.25, 0.25, 1.5)
 """Limits of the step response of the rates: the largest overshoot, and the longest time to 63 % for each axis [s]."""
 LONGEST_ARM = 2.0  # [m]
-ENOUGH = (1.6, 20.0)
+LIFT_RANGE = (1.6, 20.0)
 """Smallest and largest ratio of the total rotor thrust to the weight."""
 
 
@@ -72,17 +72,17 @@ class VehicleSpec:
         if thrust <= 1.2 * weight:
             raise ValueError(
                 f"thrust_max = {thrust} N must exceed 1.2 times the weight of {weight:.2f} N, or no "
-                f"thrust is left for control{likely(self._thrust_units(), *ENOUGH)}"
+                f"thrust is left for control{likely(self._thrust_units(), *LIFT_RANGE)}"
             )
-        if thrust < ENOUGH[0] * weight:
+        if thrust < LIFT_RANGE[0] * weight:
             raise ValueError(
                 f"thrust_max = {thrust} N is {thrust / weight:.2f} times the weight of {weight:.2f} N, and quadrotors "
-                f"have {ENOUGH[0]:g} times and more{likely(self._thrust_units(), *ENOUGH)}"
+                f"have {LIFT_RANGE[0]:g} times and more{likely(self._thrust_units(), *LIFT_RANGE)}"
             )
-        if thrust > ENOUGH[1] * weight:
+        if thrust > LIFT_RANGE[1] * weight:
             raise ValueError(
                 f"thrust_max = {thrust} N is {thrust / weight:.3g} times the weight of {weight:.2f} N, and no "
-                f"quadrotor has more than {ENOUGH[1]:g} times{likely(self._thrust_units(), *ENOUGH)}"
+                f"quadrotor has more than {LIFT_RANGE[1]:g} times{likely(self._thrust_units(), *LIFT_RANGE)}"
             )
         a, b, c = sorted(self.inertia)
         if a + b < 0.999 * c:
@@ -199,7 +199,7 @@ def read_vehicle(path: Path) -> VehicleSpec:
     """
     tables = read_toml(path)
     tables.setdefault("name", plain_from(path.stem))
-    spec = validated(VehicleSpec, tables, source=str(path))
+    spec = validate(VehicleSpec, tables, source=str(path))
     try:
         check_flyable(spec.build())
     except ValueError as error:

@@ -17,7 +17,7 @@ from ..estimation.command_path import PathEstimate, PathEstimator, ringing_of
 from ..estimation.command_path import PathState as EstimatorState
 from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
-from .caution import REPORTED, Caution
+from .caution import REPORT_LEVEL, Caution
 from .condition import Cause, Condition, Stage
 from .controller import AbstractController
 from .excitation import Excitation
@@ -67,7 +67,7 @@ class BeliefFlight(AbstractController[BeliefState]):
         inside = self.inner.condition(memory.inner)
         if inside is not None or not self.watches:
             return inside
-        cautious = memory.caution.level > REPORTED
+        cautious = memory.caution.level > REPORT_LEVEL
         return Condition(
             jnp.where(cautious, Stage.CAUTIOUS, Stage.ADAPTED), jnp.where(cautious, Cause.SWINGS, Cause.CALM)
         )
@@ -194,7 +194,7 @@ def vehicle_estimate(family: PathFamily, estimate: PathEstimate) -> VehicleEstim
         family: Family of the vehicle.
         estimate: Estimate of the command path.
     """
-    return VehicleEstimate(belief_from(family, estimate), bounded_gain(estimate))
+    return VehicleEstimate(belief_from(family, estimate), limit_gain(estimate))
 
 
 def belief_from(family: PathFamily, estimate: PathEstimate) -> PathBelief:
@@ -216,6 +216,6 @@ def belief_from(family: PathFamily, estimate: PathEstimate) -> PathBelief:
     return PathBelief.between(low, high)
 
 
-def bounded_gain(estimate: PathEstimate) -> Float[Array, ""]:
+def limit_gain(estimate: PathEstimate) -> Float[Array, ""]:
     """Return the thrust gain of an estimate, clipped to the range of possible vehicles."""
     return jnp.clip(estimate.thrust_gain.mean, *GAINS)

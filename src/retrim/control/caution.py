@@ -18,9 +18,9 @@ from .swings import Swings
 LARGE, FULL = 30.0, 60.0
 RISE = 3.0  # [1/s], largest rate at which the level rises
 MEMORY = 6.0  # [s], time constant of the level's decay; lasting caution makes the flight inaccurate
-REPORTED = 0.1  # level from which the log reports the oscillation
-MORE = 0.5  # share by which the thrust gain may be larger than estimated
-SLOWER = (1.0, 1.0, 0.0, 0.0)  # coordinates that the level changes: delay and rate lag
+REPORT_LEVEL = 0.1  # level from which the log reports the oscillation
+GAIN_SHARE = 0.5  # share by which the thrust gain may be larger than estimated
+CAUTIOUS_COORDINATES = (1.0, 1.0, 0.0, 0.0)  # coordinates that the level changes: delay and rate lag
 
 
 class Caution(eqx.Module):
@@ -49,7 +49,7 @@ class Caution(eqx.Module):
 
     def apply(self, belief: PathBelief) -> PathBelief:
         """Return the belief with delay and rate lag moved towards the slowest vehicle by the level of caution."""
-        share = self.level * jnp.array(SLOWER)
+        share = self.level * jnp.array(CAUTIOUS_COORDINATES)
         low, high = (end + share * (1.0 - end) for end in belief.ends)
         return PathBelief.between(low, high)
 
@@ -62,7 +62,7 @@ class Caution(eqx.Module):
         Args:
             gain: Estimated thrust gain.
         """
-        return gain * (1.0 + MORE * self.level.astype(gain.dtype))
+        return gain * (1.0 + GAIN_SHARE * self.level.astype(gain.dtype))
 
 
 def _tilt(x: State) -> Float[Array, "3"]:

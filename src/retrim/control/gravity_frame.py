@@ -170,7 +170,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         load, pull = self.load.predict(load, before.last, x, dt)
         without = self.trust_residual.astype(x.p.dtype) * pull
         after = dataclasses.replace(observer, nominal=Hybrid(observer.nominal, ConstantResidual(without)))(before, t, x)
-        u, _ = observer.acted(before, x)
+        u, _ = observer.acting(before, x)
         missed = after.innovation + without
         if known is not None:
             missed = missed + known(before.last, u)

@@ -72,7 +72,7 @@ class IndiController(AbstractController[IncrementalState]):
     def __call__(self, memory: IncrementalState, t: Float[Array, ""], x: State) -> tuple[Command, IncrementalState]:
         """Compute the command for the state in which the command begins to act."""
         dt, last = self.prediction.dt, memory.last
-        mean_command, _ = self.prediction.acted(memory.underway)
+        mean_command, _ = self.prediction.acting(memory.underway)
         a = (x.v - last.v) / dt if self.a is None else self.a
         # The accelerometer does not have latency, even if the attitude does.
         late = self.prediction.age if self.a is not None else jnp.zeros_like(self.prediction.age)

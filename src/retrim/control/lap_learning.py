@@ -23,7 +23,7 @@ from .wrapped_controller import WrappedController
 
 RATE = 0.15  # [1/s], rate at which the error of a slow harmonic decays; at 0.6, the vehicle swings up
 BANDWIDTH = 6.0  # [rad/s]; faster harmonics are learned more slowly, since a vehicle follows them late
-NEAR = 0.5  # [m]: errors farther away are not those of the lap
+LARGEST_ERROR = 0.5  # [m]: errors farther away are not those of the lap
 LARGEST = 0.3  # [m], largest amplitude of a coefficient
 
 
@@ -78,7 +78,7 @@ class LapLearning(WrappedController[LapState]):
     def _correct(self, shift: Float[Array, "3 h"], t: Float[Array, ""], x: State) -> Float[Array, "3 h"]:
         phase, lap = self.reference.phase(t), self.reference.phase_lap
         error = x.p - self.reference(t).p
-        is_lap = (phase > lap[0]) & (jnp.sum(error * error) < NEAR**2)
+        is_lap = (phase > lap[0]) & (jnp.sum(error * error) < LARGEST_ERROR**2)
         k = jnp.arange(1, HARMONICS + 1, dtype=shift.dtype)
         frequency = k * (2.0 * math.pi * self.reference.pace(t) / jnp.where(lap[1] > lap[0], lap[1] - lap[0], 1.0))
         harmonics = 2.0 / (1.0 + (frequency / BANDWIDTH) ** 4)

@@ -39,15 +39,17 @@ from .policy import AbstractPolicy
 from .swings import Swings
 
 INTERVAL = 1.0  # [s], interval over which errors are averaged
-MARGIN, FAR = 0.03, 0.7  # [m], limits of the error beyond that of the twin: in consecutive intervals, and in one
-STRIKES = 3  # consecutive intervals; a vehicle recovers from the largest kick of the gauntlet within two
-SAME, TOLERANCE = 0.5, 2.0  # ratios to an excess error: from where on stepping back is no gain, and the next margin
+MARGIN = 0.03  # [m], limit of the error beyond that of the twin in each of INTERVALS consecutive intervals
+SINGLE_MARGIN = 0.7  # [m], limit in a single interval
+INTERVALS = 3  # consecutive intervals; a vehicle recovers from the largest kick of the gauntlet within two
+STEP_BACK_RATIO = 0.5  # an excess error above this ratio of the one before the step back shows that it was no gain
+TOLERANCE = 2.0  # ratio of the next margin to the excess error
 LOST = 3.0  # [m]; a twin with a larger error restarts at the vehicle
 SWINGS = 8.0  # the largest kick of the gauntlet reaches 6.7; measurements 60 ms late drive the estimate beyond 8
-CALM = 2.0  # swings up to which the estimate has its full weight
+FULL_WEIGHT_SWINGS = 2.0  # swings up to which the estimate has its full weight
 RAMP = 0.2  # [s], rise of the weight of the estimate at the start, since a launch with late measurements disturbs it
 HOLD = 10.0  # [s], waiting time before the first return
-REACH, WIDENING = 0.3, 0.1  # [m] and [m/s], largest error for the base policy after an oscillation, and its growth
+REACH, REACH_RATE = 0.3, 0.1  # [m] and [m/s], largest error for the base policy after an oscillation, and its growth
 # [1/s^2] and [m]: without a residual that its observation previews, a policy falls behind by about the residual divided
 # by its stiffness, so an adapted flight is worse only beyond this distance.
 STIFFNESS, ALLOWANCE = 50.0, 0.4
@@ -134,7 +136,7 @@ class Monitor(AbstractController[MonitorState]):
         slow = memory.stage == Stage.SLOW
         flying = dataclasses.replace(
             self.frame,
-            inner=self._limited(where(is_adapted, self._inner.policy, memory.base), self._reach(memory)),
+            inner=self._limit_distance(where(is_adapted, self._inner.policy, memory.base), self._reach(memory)),
             trust_estimate=observes.astype(x.p.dtype) * self._trust(memory, t),
             trust_residual=is_adapted.astype(x.p.dtype),
             steady=slow.astype(x.p.dtype) * memory.d,
@@ -158,7 +160,7 @@ class Monitor(AbstractController[MonitorState]):
 
     def _trust(self, memory: MonitorState, t: Float[Array, ""]) -> Float[Array, ""]:
         """Return the weight of the estimate: small at launch, and smaller the more the estimate swings."""
-        calm = jnp.clip((SWINGS - memory.swings.size) / (SWINGS - CALM), 0.0, 1.0)
+        calm = jnp.clip((SWINGS - memory.swings.size) / (SWINGS - FULL_WEIGHT_SWINGS), 0.0, 1.0)
         return calm * jnp.minimum(1.0, t / RAMP).astype(calm.dtype)
 
     def _reach(self, memory: MonitorState) -> Float[Array, ""]:
@@ -170,7 +172,7 @@ class Monitor(AbstractController[MonitorState]):
         swung = (memory.cause == Cause.OSCILLATION) & (memory.stage == Stage.BASE)
         return jnp.where(
             swung,
-            jnp.minimum(REACH + WIDENING * (HOLD - jnp.minimum(memory.wait, HOLD)), self._own_reach),
+            jnp.minimum(REACH + REACH_RATE * (HOLD - jnp.minimum(memory.wait, HOLD)), self._own_reach),
             self._own_reach,
         )
 
@@ -180,7 +182,7 @@ class Monitor(AbstractController[MonitorState]):
         inner = self.frame.inner
         return inner.reach if isinstance(inner, NearTarget) else jnp.array(jnp.inf)
 
-    def _limited(self, policy: AbstractPolicy, reach: Float[Array, ""]) -> NearTarget:
+    def _limit_distance(self, policy: AbstractPolicy, reach: Float[Array, ""]) -> NearTarget:
         return NearTarget(dataclasses.replace(self._inner, policy=policy), self.task, reach)
 
     @property
@@ -202,14 +204,14 @@ class Monitor(AbstractController[MonitorState]):
         excess = twin.excess / twin.ticks
         worse = over & (excess > s.margin)
         strikes = jnp.where(over, jnp.where(worse, s.strikes + 1, 0), s.strikes)
-        strikes = jnp.where(over & (excess > FAR), STRIKES, strikes)
-        fails = (strikes >= STRIKES) & (s.stage < Stage.BASE)
+        strikes = jnp.where(over & (excess > SINGLE_MARGIN), INTERVALS, strikes)
+        fails = (strikes >= INTERVALS) & (s.stage < Stage.BASE)
         swung = swings.size > SWINGS
         wait = jnp.maximum(s.wait - dt, 0.0)
         returns = over & ~worse & ~fails & (wait <= 0.0) & (s.stage > s.best)
         # Never after an oscillation, whose cause lasts throughout the flight.
-        shared = (excess > SAME * s.loss) & (excess < 0.5 * FAR)
-        no_gain = over & (strikes >= STRIKES) & (s.stage == Stage.BASE) & (s.best == Stage.ADAPTED) & shared
+        shared = (excess > STEP_BACK_RATIO * s.loss) & (excess < 0.5 * SINGLE_MARGIN)
+        no_gain = over & (strikes >= INTERVALS) & (s.stage == Stage.BASE) & (s.best == Stage.ADAPTED) & shared
         loss = jnp.where(fails & (s.stage == Stage.ADAPTED), excess, s.loss)
         stage = s.stage + fails.astype(s.stage.dtype) - returns.astype(s.stage.dtype)
         stage = jnp.where(no_gain, Stage.ADAPTED, stage)
@@ -233,13 +235,15 @@ class Monitor(AbstractController[MonitorState]):
             strikes=jnp.where(changes_stage | swung, 0, strikes),
             wait=jnp.where(changes_stage | swung, s.hold, wait),
             hold=jnp.where(fails, 2.0 * s.hold, s.hold),
-            margin=jnp.where(no_gain, jnp.minimum(TOLERANCE * jnp.maximum(excess, s.loss), 0.5 * FAR), s.margin),
+            margin=jnp.where(
+                no_gain, jnp.minimum(TOLERANCE * jnp.maximum(excess, s.loss), 0.5 * SINGLE_MARGIN), s.margin
+            ),
             loss=loss,
         )
 
     def _step(self, s: MonitorState, t: Float[Array, ""], x: State, allowance: Float[Array, ""]) -> Twin:
         """Return the twin one tick later; the vehicle's error may exceed that of the twin by ``allowance`` [m]."""
-        nominal, base = self.frame.observer.nominal, self._limited(s.base, self._own_reach)
+        nominal, base = self.frame.observer.nominal, self._limit_distance(s.base, self._own_reach)
         excess = self.task.error(t, x) - self.task.error(t, s.twin.x)
         near = self.task.error(t, s.twin.x) < LOST  # also false for an error that is not a number
         at, memory, path = where(near, (s.twin.x, s.twin.memory, s.twin.path), (x, base.init(x), self._at_hover(x)))

@@ -23,9 +23,9 @@ from ..tasks.abstract_reference import AbstractReference, Point
 from ..tasks.paced_reference import Clock, at_pace
 
 STEP, STEPS = 0.04, 25  # [s], interval between the instants ahead, and their number
-SOONEST = 0.1  # [s], shortest time within which the pace adapts to a limit
+SHORTEST_ADAPTATION = 0.1  # [s], shortest time within which the pace adapts to a limit
 LEAST_LIFT = 3.0  # [m/s^2]: with less upward thrust, the attitude turns fast for small changes of the path
-SLOWEST, FASTEST = 0.05, 20.0  # limits of a factor
+LEAST_FACTOR, LARGEST_FACTOR = 0.05, 20.0  # limits of a factor
 TINY = 1e-9
 
 
@@ -67,7 +67,7 @@ def largest_growth(tau: Float[Array, " n"], factors: Float[Array, " n"], share: 
         factors: Largest factors of the pace at these times.
         share: Share of each factor that is used.
     """
-    return jnp.min(jnp.log(share * factors) / jnp.maximum(tau, SOONEST))
+    return jnp.min(jnp.log(share * factors) / jnp.maximum(tau, SHORTEST_ADAPTATION))
 
 
 def largest_factors(
@@ -90,7 +90,7 @@ def largest_factors(
     jumps = jnp.sqrt(jnp.sum((jnp.diff(points.v, axis=0) - smooth) ** 2, axis=1) + TINY)
     # A vehicle that turns with the acceleration a cuts a jump of the velocity by jump^2 / (8 a).
     by_corners = jnp.sqrt(8.0 * limits.turning * limits.corner) / jnp.append(jumps, jumps[-1])
-    return jnp.clip(jnp.minimum(jnp.minimum(by_force, by_rates), by_corners), SLOWEST, FASTEST)
+    return jnp.clip(jnp.minimum(jnp.minimum(by_force, by_rates), by_corners), LEAST_FACTOR, LARGEST_FACTOR)
 
 
 def _forces(points: Point, limits: PaceLimits, d: Float[Array, "n 3"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

@@ -20,7 +20,7 @@ FIRST_SPEED, FIRST_ACCELERATION = 1.0, 1.0  # [m/s], [m/s^2], largest values of 
 TOLERANCE = 0.1  # [m]: the share of the pace limits grows while the error is smaller
 RISE, FALL = 0.08, 0.5  # [1/s], largest relative rates of this share
 PEAK_TAU = 2.0  # [s], time constant with which the peak of the error decays
-ACCELERATING, BRAKING = 1.0, 2.0  # [1/s], largest relative changes of the pace
+ACCELERATION_RATE, BRAKING_RATE = 1.0, 2.0  # [1/s], largest relative changes of the pace
 SAMPLES = 512  # instants at which the whole path is evaluated
 SMOOTHING = 0.1  # [s], time constant of the growth of the pace
 
@@ -163,7 +163,7 @@ def ideal_step(
 
 def _approach(clock: Clock, growth: Float[Array, ""], dt: float) -> Clock:
     """Return a clock whose growth moves towards a desired growth."""
-    target = jnp.clip(growth, -BRAKING, ACCELERATING)
+    target = jnp.clip(growth, -BRAKING_RATE, ACCELERATION_RATE)
     return dataclasses.replace(clock, growth=clock.growth + (dt / SMOOTHING) * (target - clock.growth))
 
 

@@ -72,9 +72,9 @@ class AbstractPolicy(eqx.Module):
 
     def __call__(self, observation: Float[Array, " o"]) -> Command:
         """Return the command for one observation."""
-        return self.bounded(self.output(observation))
+        return self.limit(self.output(observation))
 
-    def bounded(self, y: Float[Array, "4"]) -> Command:
+    def limit(self, y: Float[Array, "4"]) -> Command:
         """Map the network's output to a command within the limits; zero maps to hover."""
         low, high, hover = (lax.stop_gradient(u.vector()) for u in (self.u_min, self.u_max, self.u_hover))
         y_0 = jnp.log((hover - low) / (high - hover))
@@ -142,7 +142,7 @@ class Policy(AbstractPolicy):
             h = jax.nn.relu(layer(h))
         return self.layers[-1](h)
 
-    def perturbed(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
+    def perturb(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
         """Return the command with ``perturbations[l]`` added to the output of layer l, without weight gradients.
 
         Also return the input of each layer; with the cotangents of the perturbations, these give every weight gradient.
@@ -152,7 +152,7 @@ class Policy(AbstractPolicy):
             inputs.append(h)
             y = lax.stop_gradient(layer)(h) + perturbation
             h = jax.nn.relu(y) if i < len(self.layers) - 1 else y
-        return self.bounded(h), tuple(inputs)
+        return self.limit(h), tuple(inputs)
 
 
 def command_bounds(vehicle: Vehicle) -> tuple[Command, Command, Command]:

@@ -22,14 +22,14 @@ from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.task import AbstractTask
 
 # [m/s^2] and [s]: a reference whose acceleration is smaller, now and a little later, rests, and no swing is expected.
-REST, SOON = 0.3, 0.2
+REST, SHORT_TIME = 0.3, 0.2
 # [1/s], acceleration of the frame per velocity of the load relative to the vehicle. At rest, a fast decay of the swing
 # matters more than the motion; on a path, the error of the path matters more.
 GAIN, GAIN_AT_REST = 1.0, 3.0
-FORGET, FORGET_AT_REST = 0.1, 4.0  # [1/s], rates at which the expected swing decays
-CERTAIN = 0.2  # [m/s], standard deviation of the velocity of the load at which the motion is halved
-LIGHT = 0.1  # share of the load below which the motion is smaller, since a light load matters less
-MOST = 2.0  # [m/s^2], largest acceleration of the frame
+DECAY_RATE, REST_DECAY_RATE = 0.1, 4.0  # [1/s], rates at which the expected swing decays
+HALVING_DEVIATION = 0.2  # [m/s], standard deviation of the velocity of the load at which the motion is halved
+LIGHT_SHARE = 0.1  # share of the load below which the motion is smaller, since a light load matters less
+LARGEST_ACCELERATION = 2.0  # [m/s^2], largest acceleration of the frame
 # Frequency of the critically damped return of the frame, as a share of that of the swing below a fixed vehicle. It lets
 # the motion of the frame lead the swing by 20 degrees, which is about the lag of the vehicle.
 RETURN = 0.18
@@ -121,14 +121,14 @@ class LoadCompensation(eqx.Module):
         dtype, load, sway = s.sway.p.dtype, s.estimate.load, s.sway
         coming = self.task.setpoint(t + lead.astype(t.dtype)).a.astype(dtype) + sway.a
         pull = load.after(lead, coming).pull(coming)
-        a, later = (self.task.setpoint(t + soon).a.astype(dtype) for soon in (0.0, SOON))
+        a, later = (self.task.setpoint(t + soon).a.astype(dtype) for soon in (0.0, SHORT_TIME))
         rests = jnp.sum(a * a) + jnp.sum(later * later) < REST**2
         expected = self._expect(s, a, rests, dt)
         excess = (load.length * (load.rate - expected.rate)).at[2].set(0.0)
         variance = load.length**2 * (s.estimate.P[2, 2] + s.estimate.P[3, 3])
-        share = jnp.minimum(1.0, load.share / LIGHT) * CERTAIN**2 / (CERTAIN**2 + variance)
+        share = jnp.minimum(1.0, load.share / LIGHT_SHARE) * HALVING_DEVIATION**2 / (HALVING_DEVIATION**2 + variance)
         a = jnp.where(rests, GAIN_AT_REST, GAIN) * share * excess
-        a = a * jnp.minimum(1.0, MOST / jnp.sqrt(jnp.sum(a * a) + 1e-12))
+        a = a * jnp.minimum(1.0, LARGEST_ACCELERATION / jnp.sqrt(jnp.sum(a * a) + 1e-12))
         back = RETURN * jnp.sqrt(STANDARD_GRAVITY / load.length)
         a = a - 2.0 * back * sway.v - back**2 * sway.p
         after = Sway(sway.p + dt * sway.v + 0.5 * dt**2 * a, sway.v + dt * a, a)
@@ -138,5 +138,5 @@ class LoadCompensation(eqx.Module):
         """Return the expected load one tick later; ``a`` is the acceleration of the reference [m/s^2]."""
         load = s.estimate.load
         expected = dataclasses.replace(s.expected, share=load.share, length=load.length).after(dt, a)
-        remains = jnp.exp(-dt * jnp.where(rests, FORGET_AT_REST, FORGET)).astype(a.dtype)
+        remains = jnp.exp(-dt * jnp.where(rests, REST_DECAY_RATE, DECAY_RATE)).astype(a.dtype)
         return dataclasses.replace(expected, n=jnp.where(rests, remains, 1.0) * expected.n, w=remains * expected.w)

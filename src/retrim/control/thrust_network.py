@@ -59,11 +59,11 @@ class ThrustNetwork(eqx.Module):
         thrusts = STANDARD_GRAVITY * o[6 : 6 + 3 * POINTS].reshape(POINTS, 3)
         nose = o[6 + 3 * POINTS : 8 + 3 * POINTS]
         position, velocity, attitude, heading = jnp.exp(self.gains)
-        wanted = thrusts[0] + _limited(position * error + velocity * speed, FEEDBACK)
+        desired = thrusts[0] + _limit(position * error + velocity * speed, FEEDBACK)
         up = jnp.array([0.0, 0.0, 1.0], dtype=o.dtype)
         turns = jax.vmap(_turn)(thrusts[:-1], thrusts[1:]) / STEP
-        rates = _limited(attitude * _turn(up, wanted), TURN) + self.lead[:-1] @ turns
-        c = wanted[2] + self.lead[-1] * (thrusts[1] - thrusts[0])[2]
+        rates = _limit(attitude * _turn(up, desired), TURN) + self.lead[:-1] @ turns
+        c = desired[2] + self.lead[-1] * (thrusts[1] - thrusts[0])[2]
         yaw = heading * jnp.arctan2(nose[1], nose[0] + 1e-6)
         u = jnp.stack([c, rates[0], rates[1], yaw]) + jnp.array(CORRECTION, o.dtype) * self.perceptron(o)
         hover, low, high = (lax.stop_gradient(each.vector().astype(o.dtype)) for each in self.bounds)
@@ -71,7 +71,7 @@ class ThrustNetwork(eqx.Module):
         return jnp.log(share / (1.0 - share)) - jnp.log((hover - low) / (high - hover))
 
 
-def _limited(y: Float[Array, "3"], limit: float) -> Float[Array, "3"]:
+def _limit(y: Float[Array, "3"], limit: float) -> Float[Array, "3"]:
     """Return ``y`` with a norm that approaches ``limit`` smoothly."""
     return y / jnp.sqrt(1.0 + jnp.sum(y * y) / limit**2)
 

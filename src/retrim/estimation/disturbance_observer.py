@@ -88,7 +88,7 @@ class DisturbanceObserver(eqx.Module):
         """Return the mean command that arrived during the tick that has just ended."""
         return s.commands.arrival(self.path.delay, self.nominal.dt)
 
-    def acted(self, s: ObserverState, x: State) -> tuple[Command, Float[Array, ""]]:
+    def acting(self, s: ObserverState, x: State) -> tuple[Command, Float[Array, ""]]:
         """Return the mean thrust and the mean body rates of the tick that has just ended, and the thrust at its end.
 
         The body rates are those of the measured rotation, not the commanded ones.
@@ -119,7 +119,7 @@ class DisturbanceObserver(eqx.Module):
             x: Measured state.
         """
         nominal, dt = self.nominal, self.nominal.dt
-        u, thrust = self.acted(s, x)
+        u, thrust = self.acting(s, x)
         speed_change = nominal.state(nominal.step(nominal.init(s.last), u, jnp.zeros_like(x.p))).v - s.last.v
         mismatch = (x.v - s.last.v - speed_change) / dt
         noise = self._noise(s, mismatch)

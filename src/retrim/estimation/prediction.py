@@ -54,7 +54,7 @@ class Prediction(eqx.Module):
         hover = Command.hover(x.p.dtype)
         return Underway(ActuatorState.at(hover), CommandQueue.of(hover, self.dt, longest=self.ticks * self.dt))
 
-    def acted(self, s: Underway) -> tuple[Command, ActuatorState]:
+    def acting(self, s: Underway) -> tuple[Command, ActuatorState]:
         """Return the mean thrust and rates over the tick that has just ended, and the actuator state at its end."""
         return self.path.advance(s.queue, s.before, self.dt)
 
@@ -66,7 +66,7 @@ class Prediction(eqx.Module):
             before: Attitude at the beginning of the tick, body to world.
             after: Attitude at the end of the tick.
         """
-        return self.acted(s)[0].c * 0.5 * (before[:, 2] + after[:, 2])
+        return self.acting(s)[0].c * 0.5 * (before[:, 2] + after[:, 2])
 
     def __call__(
         self, s: Underway, x: State, d: Float[Array, "3"], omega: Float[Array, "3"] | None = None
@@ -79,7 +79,7 @@ class Prediction(eqx.Module):
             d: Disturbance, world [m/s^2].
             omega: Measured body rates [rad/s]; None to use the rates that follow from the commands.
         """
-        _, actuators = self.acted(s)
+        _, actuators = self.acting(s)
         if omega is not None:
             actuators = dataclasses.replace(actuators, command=Command(actuators.command.c, omega))
         x = ahead(x, actuators.command, d, self.age.astype(x.p.dtype))
@@ -95,7 +95,7 @@ class Prediction(eqx.Module):
 
     def issue(self, s: Underway, u: Command) -> Underway:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""
-        return Underway(self.acted(s)[1], s.queue.push(u))
+        return Underway(self.acting(s)[1], s.queue.push(u))
 
     def accept(self, s: Underway, u: Command) -> Underway:
         """Return the memory after the plant accepted ``u`` instead of the command that was issued last."""

@@ -31,15 +31,13 @@ WALK = (0.0, 0.0, 0.3, 0.3, 0.3, 0.3, 0.3, 0.01, 0.03, 0.01, 0.003)
 """Standard deviation of the random walk of each number in one second."""
 NOISE = 0.3  # [m/s^2], standard deviation of a missed acceleration without measurement noise
 AXES = 3.0  # expected sum of the squared innovations of a tick, relative to their variances
-OF_LOAD = (True,) * 4 + (False,) * 3 + (True, True, False, False)  # numbers that describe the load
+LOAD_ENTRIES = (True,) * 4 + (False,) * 3 + (True, True, False, False)  # numbers that describe the load
 GATE = 4.0  # standard deviations; a missed acceleration farther off corrects no more than one at this distance
 PATIENCE = 0.5  # [s], time after a change in which no other one is noticed, since the filter must settle
-SURPRISE, SURPRISE_TAU = (
-    12.0,
-    0.06,
-)  # mean squared innovation [variances, of 3 axes] that shows a change; its memory [s]
-WIDEST = 3.0  # largest standard deviation, in those of the start
-LIGHT = 0.05  # share below which the direction of the load fades, since it cannot be observed
+SURPRISE = 12.0  # mean squared innovation [variances, of 3 axes] that shows a change
+SURPRISE_TAU = 0.06  # [s], time constant of this mean
+LARGEST_DEVIATION = 3.0  # largest standard deviation, in those of the start
+LIGHT_SHARE = 0.05  # share below which the direction of the load fades, since it cannot be observed
 STEEPEST = 0.98  # largest horizontal part of the direction
 HEAVIEST, SHORTEST, LONGEST = 1.5, 0.1, 5.0  # largest share; bounds of the length [m]
 
@@ -90,8 +88,8 @@ class Load(eqx.Module):
             h: Time [s].
             a: Mean acceleration of the vehicle over this time, world [m/s^2].
         """
-        middle = self._moved(0.5 * h, self.w, self._acceleration(a))
-        return self._moved(h, middle.w, middle._acceleration(a))
+        middle = self._advance(0.5 * h, self.w, self._acceleration(a))
+        return self._advance(h, middle.w, middle._acceleration(a))
 
     def _down(self) -> Float[Array, ""]:
         return jnp.sqrt(1.0 - jnp.minimum(jnp.sum(self.n * self.n), STEEPEST**2))
@@ -102,7 +100,7 @@ class Load(eqx.Module):
         across = force - q * jnp.sum(q * force)
         return (across / self.length - jnp.sum(q_dot * q_dot) * q)[:2]
 
-    def _moved(self, h: float | Float[Array, ""], w: Float[Array, "2"], w_dot: Float[Array, "2"]) -> "Load":
+    def _advance(self, h: float | Float[Array, ""], w: Float[Array, "2"], w_dot: Float[Array, "2"]) -> "Load":
         return dataclasses.replace(self, n=self.n + h * w, w=self.w + h * w_dot)
 
     def vector(self) -> Float[Array, "11"]:
@@ -142,16 +140,16 @@ class LoadEstimate(eqx.Module):
 
         def step(z: Float[Array, "11"]) -> Float[Array, "11"]:
             load = Load.of(z).after(dt, a)
-            remains = jnp.exp(-dt * jnp.maximum(0.0, 1.0 - load.share / LIGHT))
+            remains = jnp.exp(-dt * jnp.maximum(0.0, 1.0 - load.share / LIGHT_SHARE))
             return dataclasses.replace(load, n=remains * load.n, w=remains * load.w).vector()
 
         F = jax.jacfwd(step)(self.z)
         P = F @ self.P @ F.T + dt * jnp.diag(jnp.array(WALK, dtype=self.P.dtype) ** 2)
         # The direction of a load without mass cannot be observed: its uncertainty must not grow beyond all bounds.
-        widest = WIDEST * jnp.array(PRIOR, dtype=P.dtype)
+        widest = LARGEST_DEVIATION * jnp.array(PRIOR, dtype=P.dtype)
         variances = jnp.sum(jnp.eye(P.shape[0], dtype=P.dtype) * P, axis=0)  # jnp.diagonal has no NumPy form on board
         shrink = jnp.minimum(1.0, widest / jnp.sqrt(jnp.maximum(variances, 1e-12)))
-        return LoadEstimate(_bounded(step(self.z)), shrink[:, None] * P * shrink[None], self.surprise, self.since)
+        return LoadEstimate(_limit(step(self.z)), shrink[:, None] * P * shrink[None], self.surprise, self.since)
 
     def correct(
         self,
@@ -199,16 +197,16 @@ class LoadEstimate(eqx.Module):
         changed = (surprise > SURPRISE) & (since > PATIENCE)
         # After a change, the load may be a different one; the other causes of missed acceleration remain.
         start = LoadEstimate.start(P.dtype)
-        is_new = jnp.array(OF_LOAD) & changed
+        is_new = jnp.array(LOAD_ENTRIES) & changed
         P = jnp.where(is_new[:, None] | is_new[None], start.P, 0.5 * (P + P.T))
-        z = _bounded(jnp.where(is_new, start.z, jnp.where(changed, self.z, self.z + off)))
+        z = _limit(jnp.where(is_new, start.z, jnp.where(changed, self.z, self.z + off)))
         surprise, since = jnp.where(changed, AXES, surprise), jnp.where(changed, 0.0, since)
         after = LoadEstimate(z, P, surprise, since.astype(P.dtype))
         finite = jnp.all(jnp.isfinite(P)) & jnp.all(jnp.isfinite(z)) & jnp.isfinite(surprise)
         return where(finite, after, start)
 
 
-def _bounded(z: Float[Array, "11"]) -> Float[Array, "11"]:
+def _limit(z: Float[Array, "11"]) -> Float[Array, "11"]:
     norm = jnp.sqrt(jnp.sum(z[:2] * z[:2]) + 1e-12)
     n = z[:2] * jnp.minimum(1.0, STEEPEST / norm)
     length = jnp.clip(z[8], jnp.log(SHORTEST), jnp.log(LONGEST))

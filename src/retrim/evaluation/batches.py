@@ -11,7 +11,7 @@ from ..runkit.flights import FlightSpec
 from ..runkit.provenance import cores
 
 CPU_LIMIT, ACCELERATOR_LIMIT = 64, 2048  # largest number of flights in one program: on a CPU, on an accelerator
-SMALL = 2  # smallest batch; Python steps a single flight, which uses only one core
+SMALLEST_BATCH = 2  # smallest batch; Python steps a single flight, which uses only one core
 
 
 class FlightBatch(NamedTuple):
@@ -38,7 +38,9 @@ def in_batches(
     first, others = dict[Hashable, FlightBatch](), list[FlightBatch]()
     for group in groups:
         of_group = program(group)
-        for part in _parts(group, 1 if of_group is None else min(largest(), max(SMALL, -(-len(group) // lanes())))):
+        for part in _parts(
+            group, 1 if of_group is None else min(largest(), max(SMALLEST_BATCH, -(-len(group) // lanes())))
+        ):
             if len(part) == 1:
                 others.append(FlightBatch(part, None))
             elif (of_group, len(part)) in first:

@@ -13,11 +13,11 @@ from ..runkit.provenance import EXTRAS, code, versions
 from ..runkit.reporter import Reporter
 
 ANSWERS_S = 10.0  # time limit for the first connection to the scheduler
-BACK_S = 60.0  # time limit for an answer from the scheduler, also after a lost connection
+ANSWER_LIMIT_S = 60.0  # time limit for an answer from the scheduler, also after a lost connection
 WORKERS_S = 30.0  # time limit for the first worker to connect
 ATTEMPTS = 5  # for a job that the scheduler has lost, or whose result has not arrived
 ADDRESS = re.compile(r"(tcp|tls)://\[?(?P<host>[^\]]+)\]?:(?P<port>\d{1,5})")
-ALIKE = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
+COMMON_PACKAGES = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy", "python")
 """Packages whose versions must be equal on all machines, so that a flight does not depend on its machine."""
 
 
@@ -47,7 +47,7 @@ class Cluster(Executor):
         distributed = import_extra("distributed", "dask", package="distributed", kind="--on")
         try:
             socket.create_connection((place["host"], int(place["port"])), ANSWERS_S).close()
-            self._client = distributed.Client(address, timeout=BACK_S, set_as_default=False, name="retrim")
+            self._client = distributed.Client(address, timeout=ANSWER_LIMIT_S, set_as_default=False, name="retrim")
         except (OSError, TimeoutError, ValueError, TypeError) as error:
             raise ConfigError(f"--on {address}: no scheduler responds there ({_line(error)})") from error
         try:
@@ -134,7 +134,7 @@ def join_cluster(address: str | None, reporter: Reporter) -> Iterator[Cluster | 
 def ours() -> dict[str, str]:
     """Return the values that must be equal on all machines: the versions, and the digest of retrim's code."""
     result = versions()
-    return {name: result.get(name, "missing") for name in (*ALIKE, *EXTRAS)} | {"code": code()}
+    return {name: result.get(name, "missing") for name in (*COMMON_PACKAGES, *EXTRAS)} | {"code": code()}
 
 
 def check_alike(theirs: dict[str, str], who: str) -> None:

@@ -19,7 +19,7 @@ from ..learn.window import Window
 from ..physics.state import Command
 from ..runkit.stopwatch import Stopwatch
 
-RUNS = 9  # runs of each timed program
+TIMED_RUNS = 9  # runs of each timed program
 DECISIONS = 200
 
 
@@ -47,11 +47,11 @@ def updates(setup: Setup, *, lora: bool = False) -> dict[str, Any]:
         policy = setup.low_rank(policy, random.key(2))
     learner, window = setup.learner, full_window(setup)
     state = learner.init(policy, random.key(1))
-    fit_compile, fit_s = time_runs(lambda: OnlineLearner.fit_residual(learner, state.residual, window), RUNS)
+    fit_compile, fit_s = time_runs(lambda: OnlineLearner.fit_residual(learner, state.residual, window), TIMED_RUNS)
     residual, _ = learner.fit_residual(state.residual, window)
     key = random.key(0)
     compile_s, run_s = time_runs(
-        lambda: OnlineLearner.update_policy(learner, state.policy, residual, window, key), RUNS
+        lambda: OnlineLearner.update_policy(learner, state.policy, residual, window, key), TIMED_RUNS
     )
     a = setup.preset.adapt
     return {

@@ -9,7 +9,7 @@ from ..runtime.flight import Log
 
 DELAYS, LAGS = range(11), (0.0, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)  # [ticks], [s]
 TICKS = 12  # shorter flights contain too little data on thrust and rates
-LATER = 0.06  # tolerated delay of rates beyond that in training [s]; the fit of a fast loop is about this uncertain
+DELAY_TOLERANCE = 0.06  # [s], delay of rates beyond that in training; the fit of a fast loop is about this uncertain
 
 
 def likely_cause(log: Log, lateness: float) -> str | None:
@@ -88,7 +88,7 @@ def _rates(log: Log, lateness: float) -> Iterator[str]:
         yield f"the vehicle turns against its command ({numbers}): look at the signs of roll and pitch"
     elif abs(match) < 0.3:
         yield f"the body rates do not follow their commands ({numbers}, correlation {match:.2f})"
-    elif late > lateness + LATER:
+    elif late > lateness + DELAY_TOLERANCE:
         yield (
             f"the vehicle turned with {numbers}, and the policy was trained for {lateness:.2f} s: give its rate_lag "
             f"and command_delay in the vehicle file, or fly a policy of hover/any, which identifies them"

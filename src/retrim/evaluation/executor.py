@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 MOST_ROWS = 6  # rows of results in the text of flights
 SCENARIO = ("plant", "vehicle", "sensors", "thrust_error", "delay", "fault", "reference")
 """Conditions of a scenario that the text of flights states if they differ; the disturbance is always stated."""
-GONE: "Future[list[Flight]]" = Future()
+CANCELLED: "Future[list[Flight]]" = Future()
 """Placeholder for a future whose flights were discarded; it is cancelled, and never waited for."""
-GONE.cancel()
-OFTEN = 1.0  # interval between progress reports while flights are running [s]
+CANCELLED.cancel()
+REPORT_PERIOD = 1.0  # interval between progress reports while flights are running [s]
 Progress = Callable[[float, int], None]
 """Receives the numbers of completed flights and of all flights; a running flight counts by its completed share."""
 Submit = Callable[[FlightBatch, Callable[[float], None]], "Future[list[Flight]]"]
@@ -131,7 +131,7 @@ def gather_flights(
                 progress(len(result) + len(failures) + in_air, len(specs))
 
         while waiting:
-            over = wait(waiting, OFTEN, FIRST_COMPLETED).done
+            over = wait(waiting, REPORT_PERIOD, FIRST_COMPLETED).done
             for future in over:
                 error = future.exception()
                 if error is not None and (not outlive or isinstance(error, ConfigError | JobError | FlightStopped)):
@@ -145,7 +145,7 @@ def gather_flights(
                         with interrupts_only_set(stop):
                             on_result(flights)
                     if forget:
-                        futures[waiting[future]] = GONE
+                        futures[waiting[future]] = CANCELLED
                 del waiting[future]
                 report()
             if not over and aloft:

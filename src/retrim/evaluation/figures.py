@@ -19,15 +19,15 @@ from ..physics.effects import ExternalEffects
 from ..physics.state import State
 from ..runkit.disturbance_text import describe_effects
 from ..runkit.flights import Flight
-from ..runkit.recovery import FEW, timeline
+from ..runkit.recovery import FREQUENT, timeline
 from ..tasks.observation import AbstractObservation
 from ..tasks.reference import Reference
 from ..tasks.track import AbstractTrack
 from ..tasks.transition import SplicedReference
 from ..viz import animation, plots
 
-BY_HAND = ("asked", "knobs", "reference")
-"""Kinds of events that a user causes in a live flight."""
+USER_EVENTS = ("request", "asked", "knobs", "reference")
+"""Kinds of events that a user causes in a live flight; "asked" is in earlier recordings."""
 
 
 def picture(
@@ -121,7 +121,7 @@ def animate(
 def spans(name: str, home: Array, seconds: float) -> list[plots.Span]:
     """Return the time spans of a disturbance, with labels; a disturbance that changes all the time has one span."""
     times, result, changes = timeline(name, home, seconds)
-    if len(changes) > FEW:
+    if len(changes) > FREQUENT:
         return [plots.Span(0.0, seconds, name, strong=False)]
     marks = []
     for first, after in itertools.pairwise([0, *changes, len(times)]):
@@ -146,7 +146,7 @@ def _colours(methods: Sequence[str]) -> dict[str, int]:
 def _track(flight: Flight) -> plots.Track:
     return plots.Track(
         flight.log.t, flight.log.p, flight.error, flight.swaps, flight.log.terminated, flight.steady_seconds,
-        tuple((event.t, event.note) for event in flight.log.events if event.kind in BY_HAND),
+        tuple((event.t, event.note) for event in flight.log.events if event.kind in USER_EVENTS),
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from .executor import Flights, Progress, Submit, gather_flights, report_progress
 from .jobs import Job, fly_job
 from .limits import check_flights, check_seeds
 
-COMPILED_AFTER = 1.0  # flight time by which all programs of a batch have run [s]
+COMPILATION_END = 1.0  # flight time by which all programs of a batch have run [s]
 
 
 class Fleet:
@@ -210,7 +210,7 @@ class Fleet:
         program, cold = batch.compiled, batch.compiles
 
         def report_share(share: float) -> None:
-            if share * seconds > COMPILED_AFTER:
+            if share * seconds > COMPILATION_END:
                 program.set()
             aloft(share)
 

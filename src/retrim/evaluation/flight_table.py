@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from ..runkit.flights import SETTLED
+from ..runkit.flights import SETTLING_ERROR
 from .metrics import with_counts
 
 START_S = 5.0  # [s], flight to the goal, which the worst moment excludes
@@ -16,7 +16,7 @@ def figure_columns(seconds: float | None = None) -> tuple[str, str, str]:
         seconds: Length of the flights [s]; the worst moment of a flight below 10 s is in its second half.
     """
     after = START_S if seconds is None else min(START_S, seconds / 2)
-    return "error at the end [mm]", f"worst after {after:g} s [mm]", f"below {1000 * SETTLED:g} mm from [s]"
+    return "error at the end [mm]", f"worst after {after:g} s [mm]", f"below {1000 * SETTLING_ERROR:g} mm from [s]"
 
 
 def figure_cells(row: Mapping[str, Any]) -> tuple[str, str, str]:

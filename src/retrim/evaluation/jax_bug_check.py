@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-EXCLUDED = "0.10.2"
+EXCLUDED_VERSION = "0.10.2"
 """Version of JAX that computes wrong results on the CPU."""
 
 

@@ -16,7 +16,7 @@ from ..runkit.store import Store
 from ..runkit.training import train, train_elsewhere
 
 POLICIES = "policies"
-UNSAFE = re.compile(r"[^\w.+=-]+")
+UNSAFE_CHARACTERS = re.compile(r"[^\w.+=-]+")
 """Characters in a preset's name (which may be a path) that are unsafe in a file name."""
 
 
@@ -37,7 +37,7 @@ def train_policies(preset: Preset, seeds: Sequence[int], run: Run, reporter: Rep
         JobError: Training failed in another process; raised after the other jobs are completed.
     """
     inputs = section_key(preset=dump(preset), files=file_digests(*preset_names(preset)))
-    stem = f"{POLICIES}/{UNSAFE.sub('-', preset.name)}-{inputs[:8]}"
+    stem = f"{POLICIES}/{UNSAFE_CHARACTERS.sub('-', preset.name)}-{inputs[:8]}"
     store, codec = Store(run.policy_folder, reporter=reporter, stop=run.stop), policy_codec(preset)
     result = dict[int, AbstractPolicy]()
     for seed in seeds:

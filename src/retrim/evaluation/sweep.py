@@ -14,7 +14,7 @@ from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Setup
 from ..config.trust import check_trust
-from ..config.validation import read_toml, validated
+from ..config.validation import read_toml, validate
 from ..config.vehicle_file import VehicleSpec
 from ..control.policy import AbstractPolicy
 from ..io.logs.recording import write_npz
@@ -93,7 +93,7 @@ def read_sweep(path: Path, trust: Collection[str] = ()) -> Sweep:
         tables["overlay"] = beside(overlay, path.parent)
     if isinstance(names := tables.get("vehicles"), list):
         tables["vehicles"] = [beside({"vehicle": name}, path.parent)["vehicle"] for name in names]
-    sweep = validated(Sweep, tables, source=str(path))
+    sweep = validate(Sweep, tables, source=str(path))
     check_trust(tables, trust, source=str(path))
     return sweep
 

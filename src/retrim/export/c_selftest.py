@@ -13,7 +13,7 @@ from .c_literals import array, bits
 from .portable import Portable
 
 TOLERANCE = 1e-5  # largest deviation of a computed command from the stored one, as a fraction of the command range
-BAD = (math.nan, math.inf, -math.inf, LARGEST)  # the test puts each of them at each index
+INVALID = (math.nan, math.inf, -math.inf, LARGEST)  # the test puts each of them at each index
 FORMAT, DAMAGE, LIMITS, OBSERVATION, STATE = 1, 2, 3, 4, 5
 """Numbers of the cases that are not test vectors."""
 VECTORS, TICKS = 100, 200
@@ -30,11 +30,11 @@ def test_vectors(name: str, policy: Portable) -> list[str]:
         lines += array(f"{name}_test_states", policy.test_states)
         lines += array(f"{name}_test_flight", policy.test_flight)
     total = START
-    for _, values in _stored(policy):
+    for _, values in _constants(policy):
         total = _checksum(total, values)
     return [
         *lines,
-        f"static const uint32_t {name}_test_bits[{len(BAD)}] = {{{', '.join(map(bits, BAD))}}};",
+        f"static const uint32_t {name}_test_bits[{len(INVALID)}] = {{{', '.join(map(bits, INVALID))}}};",
         f"#define {name.upper()}_CHECKSUM 0x{total:08x}u",
         f"#define {name.upper()}_TOLERANCE {TOLERANCE:g}f /* of a command, as a fraction of its range */",
         "",
@@ -44,7 +44,7 @@ def test_vectors(name: str, policy: Portable) -> list[str]:
 def self_test(name: str, policy: Portable) -> list[str]:
     """Return the functions of the self-test."""
     n, size = policy.test_observations.shape
-    stored = [f"    sum = {name}_hash(sum, {name}_{part}, {values.size});" for part, values in _stored(policy)]
+    stored = [f"    sum = {name}_hash(sum, {name}_{part}, {values.size});" for part, values in _constants(policy)]
     has_step = policy.observation is not None
     return [
         *_hash(name),
@@ -71,7 +71,7 @@ def self_test(name: str, policy: Portable) -> list[str]:
         f"        for (int i = 0; i < 4; ++i) before[i] = y[i] > 0.0f ? {name}_high[i] : {name}_low[i];",
         f"        if ({name}_deviation(command, before) > {name.upper()}_TOLERANCE) return {LIMITS};",
         "    }",
-        f"    for (int k = 0; k < {len(BAD)} * {size}; ++k) {{",
+        f"    for (int k = 0; k < {len(INVALID)} * {size}; ++k) {{",
         f"        float spoilt[{size}];",
         f"        memcpy(spoilt, {name}_test_observations, sizeof spoilt);",
         f"        memcpy(spoilt + k % {size}, {name}_test_bits + k / {size}, sizeof(float));",
@@ -121,7 +121,7 @@ def self_test(name: str, policy: Portable) -> list[str]:
     ]
 
 
-def _stored(policy: Portable) -> list[tuple[str, np.ndarray]]:
+def _constants(policy: Portable) -> list[tuple[str, np.ndarray]]:
     """Return the names and values of all stored arrays, in the order of the checksum."""
     layers = [
         (f"{kind}{i}", part) for i, layer in enumerate(policy.layers) for kind, part in zip("wb", layer, strict=True)
@@ -189,7 +189,7 @@ def _flight(name: str, ticks: int) -> list[str]:
         "            *worst = 1.0f;",
         f"            return {STATE};",
         "        }",
-        f"        for (int k = 0; k < {len(BAD)} * 15; ++k) {{",
+        f"        for (int k = 0; k < {len(INVALID)} * 15; ++k) {{",
         "            float spoilt[15];",
         "            memcpy(spoilt, x, sizeof spoilt);",
         f"            memcpy(spoilt + k % 15, {name}_test_bits + k / 15, sizeof(float));",

@@ -30,7 +30,7 @@ from .releases import newer_release, this_release
 from .sanity import check_policy, check_size
 
 LOG = logging.getLogger(__name__)
-MOST = 1e12  # largest number in a resumed learner's state
+LARGEST_NUMBER = 1e12  # largest number in a resumed learner's state
 
 
 def save_policy(path: str | Path, policy: AbstractPolicy, preset: Preset) -> None:
@@ -103,7 +103,7 @@ def load_learner_state(path: str | Path, *, trust: Collection[str] = ()) -> tupl
         state = wire.unpack(data, like, kind="learnt", source=str(path))
     except (MessageError, ConfigError) as error:
         raise CheckpointError(str(error)) from error
-    check_size(state, source=str(path), largest=MOST)
+    check_size(state, source=str(path), largest=LARGEST_NUMBER)
     check_policy(state.policy.policy.merged(), source=str(path), observation=np.asarray(_observe_at_rest(setup)))
     if not np.isfinite(np.asarray(_command_at_rest(setup.controller(state), setup.flight_task.home()))).all():
         raise CheckpointError(f"{path}: its command at hover is not finite; the learner state cannot be flown")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 
 NUMBERS = re.compile(r"(\d{1,6})\.(\d{1,6})(?:\.(\d{1,6}))?[\w.+-]{0,40}", re.ASCII)
-UNKNOWN = "0.0"
+UNKNOWN_RELEASE = "0.0"
 
 
 @functools.cache
@@ -15,7 +15,7 @@ def this_release() -> str:
     try:
         return version("retrim")
     except PackageNotFoundError:  # a source tree that is not installed
-        return UNKNOWN
+        return UNKNOWN_RELEASE
 
 
 def newer_release(header: Mapping[str, str]) -> str | None:

@@ -14,7 +14,7 @@ from ..control.policy import AbstractPolicy, Inputs, Perturbations, Policy
 from ..tasks.task import Start
 from . import weight_gradients
 from .env import Env
-from .rollout import Trajectory, perturbed_rollout, rollout
+from .rollout import Trajectory, rollout, rollout_with_perturbations
 from .transposed_layers import with_transposed_copy
 
 
@@ -55,7 +55,7 @@ def _perceptron_gradient(policy: Policy, env: Env, x0: Start) -> tuple[Float[Arr
 
     def loss(zeros: Perturbations) -> tuple[Float[Array, ""], Inputs]:
         def fly(start: Start, z: Perturbations) -> tuple[Trajectory, Inputs]:
-            return perturbed_rollout(copies, flying, start, z)
+            return rollout_with_perturbations(copies, flying, start, z)
 
         # Keep time as the leading axis, as the scan lays it out, to avoid transposing activations.
         trajectory, inputs = jax.vmap(fly, in_axes=(0, 1), out_axes=(0, 1))(x0, zeros)

@@ -17,7 +17,7 @@ from ..errors import ConfigError
 
 T = TypeVar("T")
 
-MANY = "many"
+MANY_DEVICES = "many"
 """Name of the divided axis."""
 
 
@@ -60,7 +60,7 @@ def shard(tree: T, *, axis: int = 0) -> T:
         ConfigError: There are several hosts, and the length of the axis cannot be divided among their devices.
     """
     leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array))
-    return _lay_out(tree, leaves[0].shape[axis], PartitionSpec(*[None] * axis, MANY)) if leaves else tree
+    return _lay_out(tree, leaves[0].shape[axis], PartitionSpec(*[None] * axis, MANY_DEVICES)) if leaves else tree
 
 
 def replicate(tree: T, n: int) -> T:
@@ -87,6 +87,6 @@ def _lay_out(tree: T, n: int, how: PartitionSpec) -> T:
     if count == 1:
         return tree
     arrays, rest = eqx.partition(tree, eqx.is_array)
-    mesh = Mesh(np.array(jax.devices()[:count]), (MANY,))
+    mesh = Mesh(np.array(jax.devices()[:count]), (MANY_DEVICES,))
     tree_on_devices: T = eqx.combine(lax.with_sharding_constraint(arrays, NamedSharding(mesh, how)), rest)
     return tree_on_devices

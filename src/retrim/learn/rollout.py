@@ -46,7 +46,7 @@ def rollout(env: Env, policy: AbstractPolicy, start: Start) -> Trajectory:
     return _scan(env, policy, start, lambda o, _: (policy(o), ()), None)[0]
 
 
-def perturbed_rollout(
+def rollout_with_perturbations(
     env: Env, policy: Policy, start: Start, perturbations: Perturbations
 ) -> tuple[Trajectory, Inputs]:
     """Fly like :func:`rollout`, with a perturbation added to each layer's output at each tick.
@@ -60,7 +60,7 @@ def perturbed_rollout(
     Returns:
         The trajectory, and the inputs of each layer (per layer, horizon x fan-in).
     """
-    return _scan(env, policy, start, policy.perturbed, perturbations)
+    return _scan(env, policy, start, policy.perturb, perturbations)
 
 
 def _scan(

@@ -12,7 +12,7 @@ from .operator.requests import OperatorRequests
 from .status import Status
 from .supervisor import LANDING, Supervisor
 
-EVERY = 0.05  # [s] between two reads of the status
+STATUS_PERIOD = 0.05  # [s] between two reads of the status
 LAST = 1.0  # [s], longest wait for a terminal to display the end of a flight
 
 
@@ -51,7 +51,7 @@ def watch_flight(
             if (stop.is_set() or supervisor.landing or status.t >= seconds) and deadline == float("inf"):
                 supervisor.land()
                 deadline = time.monotonic() + LANDING
-            time.sleep(EVERY)
+            time.sleep(STATUS_PERIOD)
 
 
 class _Screen:

@@ -9,8 +9,8 @@ from ..runtime.events import Event
 from .status import Status
 
 EXCLUDED_EVERY = 5.0  # [s] between two events about excluded measurements; the duration of a window
-HUNG = f"hung: it said nothing for {SILENCE:g} s and was ended"
-WITHOUT = {
+HANG_TEXT = f"hung: it said nothing for {SILENCE:g} s and was ended"
+LOSS_EFFECTS = {
     "control": "the watchdog flies, holds and lands",
     "plant": "measurements have stopped, and the flight is over",
 }
@@ -98,10 +98,12 @@ class LiveEvents:
         for role in sorted(status.hangs.keys() | status.restarts.keys()):
             hangs = status.hangs.get(role, 0) > self._hangs.get(role, 0)
             again = status.restarts.get(role, 0) > self._restarts.get(role, 0)
-            why = f"the {role} process {HUNG if hangs else 'had died'}"
+            why = f"the {role} process {HANG_TEXT if hangs else 'had died'}"
             if again:
                 new.append(Event(status.t, "restarted", why))
             elif hangs:
-                new.append(Event(status.t, "guard", f"{why}; {WITHOUT.get(role, 'the flight continues without it')}"))
+                new.append(
+                    Event(status.t, "guard", f"{why}; {LOSS_EFFECTS.get(role, 'the flight continues without it')}")
+                )
         self._hangs, self._restarts = dict(status.hangs), dict(status.restarts)
         return new

@@ -13,7 +13,7 @@ from ..adapt.updates import Layer
 from ..config.loading import parse
 from ..config.trust import check_trust
 from ..errors import MessageError, excerpt
-from ..onboard.topics import INTO, LAYERS, MOST, OUT
+from ..onboard.topics import INPUT_TOPICS, LAYERS, MOST_BYTES, OUTPUT_TOPICS
 from ..transport.message import describe, pack_arrays, unpack_arrays
 
 LOCAL = re.compile(r"\.(csv|toml)(:|\+|$)", re.IGNORECASE)
@@ -41,7 +41,7 @@ class LearnerMission:
     def of(cls, number: int, reference: str | None, seed: int, base: str, layers: tuple[Layer, ...],
            floor: int, capacities: Mapping[str, int], start: Path) -> "LearnerMission":  # fmt: skip
         """Return the mission of a flight whose learners start from a file."""
-        topic_sizes = {topic: size for topic, size in capacities.items() if topic in (*OUT, *INTO)}
+        topic_sizes = {topic: size for topic, size in capacities.items() if topic in (*OUTPUT_TOPICS, *INPUT_TOPICS)}
         return cls(number, reference, seed, base, layers, floor, topic_sizes, start.read_bytes())
 
     def check(self, trust: Collection[str]) -> None:
@@ -84,9 +84,11 @@ class LearnerMission:
             floor = int(fields["floor"])
         except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
             raise MessageError(f"mission: a field is missing or wrong ({error})") from error
-        if not set(capacities) <= {*OUT, *INTO} or not all(0 < size <= MOST for size in capacities.values()):
+        if not set(capacities) <= {*OUTPUT_TOPICS, *INPUT_TOPICS} or not all(
+            0 < size <= MOST_BYTES for size in capacities.values()
+        ):
             raise MessageError("mission: topics that no flight has, or messages that are too long")
-        if not 0 <= length <= MOST:
+        if not 0 <= length <= MOST_BYTES:
             raise MessageError(f"mission: a file of {length} bytes")
         arrays = unpack_arrays(data, {"start": np.empty(length, np.uint8)}, kind="mission", source="mission")
         return cls(number, reference, seed, base, layers, floor, capacities, arrays["start"].tobytes())

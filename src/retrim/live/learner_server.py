@@ -16,7 +16,7 @@ from ..onboard.heartbeat import beat_topic
 from ..onboard.launch import last_words, launch
 from ..onboard.messages import last_note, pack_note
 from ..onboard.pulses import Pulses
-from ..onboard.topics import INTO, MOST, OUT
+from ..onboard.topics import INPUT_TOPICS, NETWORK_SIZES, OUTPUT_TOPICS
 from ..transport.bridge import Bridge
 from ..transport.network import DISTRUST, FAREWELL
 from ..transport.remote import Address
@@ -26,8 +26,8 @@ from .processes.fleet import FleetProcess, FleetSlot
 from .processes.learner import LearnerPlan
 from .roles import ROLES
 
-IDLE, SELDOM = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before the flight
-BEAT_EVERY = REPORT_EVERY = 0.25  # [s]
+IDLE, IDLE_BEFORE_FLIGHT = 0.002, 0.05  # [s] between two reads of a bus, during a flight and before the flight
+HEARTBEAT_PERIOD = REPORT_PERIOD = 0.25  # [s]
 SILENCE = 5.0  # [s] without a status from the flight, after which the silence is reported
 STARTING, ATTEMPTS = 300.0, 5  # [s] for a learner to compile and send its first heartbeat; restarts per learner
 
@@ -46,7 +46,7 @@ class LearnerServer:
         Raises:
             ConfigError: The bus cannot be joined.
         """
-        self._network = address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=False, writes=INTO)
+        self._network = address.join(NETWORK_SIZES, listen=False, writes=INPUT_TOPICS)
         self._place = tempfile.TemporaryDirectory(prefix="retrim-ground-")
         self.folder = Path(self._place.name)
         self.address, self._fleet, self._trust = address, fleet, trust
@@ -95,7 +95,7 @@ class LearnerServer:
             assert self._bridge is not None
             assert self._bus is not None
             self.has_traffic = self._bridge.step() > 0
-            if time.monotonic() - self._last_beat > BEAT_EVERY:
+            if time.monotonic() - self._last_beat > HEARTBEAT_PERIOD:
                 self._last_beat = time.monotonic()
                 self._standing = self._beat()
             if end_note := last_note(self._bus, "ended"):
@@ -138,7 +138,9 @@ class LearnerServer:
         self._end()
         self._bus = SharedMemoryBus.create({**mission.capacities, **{beat_topic(x): 1024 for x in mission.layers}})
         topics = mission.capacities  # a controller without a residual has no topic for residual parameters
-        out, into = ([topic for topic in carried_topics if topic in topics] for carried_topics in (OUT, INTO))
+        out, into = (
+            [topic for topic in carried_topics if topic in topics] for carried_topics in (OUTPUT_TOPICS, INPUT_TOPICS)
+        )
         # The network still holds messages from the previous flight; its ticks, orders and reference do not apply here.
         before = {} if self._bridge is None else self._bridge.versions
         versions = {topic: before.get(topic, 0) for topic in out}
@@ -264,7 +266,7 @@ def learn_for(
         pool = stack.enter_context(ThreadPoolExecutor(len(grounds)))
         flights = {pool.submit(_serve, ground, stands, stop): ground for ground in grounds}
         try:
-            while (now := wait(flights, REPORT_EVERY)).not_done:
+            while (now := wait(flights, REPORT_PERIOD)).not_done:
                 for flight in now.done:  # report a failure immediately, since the other flights may last long
                     if (error := flight.exception()) is not None:
                         stands[flights[flight]] = f"failed: {error!r}"
@@ -281,7 +283,7 @@ def _serve(ground: LearnerServer, stands: dict[LearnerServer, str], stop: thread
     """Learn for one flight until it is over, and store its status in ``stands``."""
     for words in ground.wait():
         stands[ground] = words
-        if stop.wait(SELDOM):
+        if stop.wait(IDLE_BEFORE_FLIGHT):
             return
     for words in ground.learn():
         stands[ground] = words

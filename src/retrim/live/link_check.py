@@ -19,9 +19,9 @@ from ..plants.bridges.frames import heading_of
 from ..plants.bridges.vehicle_plant import VehiclePlant
 from ..plants.bridges.vehicle_state import VehicleState
 
-EVERY_S, SHOWN_S = 0.02, 0.5  # [s] between two states, and between two lines
-MOVED, TURNED = 0.1, 0.2  # [m/s] and [rad/s], smallest mean motion that can be compared
-AGREES = 0.8
+SAMPLE_PERIOD_S, REPORT_PERIOD_S = 0.02, 0.5  # [s] between two states, and between two lines
+LEAST_SPEED, LEAST_TURN = 0.1, 0.2  # [m/s] and [rad/s], smallest mean motion that can be compared
+LEAST_AGREEMENT = 0.8
 LENGTHS_S = 1.0, 3600.0  # [s], length of a check
 SMOOTH = 5  # states over which a difference is taken
 
@@ -50,13 +50,13 @@ def compare(states: Sequence[tuple[float, VehicleState]]) -> dict[str, float | N
     rows = [now for last, now in zip([None, *states], states, strict=False) if last is None or now[0] - last[0] > 1e-3]
     pairs = list(zip(rows, rows[SMOOTH:], strict=False))
     dt = np.array([[b[0] - a[0]] for a, b in pairs]).reshape(-1, 1)
-    moved = np.array([b[1].p - a[1].p for a, b in pairs]).reshape(-1, 3) / dt
-    turned = np.array([Rotation.from_matrix(a[1].R.T @ b[1].R).as_rotvec() for a, b in pairs]).reshape(-1, 3) / dt
+    velocities = np.array([b[1].p - a[1].p for a, b in pairs]).reshape(-1, 3) / dt
+    turn_rates = np.array([Rotation.from_matrix(a[1].R.T @ b[1].R).as_rotvec() for a, b in pairs]).reshape(-1, 3) / dt
     middle = [x for _, x in rows[SMOOTH // 2 : SMOOTH // 2 + len(pairs)]]
     v, omega = (np.array(each).reshape(-1, 3) for each in ([x.v for x in middle], [x.omega for x in middle]))
     return {
-        "velocity is the derivative of position": agreement(moved, v, MOVED),
-        "body rates are the derivative of attitude": agreement(turned, omega, TURNED),
+        "velocity is the derivative of position": agreement(velocities, v, LEAST_SPEED),
+        "body rates are the derivative of attitude": agreement(turn_rates, omega, LEAST_TURN),
     }
 
 
@@ -80,21 +80,24 @@ def verdicts(results: dict[str, float | None]) -> Iterable[tuple[str, bool]]:
         if value is None:
             yield f"{name}: not known, since there was too little motion", False
         else:
-            yield f"{name}: {100.0 * value:.0f} % agreement; at least {100.0 * AGREES:.0f} % are needed", value > AGREES
+            yield (
+                f"{name}: {100.0 * value:.0f} % agreement; at least {100.0 * LEAST_AGREEMENT:.0f} % are needed",
+                value > LEAST_AGREEMENT,
+            )
 
 
 def check(plant: VehiclePlant, seconds: float) -> bool:
     """Print the states of a link for some time, and return whether they agree with each other."""
     states: list[tuple[float, VehicleState]] = []
     plant.connect()
-    began = shown = time.monotonic()
+    began = last_report = time.monotonic()
     while (now := time.monotonic()) - began < seconds:
         x = plant.read()
         states.append((now - x.age, x))
-        if now - shown > SHOWN_S:
-            shown = now
+        if now - last_report > REPORT_PERIOD_S:
+            last_report = now
             print(line(x), flush=True)
-        plant.wait(now + EVERY_S)
+        plant.wait(now + SAMPLE_PERIOD_S)
     good = True
     for text, is_good in verdicts(compare(states)):
         good &= is_good

@@ -12,7 +12,7 @@ from .spec import LiveSpec
 from .topics import topics
 
 LOST = 2.0  # [s] without a message, after which learners count as lost
-PARTING = 5.0  # [s], time limit for the learners to confirm the end of the flight
+PARTING_TIME = 5.0  # [s], time limit for the learners to confirm the end of the flight
 
 
 class RemoteLearners:
@@ -66,7 +66,7 @@ class RemoteLearners:
         The learners run until they receive the note about the end of the flight.
         """
         base, began = self._spec.controller.base, time.monotonic()
-        while (waiting_time := time.monotonic() - began) < PARTING:
+        while (waiting_time := time.monotonic() - began) < PARTING_TIME:
             note = last_note(self._bus, "ground")
             if note.get("over") and note.get("base") == base:
                 return

@@ -43,7 +43,7 @@ LAYERS: tuple[Layer, ...] = ("residual", "policy")
 PATH_S = 20.0  # [s], duration of the reference path on the page
 WORLD_S = 60.0  # [s], flight time for which the page describes the disturbance
 STEP = 0.05  # [s] between two positions on the path
-BELOW_GROUND = 0.3  # [m], depth of the fence below z = 0: flights may start at z = 0, and transients go lower
+FENCE_DEPTH = 0.3  # [m], depth of the fence below z = 0: flights may start at z = 0, and transients go lower
 LONGEST = 3600.0  # [s], maximum duration of a flight
 
 
@@ -279,7 +279,7 @@ def _limits(request: LiveRequest) -> Limits:
         at = STEP * int(np.argmin(finite))
         raise ConfigError(f"task {setup.preset.task!r}: its reference is not finite at {at:g} s; no fence can hold it")
     low, high = places.min(0) - fence, places.max(0) + fence
-    low[2] = max(low[2], min(-BELOW_GROUND, float(places[:, 2].min()) - BELOW_GROUND))
+    low[2] = max(low[2], min(-FENCE_DEPTH, float(places[:, 2].min()) - FENCE_DEPTH))
     u_min, u_max = (as_numpy(u).astype(float) for u in (vehicle.command_min, vehicle.command_max))
     return Limits(low, high, u_min, u_max, policy_age=request.policy_age)
 

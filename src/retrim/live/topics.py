@@ -5,7 +5,7 @@ from ..onboard.topics import LAYERS, REFERENCE, SLOTS, slot
 from .roles import ROLES
 from .spec import LiveSpec
 
-SMALL = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground",
+SMALL_TOPICS = ("sample", "setpoint", "fallback", "order", "ended", "world", "knobs", "wish", "learning", "ground",
          "airborne", "followed", "identified", "refusals.page", "refusals.network")  # fmt: skip
 
 
@@ -17,7 +17,7 @@ def topics(spec: LiveSpec) -> dict[str, int]:
     state_size = spec.start.stat().st_size + 3 * half.get("policy", 0) + 200_000
     beating = [name for name, role in ROLES.items() if role.restarts]
     return (
-        dict.fromkeys(SMALL, 4096)
+        dict.fromkeys(SMALL_TOPICS, 4096)
         | {"status": 65536, "stalls": 16384, "flight": rows, "fallback.flight": rows}
         | {f"ready.{role}": 8192 for role in ROLES}
         | {f"beat.{role}": 1024 for role in ("supervisor", *beating)}

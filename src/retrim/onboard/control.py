@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import MessageError, PlantError
 from ..transport.bus import Bus
-from .guard import OVER, UP, Fallback, G, GeometricHover, Mode
+from .guard import FINAL_MODES, UP, Fallback, G, GeometricHover, Mode
 from .messages import ACCOUNTS, COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note, unpack_note
 from .parameter_receiver import ParameterReceiver
 from .pilot import LivePilot
@@ -20,7 +20,7 @@ from .timing_stats import blind_row
 REPORT_EVERY = 5  # ticks
 GAPS = 100  # number of gaps that are kept, the newest ones
 LANDING = "landing"
-BRIEF = PHASE / 4  # of a tick: longest duration of a decision that is rehearsed
+REHEARSAL_TIME = PHASE / 4  # of a tick: longest duration of a decision that is rehearsed
 SMOOTHING = 0.1  # weight of a tick in the running mean of the disturbance
 
 
@@ -96,8 +96,8 @@ class ControlLoop:
         u = self._policy(sample, t, age, new) if self.mode == Mode.POLICY else None
         if u is None:
             u, self.mode = self._fallback.step(sample.state, fresh, self._target, land=bool(self._landing))
-            self._command = u if self.mode in OVER else self.plan.limits.within(u)
-        over, blind = self.mode in OVER, self.mode == Mode.DROP
+            self._command = u if self.mode in FINAL_MODES else self.plan.limits.within(u)
+        over, blind = self.mode in FINAL_MODES, self.mode == Mode.DROP
         setpoint = Setpoint(stamp.tick, time.monotonic(), self._command, self._target, over, blind)
         if not setpoint.is_final:
             self.bus.publish("setpoint", setpoint.pack())
@@ -117,7 +117,11 @@ class ControlLoop:
 
     def rehearse(self) -> None:
         """Repeat the computation for the newest measurement to fill the processor's caches, and discard the result."""
-        if (sample := self.sample) is not None and self.mode == Mode.POLICY and self._usual < BRIEF * self.plan.dt:
+        if (
+            (sample := self.sample) is not None
+            and self.mode == Mode.POLICY
+            and self._usual < REHEARSAL_TIME * self.plan.dt
+        ):
             self.pilot.rehearse(sample.t - self._start, sample.age, sample.state)
             self.plan.limits.find_violation(Sample.unpack(sample.pack()).state)
 
@@ -136,7 +140,7 @@ class ControlLoop:
             self.intake.poll(t)
         self._ticks += 1
         has_end = self.bus.latest("ended") is not None and not self.new_sample()
-        self.over = self.mode in OVER or has_end
+        self.over = self.mode in FINAL_MODES or has_end
         if self.over:  # no later measurement will report the command that the plant accepted
             self._finish_row(None)
         self._publish_rows()  # on each tick, so the log contains the last tick whenever this process dies
@@ -152,7 +156,7 @@ class ControlLoop:
             "status", mode=self.mode.name.lower(), reason=self.reason, error=self.error, versions=self.pilot.versions,
             newest=intake.newest, given_up=intake.withdrawals, refused=intake.refusals, swaps=list(intake.swaps),
             missed=self.missed_ticks, gaps=list(self.gaps), late_samples=self.late_samples,
-            felt=self.disturbance.tolist(), estimate=self.estimate.tolist(),
+            disturbance=self.disturbance.tolist(), estimate=self.estimate.tolist(),
             target=self._target.tolist(), learning=self.intake.open,
             stages=list(self.stages),
         ))  # fmt: skip

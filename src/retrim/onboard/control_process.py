@@ -13,8 +13,8 @@ from .realtime import ParentWatch, be_punctual, sleep_until, wait_until
 from .tick_budget import PHASE, ROOM
 
 PATIENCE = ROOM  # of a tick: longest wait for a late sample; the plant then still waits for the answer
-ALONE = 5.0  # [s] without a heartbeat from the supervisor, which shares its cores with the learners
-AHEAD = 0.75 * PHASE  # of a tick, by which the process wakes up before a step is due
+SUPERVISOR_TIMEOUT = 5.0  # [s] without a heartbeat from the supervisor, which shares its cores with the learners
+LEAD = 0.75 * PHASE  # of a tick, by which the process wakes up before a step is due
 LATE = 0.5  # of a tick, after which a step is skipped
 
 
@@ -66,11 +66,11 @@ def fly(plan: ControlPlan) -> None:
     epoch = wait_for_take_off(bus, parent)
     if epoch is None:
         return
-    schedule, pulses = Schedule(epoch, plan.dt), Pulses(bus, silence=ALONE)
+    schedule, pulses = Schedule(epoch, plan.dt), Pulses(bus, silence=SUPERVISOR_TIMEOUT)
     pulses.expect("supervisor", within=float("inf"))  # a flight without heartbeats from a supervisor is allowed
     while not loop.over:
         due_time = schedule.next()
-        woke = _ready(loop, due_time, AHEAD * plan.dt)
+        woke = _ready(loop, due_time, LEAD * plan.dt)
         late = not loop.new_sample()
         while not loop.new_sample() and time.monotonic() < due_time + PATIENCE * plan.dt:
             time.sleep(2e-4)
@@ -80,7 +80,7 @@ def fly(plan: ControlPlan) -> None:
         if parent.has_ended():
             loop.land("the supervisor is gone")
         elif pulses.hanging(["supervisor"]):
-            loop.land(f"the supervisor hangs: it said nothing for {ALONE:g} s")
+            loop.land(f"the supervisor hangs: it said nothing for {SUPERVISOR_TIMEOUT:g} s")
         loop.idle()
         schedule.done(time.monotonic(), loop.stamp)
     time.sleep(2 * plan.dt)  # the plant reads the last command

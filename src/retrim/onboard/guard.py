@@ -9,7 +9,7 @@ G = 9.81  # [m/s^2]
 HOVER = np.array([G, 0.0, 0.0, 0.0])
 UP = np.array([0.0, 0.0, 1.0])
 DISTURBANCE_TAU = 0.2  # [s]
-BLIND_S = 2.0  # [s], after which the motors of a vehicle with an unknown state stop
+BLIND_LIMIT_S = 2.0  # [s], after which the motors of a vehicle with an unknown state stop
 
 
 class Mode(IntEnum):
@@ -29,7 +29,7 @@ class Mode(IntEnum):
     """The motors stop wherever the vehicle is, because its state has been unknown for too long."""
 
 
-OVER = Mode.LANDED, Mode.DROP
+FINAL_MODES = Mode.LANDED, Mode.DROP
 """Modes that end the flight; no command follows."""
 
 
@@ -169,7 +169,7 @@ class Fallback:
             self.place = target.copy()
         self.since += self.hover.dt
         self.blind_s = 0.0 if fresh else self.blind_s + self.hover.dt
-        if self.blind_s > BLIND_S:
+        if self.blind_s > BLIND_LIMIT_S:
             return np.zeros(4), Mode.DROP
         if self._down(x, fresh):
             return np.zeros(4), Mode.LANDED

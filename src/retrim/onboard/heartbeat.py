@@ -14,7 +14,7 @@ from ..errors import MessageError
 from ..transport.bus import Bus
 from .messages import pack_note
 
-EVERY = 0.1  # [s] between two heartbeats
+PERIOD = 0.1  # [s] between two heartbeats
 
 
 def beat_topic(role: str) -> str:
@@ -41,7 +41,7 @@ class Heart:
         now = self._clock()
         if now < self._next:
             return
-        self._count, self._next = self._count + 1, now + EVERY
+        self._count, self._next = self._count + 1, now + PERIOD
         with contextlib.suppress(MessageError):
             self._bus.publish(self._topic, pack_note(self._topic, count=self._count))
 
@@ -75,5 +75,5 @@ class Pacemaker:
             self._heart.beat()
 
     def _run(self) -> None:
-        while not self._over.wait(EVERY):
+        while not self._over.wait(PERIOD):
             self.beat()

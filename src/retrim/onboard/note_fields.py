@@ -8,7 +8,7 @@ from ..errors import MessageError
 
 Read = Callable[[Any], Any]
 """Function that checks and returns a JSON value, or raises ``ValueError`` with the requirement."""
-MANY, MOST, LONG = 2**53, 1e300, 1000
+LARGEST_INTEGER, LARGEST_NUMBER, LONGEST_TEXT = 2**53, 1e300, 1000
 """Limits of all readers: largest whole number, largest number, and maximum length of a text."""
 
 # Largest values of `Stage` and `Cause` in retrim.control.condition, which needs JAX; a test checks that they agree.
@@ -23,8 +23,8 @@ def format_value(value: Any) -> str:
 
 def plain(text: str) -> str:
     """Return a text with its control characters escaped and its length limited."""
-    printable = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[: LONG + 1])
-    return printable if len(printable) <= LONG else f"{printable[: LONG - 3]}..."
+    printable = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text[: LONGEST_TEXT + 1])
+    return printable if len(printable) <= LONGEST_TEXT else f"{printable[: LONGEST_TEXT - 3]}..."
 
 
 def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = True) -> Read:
@@ -35,14 +35,14 @@ def number(low: float = -math.inf, high: float = math.inf, *, finite: bool = Tru
             raise ValueError("a number")
         if isinstance(value, float) and not math.isfinite(value) and not finite:
             return value
-        if not max(low, -MOST) <= value <= min(high, MOST):
+        if not max(low, -LARGEST_NUMBER) <= value <= min(high, LARGEST_NUMBER):
             raise ValueError(f"a number from {low:g} to {high:g}")
         return float(value)
 
     return read
 
 
-def whole(low: int = 0, high: int = MANY) -> Read:
+def whole(low: int = 0, high: int = LARGEST_INTEGER) -> Read:
     """Return a reader of whole numbers in a range."""
 
     def read(value: Any) -> int:
@@ -128,7 +128,7 @@ FIELDS: Mapping[str, Mapping[str, Read]] = {
         **dict.fromkeys(("missed", "late_samples"), whole()),
         "stages": list_of(list_of(_time, whole(0, LAST_STAGE), whole(0, LAST_CAUSE))),
         **dict.fromkeys(("versions", "newest", "refused"), map_of(whole())),
-        **dict.fromkeys(("felt", "estimate", "target"), _vector),
+        **dict.fromkeys(("disturbance", "estimate", "target"), _vector),
         "error": _any,
         "given_up": list_of(whole()),
         "swaps": list_of(list_of(_any, text, whole(), _any)),

@@ -12,11 +12,11 @@ from ..transport.bus import Bus
 from .messages import Parameters, StaleError
 from .pilot import LivePilot
 from .rollback import RollbackMonitor
-from .topics import REFERENCE, UNLEARNED, VEHICLE
+from .topics import GIVEN_KINDS, REFERENCE, VEHICLE
 
-AHEAD = 1.0  # [s], how far the time stamp of parameters may lie in the future
-IN_TIME = 0.7  # [s], time limit to take a new reference, before it departs from the current one
-REMEMBERED = 50  # number of past swaps, rollbacks and policies that are kept
+CLOCK_TOLERANCE = 1.0  # [s], how far the time stamp of parameters may lie in the future
+REFERENCE_TIME_LIMIT = 0.7  # [s], time limit to take a new reference, before it departs from the current one
+HISTORY = 50  # number of past swaps, rollbacks and policies that are kept
 
 
 class ParameterReceiver:
@@ -35,7 +35,7 @@ class ParameterReceiver:
         self.refusals: dict[str, int] = {}
         self.withdrawals: list[int] = []
         self.newest = dict.fromkeys(pilot.versions, 0)
-        self.swaps: deque[list[Any]] = deque(maxlen=REMEMBERED)
+        self.swaps: deque[list[Any]] = deque(maxlen=HISTORY)
         self._bus, self._base = bus, base
         self._versions = dict.fromkeys(pilot.versions, 0)
         self._dt, self._trials, self._open = dt, RollbackMonitor(dt), True
@@ -64,7 +64,7 @@ class ParameterReceiver:
     def poll(self, t: float) -> None:
         """Read the parameters that have arrived by flight time ``t`` [s]; use valid ones and refuse the others."""
         for half in self._versions:
-            if half not in UNLEARNED and not self._open:
+            if half not in GIVEN_KINDS and not self._open:
                 continue
             message = self._bus.latest(f"parameters.{half}", self._versions[half])
             if message is None:
@@ -79,9 +79,9 @@ class ParameterReceiver:
             except MessageError:
                 self.refuse(half)
             else:
-                if result.computed_from > t + AHEAD:
+                if result.computed_from > t + CLOCK_TOLERANCE:
                     self.refuse(f"{half} of a time to come")
-                elif half == REFERENCE and t > result.computed_from + IN_TIME:
+                elif half == REFERENCE and t > result.computed_from + REFERENCE_TIME_LIMIT:
                     self.refuse("late reference")
                 else:
                     self._take(result, t)
@@ -97,7 +97,7 @@ class ParameterReceiver:
         if result.confirmed_version is not None:
             self.pilot.confirm(result.confirmed_version)
         if result.worse:
-            self.withdrawals = [*self.withdrawals, *self.pilot.back()][-REMEMBERED:]
+            self.withdrawals = [*self.withdrawals, *self.pilot.back()][-HISTORY:]
 
     def refuse(self, what: str) -> None:
         """Count a message that must not be used."""
@@ -118,6 +118,6 @@ class ParameterReceiver:
         self.swaps.append([t, parameters.half, parameters.version, t - parameters.computed_from])
         if parameters.half == "policy":
             self._data_times[parameters.version] = parameters.computed_from
-            for old in sorted(self._data_times)[1:-REMEMBERED]:
+            for old in sorted(self._data_times)[1:-HISTORY]:
                 del self._data_times[old]
             self._trials.start_trial(parameters.version)

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..compile.ops.program import Arrays, NumpyProgram, ProgramSource
 from .messages import STATE, Parameters
-from .topics import UNLEARNED, VEHICLE
+from .topics import GIVEN_KINDS, VEHICLE
 
-GROWING = 0.4  # [s], time during which the pace of a clock changes, as in retrim.tasks.paced_reference
+PACE_CHANGE_TIME = 0.4  # [s], time during which the pace of a clock changes, as in retrim.tasks.paced_reference
 BLEND = 5  # ticks over which the pilot fades out a jump in the command at a swap
 
 
@@ -72,7 +72,7 @@ class LivePilot:
         """
         begin, phase, pace, growth = self._clock
         tau = t - begin
-        growing = min(tau, GROWING)
+        growing = min(tau, PACE_CHANGE_TIME)
         return phase + pace * (tau + growth * growing * (tau - 0.5 * growing))
 
     def target(self, t: float) -> np.ndarray:
@@ -136,10 +136,10 @@ class LivePilot:
     def restart(self) -> None:
         """Use the learned parameters from take-off again, starting with the next tick."""
         self._backup = self._parameters, self.versions, self._policies
-        reference = {half: leaves for half, leaves in self._parameters.items() if half in UNLEARNED}
+        reference = {half: leaves for half, leaves in self._parameters.items() if half in GIVEN_KINDS}
         first = {half: list(arrays.values()) for half, arrays in self._source.parameters.items()}
         self._parameters = first | reference
-        self.versions = {half: self.versions[half] if half in UNLEARNED else 0 for half in first}
+        self.versions = {half: self.versions[half] if half in GIVEN_KINDS else 0 for half in first}
         self._policies = {0: self._parameters["policy"]}
         self._change()
 
@@ -147,8 +147,8 @@ class LivePilot:
         """Use the learned parameters from before :meth:`restart` again."""
         if self._backup is not None:
             (parameters, versions, self._policies), self._backup = self._backup, None
-            self._parameters |= {half: leaves for half, leaves in parameters.items() if half not in UNLEARNED}
-            self.versions |= {half: version for half, version in versions.items() if half not in UNLEARNED}
+            self._parameters |= {half: leaves for half, leaves in parameters.items() if half not in GIVEN_KINDS}
+            self.versions |= {half: version for half, version in versions.items() if half not in GIVEN_KINDS}
             self._change()
 
     def expected(self, half: str) -> Mapping[str, Any]:

@@ -8,7 +8,7 @@ import select
 import time
 
 LOCK_NOW_AND_LATER = 3  # MCL_CURRENT | MCL_FUTURE
-LATER = 2e-5  # [s]
+TIMER_SLACK = 2e-5  # [s]
 
 
 def be_punctual(priority: int, cores: set[int]) -> list[str]:
@@ -65,7 +65,7 @@ def cores_of(role: str, available: set[int] | None = None) -> set[int]:
 
 def sleep_until(instant: float) -> None:
     """Sleep until ``instant`` on the monotonic clock [s]; return immediately if the instant has passed."""
-    while (left := instant - time.monotonic()) > LATER:
+    while (left := instant - time.monotonic()) > TIMER_SLACK:
         time.sleep(left)
 
 

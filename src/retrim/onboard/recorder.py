@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .guard import OVER, Mode
+from .guard import FINAL_MODES, Mode
 from .heartbeat import Heart
 from .log_file import HEADER, LogFile, log_path
 from .messages import ACCOUNTS, COLUMNS, FlightRows, last_note, pack_note
@@ -23,7 +23,7 @@ from .realtime import ParentWatch
 from .timing_stats import is_from_control
 
 SILENCE = 2.0  # [s] without a tick, after which a flight without a supervisor is over
-ENDS = tuple(mode.name.lower() for mode in OVER)
+ENDS = tuple(mode.name.lower() for mode in FINAL_MODES)
 LINGER = 5  # ticks after the end of a flight, during which control and the watchdog may report their last ticks
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import MessageError
 from ..transport.bus import Bus
 from ..transport.shared_memory import SharedMemoryBus
-from .guard import OVER, Fallback, GeometricHover, Limits, Mode
+from .guard import FINAL_MODES, Fallback, GeometricHover, Limits, Mode
 from .heartbeat import Heart
 from .messages import COMMAND, FlightRows, Sample, Setpoint, Stamp, pack_note
 from .realtime import ParentWatch, be_punctual
@@ -77,7 +77,7 @@ class Watchdog:
         self._next = now + 1.5 * self.plan.dt  # latest time, in case no sample arrives
         fresh = self._sample.age + now - self._sample.send_time <= self.plan.limits.state_age
         u, mode = self._fallback.step(self._sample.state, fresh, self._target, land=False)
-        self.done = mode in OVER
+        self.done = mode in FINAL_MODES
         setpoint = Setpoint(self._stamp.tick, now, u, self._target, self.done, mode == Mode.DROP)
         self.bus.publish("fallback", setpoint.pack())
         if mode in (Mode.BLIND, Mode.DROP) and not new:

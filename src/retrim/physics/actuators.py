@@ -12,7 +12,7 @@ from .actuator_response import ActuatorResponse, ActuatorState
 from .dynamics import AbstractDynamics, AbstractWrapper
 from .state import Command, State
 
-AT_LIMIT = 0.05  # a command within this share of the range from a limit counts as being at the limit
+LIMIT_SHARE = 0.05  # a command within this share of the range from a limit counts as being at the limit
 
 X = TypeVar("X")
 U = TypeVar("U")
@@ -59,7 +59,7 @@ def is_unsaturated(u: Command, limits: tuple[Command, Command]) -> Bool[Array, "
         limits: Smallest and largest command.
     """
     low, high, command = (jnp.concatenate([each.c[None], each.omega]) for each in (*limits, u))
-    inside = jnp.abs(command - 0.5 * (low + high)) < (0.5 - AT_LIMIT) * (high - low)
+    inside = jnp.abs(command - 0.5 * (low + high)) < (0.5 - LIMIT_SHARE) * (high - low)
     return jnp.all(inside)
 
 

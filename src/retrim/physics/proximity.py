@@ -19,7 +19,7 @@ from .state import State
 from .substep import hub_places
 from .vehicle import Vehicle, small
 
-BELOW = 0.03  # [m], distance from the plane of the rotors to the lowest point of a vehicle
+LANDING_GEAR = 0.03  # [m], distance from the plane of the rotors to the lowest point of a vehicle
 NEAREST = 0.5  # smallest distance at which the models are evaluated [rotor radii]
 
 
@@ -76,7 +76,7 @@ class TableEdge(eqx.Module):
     def clearance(self, x: State) -> Float[Array, ""]:
         """Return the distance from the lowest point of the vehicle to the surface below its centre [m]."""
         height = jnp.where(x.p[0] > self.edge, self.top, 0.0)
-        return x.p[2] - BELOW - height
+        return x.p[2] - LANDING_GEAR - height
 
 
 class Ceiling(eqx.Module):

@@ -74,7 +74,7 @@ class SlungLoad(eqx.Module):
     def __call__(self, t: Float[Array, ""], x: State) -> ExternalEffects:
         """Return the push of a load that hangs at rest while it is attached."""
         down = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=x.p.dtype)
-        return ExternalEffects.of(x.p.dtype, push=self._attached(t, x.p.dtype) * self.share.astype(x.p.dtype) * down)
+        return ExternalEffects.of(x.p.dtype, push=self._attachment(t, x.p.dtype) * self.share.astype(x.p.dtype) * down)
 
     def init(self, x: State) -> LoadState:
         """Return the load below the vehicle, in equilibrium if the flight starts with it."""
@@ -99,7 +99,7 @@ class SlungLoad(eqx.Module):
         )
         s = where(is_held, at_hand, s)
         middle = State(x.p + 0.5 * h * x.v, x.R, x.v)
-        pull = self._attached(t, dtype) * self.tension(LoadState(s.p + 0.5 * h * s.v, s.v), middle)
+        pull = self._attachment(t, dtype) * self.tension(LoadState(s.p + 0.5 * h * s.v, s.v), middle)
         a = jnp.array([0.0, 0.0, -STANDARD_GRAVITY], dtype=dtype) - pull * direction(s, x, 0.5 * h)
         after = LoadState(s.p + h * s.v + 0.5 * h**2 * a, s.v + h * a)
         push = self.share.astype(dtype) * pull * direction(s, x, 0.5 * h)
@@ -113,7 +113,7 @@ class SlungLoad(eqx.Module):
         pull = (STIFFNESS**2 * stretch + 2.0 * DAMPING * STIFFNESS * rate) / (1.0 + self.share.astype(x.p.dtype))
         return jnp.where(stretch > 0.0, jnp.maximum(pull, 0.0), 0.0)
 
-    def _attached(self, t: Float[Array, ""], dtype: jnp.dtype) -> Float[Array, ""]:
+    def _attachment(self, t: Float[Array, ""], dtype: jnp.dtype) -> Float[Array, ""]:
         return jnp.where((t >= self.picked) & (t < self.dropped), 1.0, 0.0).astype(dtype)
 
 

@@ -53,8 +53,8 @@ class State(eqx.Module):
             return super().__repr__()
         R = self.R.tolist()
         angles = math.atan2(R[2][1], R[2][2]), math.asin(min(1.0, max(-1.0, -R[2][0]))), math.atan2(R[1][0], R[0][0])
-        roll_pitch_yaw = _rounded(map(math.degrees, angles), 1)
-        p, v = (_rounded(vector.tolist(), 3) for vector in (self.p, self.v))
+        roll_pitch_yaw = _round_text(map(math.degrees, angles), 1)
+        p, v = (_round_text(vector.tolist(), 3) for vector in (self.p, self.v))
         return f"State(p={p} m, v={v} m/s, roll_pitch_yaw={roll_pitch_yaw} deg)"
 
 
@@ -90,7 +90,7 @@ class Command(eqx.Module):
         """Return the rounded numbers of one command; the shapes of a batch and of traced arrays."""
         if not _has_numbers(self.c, ()) or not _has_numbers(self.omega, (3,)):
             return super().__repr__()
-        return f"Command(c={self.c.tolist():z.3f} m/s^2, omega={_rounded(self.omega.tolist(), 3)} rad/s)"
+        return f"Command(c={self.c.tolist():z.3f} m/s^2, omega={_round_text(self.omega.tolist(), 3)} rad/s)"
 
     def within(self, low: "Command", high: "Command") -> "Command":
         """Return the command clipped to limits, entry by entry, in the command's own precision."""
@@ -111,5 +111,5 @@ def _has_numbers(leaf: Any, shape: tuple[int, ...]) -> bool:
     return hasattr(leaf, "tolist") and not isinstance(leaf, jax.core.Tracer) and leaf.shape == shape
 
 
-def _rounded(values: Iterable[float], digits: int) -> str:
+def _round_text(values: Iterable[float], digits: int) -> str:
     return "[" + ", ".join(f"{value:z.{digits}f}" for value in values) + "]"

@@ -82,7 +82,7 @@ class Simulation(eqx.Module):
         """Age of measurements [s]."""
         return 0.0 if self.sensors is None else self.sensors.age
 
-    def undisturbed(self) -> "Simulation":
+    def without_disturbances(self) -> "Simulation":
         """Return a copy without those parts of the disturbance that have no state; a launch does not need them."""
         parts = stateful_parts(self.disturbance)
         return dataclasses.replace(self, disturbance=SumOfDisturbances(parts) if parts else _calm)
@@ -91,7 +91,7 @@ class Simulation(eqx.Module):
         """Return the state of a plant that hovers at ``x0``, with queued hover commands and one sample of ``x0``."""
         queue = CommandQueue.of(Command.hover(x0.p.dtype), self.model.dt, longest=self.longest_delay)
         samples = x0 if self.sensors is None else self.sensors.init(x0, random.fold_in(self.key, FIRST_SAMPLE))
-        sample = self._measured(samples)
+        sample = self._measure(samples)
         reports = None
         if self.fault is not None:
             rows = self.fault.memory + 1
@@ -130,13 +130,13 @@ class Simulation(eqx.Module):
         reports = self._reports(s.reports, samples, jnp.asarray(tick) + 1)
         return SimState(inner, queue, samples, a, reports, outer)
 
-    def _measured(self, samples: Any) -> State:
+    def _measure(self, samples: Any) -> State:
         return samples if self.sensors is None else self.sensors.state(samples)
 
     def _reports(self, before: Reports | None, samples: Any, tick: Int[Array, ""]) -> Reports | None:
         if before is None or self.fault is None:
             return None
-        new_state = self._measured(samples)
+        new_state = self._measure(samples)
         past = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), before.past, new_state)
         key = random.fold_in(random.fold_in(self.key, tick), FAULT)
         return Reports(past, self.fault(past, tick, key))
@@ -152,7 +152,7 @@ class Simulation(eqx.Module):
         """Return the newest sample that has arrived, as the measurement system reports it."""
         if s.reports is not None:
             return s.reports.reported
-        return self._measured(s.samples)
+        return self._measure(s.samples)
 
     def inertial(self, s: SimState, tick: Int[ArrayLike, ""]) -> tuple[Float[Array, "3"], Float[Array, "3"]] | None:
         """Return the measured body rates [rad/s] and world acceleration [m/s^2]; None for a model without body rates.
@@ -228,7 +228,7 @@ class SimPlant(Plant):
     def reset(self, x0: State | None) -> Measurement:
         """Start hovering at ``x0``, or 1 m above the ground if ``x0`` is None."""
         start = State.at(jnp.array([0.0, 0.0, 1.0])) if x0 is None else x0
-        self._state = _launch(self.simulation.undisturbed(), start)  # one compilation for all disturbances
+        self._state = _launch(self.simulation.without_disturbances(), start)  # one compilation for all disturbances
         self._ticks = 0
         return self._measurement()
 
@@ -267,9 +267,9 @@ class SimPlant(Plant):
         if simulation.sensors is None:
             x = simulation.measure(state)
             return Measurement(t, x, rates, state.a, speeds, truth=truth)
-        omega, a = (
-            (None, state.a) if rates is None else _inertial(simulation.undisturbed(), state, np.int32(self._ticks))
-        )
+        omega, a = None, state.a
+        if rates is not None:
+            omega, a = _inertial(simulation.without_disturbances(), state, np.int32(self._ticks))
         return Measurement(t, simulation.measure(state), omega, a, speeds, age=simulation.age, truth=truth)
 
     def stop(self) -> None:

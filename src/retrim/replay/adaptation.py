@@ -22,8 +22,8 @@ from ..runkit.reporter import Reporter
 from ..runkit.training import model_error
 from .predictors import refit
 
-SETTLED = 5  # consecutive refused updates after which no further improvement is expected
-ENOUGH = 0.5  # share of a window that must be valid
+PATIENCE = 5  # consecutive refused updates after which no further improvement is expected
+LEAST_VALID = 0.5  # share of a window that must be valid
 
 
 class AdaptationResult(NamedTuple):
@@ -72,7 +72,7 @@ def adapt_to(
             if bool(verdict.admitted):
                 policy_state, admissions, refusals = candidate, admissions + 1, 0
             advance(attempts / updates, verdict.reason())
-            if refusals == SETTLED:
+            if refusals == PATIENCE:
                 break
         advance(1.0, f"{admissions} of {attempts} updates were better")
     residual_model = FittedResidual(learner.residual_model, residual)
@@ -86,7 +86,7 @@ def _fit(rows: Targets, setup: Setup, state: Any) -> Any:
     last_fit = 0
     for last in range(a.window, rows.valid.shape[0] + 1, max(1, round(a.fit_every / dt))):
         part: Targets = jax.tree.map(lambda leaf, last=last: leaf[last - a.window : last], rows)
-        if float(np.mean(part.valid)) < ENOUGH:
+        if float(np.mean(part.valid)) < LEAST_VALID:
             continue
         new = refit(setup.learner.residual_model, state, part)
         if bool(all_finite(new)):

@@ -14,17 +14,17 @@ from ..errors import LogError
 from ..estimation.command_path.response import damping_of
 from ..io.logs import BodyLog
 from ..physics.state import STANDARD_GRAVITY
-from .identification import INSIDE, Estimate, IdentifiedVehicle
+from .identification import PERCENTILES, Estimate, IdentifiedVehicle
 from .response_fit import Fit, Path, Products, fit_response, respond
 
 BLOCK, DRAWS = 1.0, 60  # length of a block [s], and number of bootstrap samples
-FEWEST = 8  # smallest number of blocks
-WARM = 0.3  # [s], at the beginning of a piece of flight, where the response depends on commands before the piece
+LEAST_BLOCKS = 8  # smallest number of blocks
+WARM_UP = 0.3  # [s], at the beginning of a piece of flight, where the response depends on commands before the piece
 POOL = 0.05  # [s]: time over which measurements are averaged to find whether commands explain them
-EXPLAINED = 0.6  # least share of the changes that commands must explain
+LEAST_EXPLANATION = 0.6  # least share of the changes that commands must explain
 TWO_EQUAL_POLES = 1.0 / 3.0  # shape of critical damping
-RINGS = 0.05  # smallest shape of a response that is not of first order
-WIDE = 0.5  # a value whose interval is wider than this share of it is not determined
+LEAST_RINGING = 0.05  # smallest shape of a response that is not of first order
+WIDEST_INTERVAL = 0.5  # a value whose interval is wider than this share of it is not determined
 
 
 @dataclass(frozen=True)
@@ -66,23 +66,25 @@ def identify_body(log: BodyLog, *, seed: int = 0) -> BodyIdentification:
         LogError: The flight is too short.
     """
     blocks = _blocks(log)
-    if len(blocks) < FEWEST:
+    if len(blocks) < LEAST_BLOCKS:
         raise LogError(
-            f"{len(blocks) * BLOCK:g} s of flight in one piece are left; identification needs {FEWEST * BLOCK:g} s at "
-            f"least"
+            f"{len(blocks) * BLOCK:g} s of flight in one piece are left; identification needs at least "
+            f"{LEAST_BLOCKS * BLOCK:g} s"
         )
     ones, channels = np.ones(len(blocks)), dict[str, _Channel]()
     if log.command is not None:
         level = _rates(log, log.command, blocks, [0, 1], None)
-        if level.best.path.ringing < RINGS:
-            best = fit_response(level.products.weighted(ones), log.dt, start=level.best, shaped=False)
+        if level.best.path.ringing < LEAST_RINGING:
+            best = fit_response(level.products.weigh(ones), log.dt, start=level.best, shaped=False)
             level = level._replace(best=best)
         channels["rates"] = level
         channels["yaw"] = _rates(log, log.command, blocks, [2], level.best.path)
     if log.specific_force is not None:
         channels["thrust"] = _thrust(log, log.specific_force, blocks)
     explained = {name: each.explained for name, each in channels.items()}
-    channels = {name: each for name, each in channels.items() if each.explained > EXPLAINED and each.best.gain > 0.0}
+    channels = {
+        name: each for name, each in channels.items() if each.explained > LEAST_EXPLANATION and each.best.gain > 0.0
+    }
     rng = np.random.default_rng(seed)
     draws = [rng.integers(0, len(blocks), len(blocks)) for _ in range(DRAWS)]
     fits = {name: [each.best] for name, each in channels.items()}
@@ -93,7 +95,7 @@ def identify_body(log: BodyLog, *, seed: int = 0) -> BodyIdentification:
             each = channels[name]
             shaped = name == "rates" and each.best.path.ringing > 0.0
             fixed = level_path if name == "yaw" else None
-            fit = fit_response(each.products.weighted(count), log.dt, start=each.best, fixed=fixed, shaped=shaped)
+            fit = fit_response(each.products.weigh(count), log.dt, start=each.best, fixed=fixed, shaped=shaped)
             level_path = fit.path if name == "rates" else level_path
             fits[name].append(fit)
     return _result(log, fits, explained)
@@ -101,7 +103,7 @@ def identify_body(log: BodyLog, *, seed: int = 0) -> BodyIdentification:
 
 def _result(log: BodyLog, fits: dict[str, list[Fit]], explained: dict[str, float]) -> BodyIdentification:
     def of(values: list[float]) -> Estimate:
-        return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], INSIDE)))
+        return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], PERCENTILES)))
 
     def gain_and_lag(name: str) -> tuple[Estimate | None, Estimate | None]:
         if name not in fits:
@@ -131,13 +133,13 @@ def _result(log: BodyLog, fits: dict[str, list[Fit]], explained: dict[str, float
 
 def _ends(ringing: list[float]) -> tuple[float, float, float]:
     """Return the shapes of the smallest, the best and the largest damping."""
-    low, high = np.percentile(ringing[1:], INSIDE)
+    low, high = np.percentile(ringing[1:], PERCENTILES)
     return max(float(high), 1e-3), max(ringing[0], 1e-3), max(float(low), 1e-3)
 
 
 def _certain(each: Estimate) -> Estimate | None:
     """Return an estimate, or None if its interval is wide."""
-    return each if each.value > 0.0 and each.high - each.low < WIDE * each.value else None
+    return each if each.value > 0.0 and each.high - each.low < WIDEST_INTERVAL * each.value else None
 
 
 def _hover(full: float, curve: float) -> float:
@@ -150,9 +152,9 @@ def _hover(full: float, curve: float) -> float:
 
 def _rates(log: BodyLog, command: np.ndarray, blocks: np.ndarray, axes: list[int], fixed: Path | None) -> _Channel:
     products = Products.of([command[:, axes]], log.rates[:, axes], blocks, log.dt, bias=True)
-    best = fit_response(products.weighted(np.ones(len(blocks))), log.dt, fixed=fixed)
+    best = fit_response(products.weigh(np.ones(len(blocks))), log.dt, fixed=fixed)
     predicted = best.gain * respond(command[:, axes], log.dt, best.path)
-    return _Channel(products, best, _explained(log.rates[:, axes], predicted, blocks, log.dt))
+    return _Channel(products, best, _explanation(log.rates[:, axes], predicted, blocks, log.dt))
 
 
 def _thrust(log: BodyLog, force: np.ndarray, blocks: np.ndarray) -> _Channel:
@@ -166,13 +168,13 @@ def _thrust(log: BodyLog, force: np.ndarray, blocks: np.ndarray) -> _Channel:
     else:
         inputs = [((1.0 - log.curve) * linear + log.curve * square)[:, None]]
     products = Products.of(inputs, force[:, 2:], blocks, log.dt, bias=False)
-    best = fit_response(products.weighted(np.ones(len(blocks))), log.dt, shaped=False)
+    best = fit_response(products.weigh(np.ones(len(blocks))), log.dt, shaped=False)
     e = best.curve if log.curve is None else log.curve
     predicted = best.gain * respond((1.0 - e) * linear + e * square, log.dt, best.path)
-    return _Channel(products, best, _explained(force[:, 2:], predicted[:, None], blocks, log.dt))
+    return _Channel(products, best, _explanation(force[:, 2:], predicted[:, None], blocks, log.dt))
 
 
-def _explained(y: np.ndarray, predicted: np.ndarray, blocks: np.ndarray, dt: float) -> float:
+def _explanation(y: np.ndarray, predicted: np.ndarray, blocks: np.ndarray, dt: float) -> float:
     """Return the share of the changes of means over a short time that a prediction explains."""
     pool = max(1, round(POOL / dt))
     rows = blocks[:, : blocks.shape[1] - blocks.shape[1] % pool]
@@ -184,10 +186,10 @@ def _explained(y: np.ndarray, predicted: np.ndarray, blocks: np.ndarray, dt: flo
 
 def _blocks(log: BodyLog) -> np.ndarray:
     """Return the ticks of each complete block: one second of flight after a settling time."""
-    size, warm = max(1, round(BLOCK / log.dt)), round(WARM / log.dt)
-    settled = np.convolve(log.valid, np.ones(warm + 1), mode="full")[: len(log.valid)] > warm
+    size, warm = max(1, round(BLOCK / log.dt)), round(WARM_UP / log.dt)
+    is_settled = np.convolve(log.valid, np.ones(warm + 1), mode="full")[: len(log.valid)] > warm
     result, run = list[np.ndarray](), 0
-    for k, fine in enumerate(settled):
+    for k, fine in enumerate(is_settled):
         run = run + 1 if fine else 0
         if run == size:
             result.append(np.arange(k - size + 1, k + 1))

@@ -7,7 +7,7 @@ import numpy as np
 
 DELAYS = np.arange(0.0, 0.1601, 0.005)  # grid of delays [s]
 LAGS = np.concatenate([[0.0], np.geomspace(0.005, 1.0, 33)])  # grid of lags [s]
-EXPLAINED = 0.6  # share that the commands must explain; see Channel.told
+LEAST_EXPLANATION = 0.6  # least share of the changes that the commands must explain
 POOLS = (1, 5)  # numbers of rows to average
 PIECES = 3.0  # minimum number of blocks that contribute to the explained share
 
@@ -116,7 +116,7 @@ class Channel(NamedTuple):
         before, after = self.still.left(), self.sums.left()
         gain = np.clip(before - after, 0.0, None)
         pieces = gain.sum() ** 2 / max(float(np.sum(gain**2)), 1e-12)
-        return bool(1.0 - after.sum() / max(float(before.sum()), 1e-12) > EXPLAINED and pieces > PIECES)
+        return bool(1.0 - after.sum() / max(float(before.sum()), 1e-12) > LEAST_EXPLANATION and pieces > PIECES)
 
 
 def lowest(grid: np.ndarray, misfit: np.ndarray, k: int) -> float:

@@ -21,9 +21,9 @@ from .path_of_log import path_of_log
 from .rows import acting_commands
 
 BLOCK, DRAWS = 2.0, 200  # length of a block [s], and number of bootstrap samples
-INSIDE = (5.0, 95.0)  # percentiles at the ends of an interval
-WARM = 0.3  # [s], at the beginning of a piece of flight, where a lag depends on commands before the piece
-SLOW = 0.3  # [m/s], root-mean-square velocity along an axis below which drag is not observable
+PERCENTILES = (5.0, 95.0)  # percentiles at the ends of an interval
+WARM_UP = 0.3  # [s], at the beginning of a piece of flight, where a lag depends on commands before the piece
+LEAST_SPEED = 0.3  # [m/s], root-mean-square velocity along an axis below which drag is not observable
 
 
 class Estimate(NamedTuple):
@@ -102,11 +102,12 @@ def identify(log: FlightLog, *, seed: int = 0) -> IdentifiedVehicle:
 
     def of(name: str, is_known: bool) -> Estimate | None:
         values = [each[name] for each in solutions] if is_known else []
-        return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], INSIDE))) if is_known else None
+        return Estimate(values[0], *(float(q) for q in np.percentile(values[1:], PERCENTILES))) if is_known else None
 
     speeds = np.sqrt(np.mean(np.einsum("nji,nj->ni", log.R, log.v)[log.valid] ** 2, axis=0))
     x, y, z = (
-        of(f"drag {axis}", bool(channels) and bool(fast > SLOW)) for axis, fast in zip("xyz", speeds, strict=True)
+        of(f"drag {axis}", bool(channels) and bool(fast > LEAST_SPEED))
+        for axis, fast in zip("xyz", speeds, strict=True)
     )
     lift, turn, yaw = (name in channels for name in ("thrust", "rates", "yaw"))
     vehicle = IdentifiedVehicle(
@@ -163,7 +164,7 @@ def _solve(channels: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> d
 
 def _blocks(log: FlightLog) -> np.ndarray:
     """Return the ticks of each complete block: two seconds of flight after a settling time."""
-    size, warm = 10 * max(1, round(0.1 * BLOCK / log.dt)), round(WARM / log.dt)
+    size, warm = 10 * max(1, round(0.1 * BLOCK / log.dt)), round(WARM_UP / log.dt)
     good = log.valid[:-1] & log.valid[1:]
     has_settled = np.convolve(good, np.ones(warm + 1), mode="full")[: len(good)] > warm
     result, run = [], 0

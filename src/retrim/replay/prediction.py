@@ -10,8 +10,8 @@ from ..errors import LogError
 from ..learn.residuals.targets import Targets
 from .predictors import Predictor
 
-EVERY = 3.0  # time between fits [s], as in the paper
-ENOUGH = 0.5  # share of a buffer or a horizon that must be valid
+FIT_PERIOD = 3.0  # time between fits [s], as in the paper
+LEAST_VALID = 0.5  # share of a buffer or a horizon that must be valid
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Protocol:
     """Length of the fitted window [s]."""
     horizon: float = 5.0
     """Length of the predicted window [s]."""
-    every: float = EVERY
+    every: float = FIT_PERIOD
     """Time between fits [s]."""
 
     def windows(self, valid: np.ndarray, dt: float) -> list[tuple[int, int, int]]:
@@ -50,7 +50,7 @@ class Protocol:
         result = []
         for now in range(buffer, len(valid) - horizon + 1, every):
             before, after = valid[now - buffer : now], valid[now : now + horizon]
-            if before.mean() >= ENOUGH and after.mean() >= ENOUGH:
+            if before.mean() >= LEAST_VALID and after.mean() >= LEAST_VALID:
                 result.append((now - buffer, now, now + horizon))
         if not result:
             raise LogError(

@@ -22,7 +22,7 @@ Predict = Callable[[Targets], np.ndarray]
 Predictor = Callable[[Targets], Predict]
 """Fits to the rows of the last few seconds, in order of time; returns a predictor for further rows [m/s^2]."""
 RIDGE = 10.0  # penalty, added to the sums of squares
-STEEP = 3.0  # thrust [m/s^2] that corresponds to one unit of the regression input
+THRUST_UNIT = 3.0  # thrust [m/s^2] that corresponds to one unit of the regression input
 
 
 def zero(rows: Targets) -> Predict:
@@ -50,7 +50,7 @@ def ridge(rows: Targets) -> Predict:
 
 def _inputs(rows: Targets) -> np.ndarray:
     n = rows.valid.shape[0]
-    thrust = (np.asarray(rows.u.c)[:, None] - STANDARD_GRAVITY) / STEEP
+    thrust = (np.asarray(rows.u.c)[:, None] - STANDARD_GRAVITY) / THRUST_UNIT
     columns = [rows.x.v, np.asarray(rows.x.R).reshape(n, 9), thrust, rows.u.omega]
     return np.concatenate([np.asarray(column, dtype=float) for column in columns], axis=1)
 

@@ -33,9 +33,9 @@ from .vehicle import vehicle_toml
 REPORT_MODELS = ("regression", "ensemble", "linear")  # residual models to compare with the baselines
 ENSEMBLE_RATE = 1e-3  # learning rate; with that of hover/paper, an ensemble fits the noise in a real log
 DEFAULT = "hover/retrim"
-UNSTATED = "values that the log does not determine are those of the vehicle in --vehicle"
+VEHICLE_NOTE = "values that the log does not determine are those of the vehicle in --vehicle"
 SAMPLES = (12, 100_000)  # limits for the number of samples in a fit; the command delay is added to the minimum
-SLOWEST = 0.1  # [s]: the longest tick of a preset; a log's tick may differ slightly
+LONGEST_TICK = 0.1  # [s]: the longest tick of a preset; a log's tick may differ slightly
 LOST = 0.5  # [m]: above this error, the corrected model no longer describes the flight
 SPANS = {"buffer": (0.2, 600.0), "horizon": (0.1, 600.0), "delay": (0.0, 1.0), "lag": (0.0, 5.0)}  # limits [s]
 
@@ -118,7 +118,7 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
     chosen_map = None if request.map is None else read_map(request.map)
     log = read_log(path, chosen_map, dt=preset.dt, flight=request.flight)
     if request.identify and request.vehicle is None and request.policy is None:
-        reporter.say(f"{UNSTATED}, which is not stated: {name_of(setup.preset.vehicle)!r}")
+        reporter.say(f"{VEHICLE_NOTE}, which is not stated: {name_of(setup.preset.vehicle)!r}")
     if isinstance(log, BodyLog):
         return replay_body(log, path, setup, run, reporter, identify=request.identify, seed=request.seed,
                            adapt=request.adapt)  # fmt: skip
@@ -163,7 +163,7 @@ def _score_predictions(
     result = list[PredictionScore]()
     home = np.mean(log.p[log.valid], axis=0)
     goal = tuple(float(x) for x in home)
-    preset = changed(setup.preset, goal=goal, dt=min(max(0.001, round(log.dt, 3)), SLOWEST))
+    preset = changed(setup.preset, goal=goal, dt=min(max(0.001, round(log.dt, 3)), LONGEST_TICK))
     adapt: dict[str, Any] = {"window": round(protocol.buffer / log.dt), "fit_every": protocol.every}
     names = dict.fromkeys([*REPORT_MODELS, *([request.residual] if request.residual else [])])
     predictors = yardsticks(log.dt)

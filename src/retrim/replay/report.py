@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..io.logs import BodyLog, FlightLog
-from ..io.logs.plausibility import DOUBTFUL
+from ..io.logs.plausibility import DOUBT_LIMITS
 from ..learn.residuals.targets import Targets
 from ..runkit.document import TableSection
 from .identification import Estimate, IdentifiedVehicle
@@ -34,7 +34,7 @@ def warning_of(log: FlightLog | BodyLog) -> str:
 def agreement_section(log: FlightLog | BodyLog) -> TableSection:
     """Return a table of the agreement between a log's quantities."""
     lines = tuple(
-        (WORDS[name], f"{round(100 * score)} %", f"{round(100 * DOUBTFUL[name])} %")
+        (WORDS[name], f"{round(100 * score)} %", f"{round(100 * DOUBT_LIMITS[name])} %")
         for name, score in log.agreement.items()
     )
     about = warning_of(log) or (

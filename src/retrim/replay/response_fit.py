@@ -13,7 +13,7 @@ import numpy as np
 from ..estimation.command_path.history import ages
 from ..estimation.command_path.prior import LAGS, LONGEST_DELAY, MOST_RINGING
 
-SHARED = 1e-6  # [s]: two poles with equal time constants are moved apart by this
+POLE_SEPARATION = 1e-6  # [s]: two poles with equal time constants are moved apart by this
 DELAYS = np.linspace(0.0, LONGEST_DELAY, 13)  # [s], first grid
 FIRST_LAGS = np.geomspace(*LAGS, 14)
 FIRST_RINGING = (0.0, 0.3, 0.6)
@@ -37,9 +37,9 @@ def mean_response(age: np.ndarray, dt: float, path: Path) -> np.ndarray:
     kappa = 0.5 * path.ringing / (1.0 - path.ringing)
     root = np.sqrt(complex(1.0 - 4.0 * kappa))
     slow, fast = 0.5 * path.lag * (1.0 + root), 0.5 * path.lag * (1.0 - root)
-    if abs(slow - fast) < SHARED:
-        slow, fast = slow + SHARED, fast - SHARED
-    fast = fast if abs(fast) > SHARED else complex(SHARED)
+    if abs(slow - fast) < POLE_SEPARATION:
+        slow, fast = slow + POLE_SEPARATION, fast - POLE_SEPARATION
+    fast = fast if abs(fast) > POLE_SEPARATION else complex(POLE_SEPARATION)
     t = age - path.delay
     return np.asarray((_ramp(t, slow, fast) - _ramp(t - dt, slow, fast)) / dt)
 
@@ -104,7 +104,7 @@ class Products(NamedTuple):
         yy = np.sum(y[blocks] ** 2, axis=(1, 2))
         return cls(xx, xy, yy, np.full(len(blocks), float(blocks.shape[1] * outputs)))
 
-    def weighted(self, draw: np.ndarray) -> "Products":
+    def weigh(self, draw: np.ndarray) -> "Products":
         """Return the sums over blocks, each counted ``draw`` times, as one block."""
         parts = (np.tensordot(draw, each, axes=1)[None] for each in self)
         return Products(*parts)
@@ -135,7 +135,7 @@ def fit_response(
     """Return the response with the least squared error.
 
     Args:
-        products: Sums of one block; see :meth:`Products.weighted`.
+        products: Sums of one block; see :meth:`Products.weigh`.
         dt: Tick [s].
         start: Fit from which the search starts; None for a grid.
         fixed: Path whose delay and shape are not fitted.
@@ -165,9 +165,9 @@ def fit_response(
     else:
         x = np.array([start.path.delay, np.log(start.path.lag), start.path.ringing])
     simplex = np.concatenate([x[None], x[None] + np.diag(np.where(x + STEPS > _inside(x + STEPS), -STEPS, STEPS))])
-    found = minimize(misfit, x, method="Nelder-Mead",
+    optimum = minimize(misfit, x, method="Nelder-Mead",
                      options={"initial_simplex": simplex, "xatol": 1e-5, "fatol": 1e-3, "maxiter": 400})  # fmt: skip
-    path = path_of(found.x)
+    path = path_of(optimum.x)
     return _solve(sums, mean_response(age, dt, path), dt)._replace(path=path)
 
 

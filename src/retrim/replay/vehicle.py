@@ -2,8 +2,7 @@
 
 import tomllib
 
-from ..config.names import MOST as LONGEST_NAME
-from ..config.names import plain_from
+from ..config.names import LONGEST_NAME, plain_from
 from ..config.setup import Setup
 from ..config.vehicle_file import VehicleSpec
 from ..config.vehicles import name_of
@@ -11,7 +10,7 @@ from .identification import Estimate, IdentifiedVehicle
 
 SHORTEST, LONGEST = 0.002, 0.5  # limits for a lag in a vehicle file [s]
 SUFFIX = "-identified"
-MOST = 0.2  # longest delay in a vehicle file [s]
+LONGEST_DELAY = 0.2  # longest delay in a vehicle file [s]
 DAMPINGS = (0.1, 10.0)  # limits for a damping ratio in a vehicle file
 
 
@@ -75,7 +74,7 @@ def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str, *, r
             lines.append(f"rate_damping = {_row(base.rate_damping.tolist())}")
     if (delay := identification.delay) is not None:
         origin = delay.text("ms", 1000.0)
-        lines.append(f"command_delay = {min(max(delay.value, 0.0), MOST):.4g}  # [s], identified: {origin}")
+        lines.append(f"command_delay = {min(max(delay.value, 0.0), LONGEST_DELAY):.4g}  # [s], identified: {origin}")
     elif keep is not None and keep.command_delay is not None:
         lines.append(f"command_delay = {keep.command_delay:.6g}  # [s]")
     if keep is not None:

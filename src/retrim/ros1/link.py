@@ -38,7 +38,7 @@ class RosLink(RosStates):
         self._rospy, self._target = rospy, attitude_target()
         odometry, pose = system_module("nav_msgs.msg").Odometry, system_module("geometry_msgs.msg").PoseStamped
         self._ends = [
-            rospy.Subscriber(f"{namespace}/{topic}", kind, _stamped(take), queue_size=1, tcp_nodelay=True)
+            rospy.Subscriber(f"{namespace}/{topic}", kind, _with_stamp(take), queue_size=1, tcp_nodelay=True)
             for topic, kind, take in ((ODOMETRY, odometry, self.take_odometry), (POSE, pose, self.take_pose))
         ]
         self._publisher = rospy.Publisher(f"{namespace}/{TARGET}", self._target, queue_size=1, tcp_nodelay=True)
@@ -81,6 +81,6 @@ class RosLink(RosStates):
             end.unregister()
 
 
-def _stamped(take: Callable[[Any, float], None]) -> Callable[[Any], None]:
+def _with_stamp(take: Callable[[Any, float], None]) -> Callable[[Any], None]:
     """Return a callback that also passes the stamp of a message."""
     return lambda message: take(message, message.header.stamp.to_sec())

@@ -20,7 +20,7 @@ from .link import ODOMETRY, POSE, TARGET
 from .node import join, system_module
 from .plant import NAMESPACE
 
-FRESH_S = 0.3  # [s]: time for which a target is valid
+VALIDITY_S = 0.3  # [s]: time for which a target is valid
 
 
 class RosPeer:
@@ -28,7 +28,7 @@ class RosPeer:
 
     def __init__(
         self, master: str, scenario: Scenario, *, place: np.ndarray, yaw: float, poses: bool = False,
-        fresh: float = FRESH_S,
+        fresh: float = VALIDITY_S,
     ) -> None:  # fmt: skip
         """Build a vehicle that is about to take off.
 

@@ -172,10 +172,10 @@ def configuration() -> str:
             f'<NetworkInterface address="{each}"/>' for each in sorted(set(map(_way_to, peers))) if each
         )
     interfaces = interfaces and f"<Interfaces>{interfaces}</Interfaces>"
-    listed = "".join(f'<Peer address="{peer}"/>' for peer in peers)
+    peer_list = "".join(f'<Peer address="{peer}"/>' for peer in peers)
     return (
         f'<CycloneDDS><Domain id="any"><General>{interfaces}</General><Discovery><ParticipantIndex>auto'
-        f"</ParticipantIndex><MaxAutoParticipantIndex>{PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{listed}</Peers>"
+        f"</ParticipantIndex><MaxAutoParticipantIndex>{PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{peer_list}</Peers>"
         "</Discovery></Domain></CycloneDDS>"
     )
 

@@ -21,32 +21,32 @@ def _fields(*pairs: str) -> str:
     return "".join(f"{pair}\n" for pair in pairs)
 
 
-def _stamped(*pairs: str) -> str:
+def _with_stamp(*pairs: str) -> str:
     return _fields("uint64 timestamp", *pairs)
 
 
 def _command(source: str) -> str:
     """Return the fields of VehicleCommand; the type of source_component differs between releases."""
     parameters = (*(f"float32 param{i}" for i in range(1, 5)), "float64 param5", "float64 param6", "float32 param7")
-    return _stamped(
+    return _with_stamp(
         *parameters, "uint32 command", "uint8 target_system", "uint8 target_component", "uint8 source_system",
         f"{source} source_component", "uint8 confirmation", "bool from_external",
     )  # fmt: skip
 
 
 def _flags(*names: str) -> str:
-    return _stamped(*(f"bool {name}" for name in names))
+    return _with_stamp(*(f"bool {name}" for name in names))
 
 
 DEFINITIONS: Mapping[str, Mapping[str, str]] = {
     "px4_msgs/msg/VehicleOdometry": {
-        "1.13": _stamped(
+        "1.13": _with_stamp(
             "uint64 timestamp_sample", "uint8 local_frame", "float32 x", "float32 y", "float32 z", "float32[4] q",
             "float32[4] q_offset", "float32[21] pose_covariance", "uint8 velocity_frame", "float32 vx", "float32 vy",
             "float32 vz", "float32 rollspeed", "float32 pitchspeed", "float32 yawspeed",
             "float32[21] velocity_covariance", "uint8 reset_counter",
         ),
-        "1.14": _stamped(
+        "1.14": _with_stamp(
             "uint64 timestamp_sample", "uint8 pose_frame", f"{VECTOR} position", "float32[4] q", "uint8 velocity_frame",
             f"{VECTOR} velocity", f"{VECTOR} angular_velocity", f"{VECTOR} position_variance",
             f"{VECTOR} orientation_variance", f"{VECTOR} velocity_variance", "uint8 reset_counter", "int8 quality",
@@ -55,10 +55,10 @@ DEFINITIONS: Mapping[str, Mapping[str, str]] = {
     "px4_msgs/msg/VehicleControlMode": {
         "1.14": _flags(*(f"flag_{name}" for name in CONTROL_FLAGS)) + "uint8 source_id\n",
     },
-    "px4_msgs/msg/VehicleThrustSetpoint": {"1.14": _stamped("uint64 timestamp_sample", f"{VECTOR} xyz")},
+    "px4_msgs/msg/VehicleThrustSetpoint": {"1.14": _with_stamp("uint64 timestamp_sample", f"{VECTOR} xyz")},
     "px4_msgs/msg/VehicleRatesSetpoint": {
-        "1.13": _stamped("float32 roll", "float32 pitch", "float32 yaw", f"{VECTOR} thrust_body"),
-        "1.14": _stamped(
+        "1.13": _with_stamp("float32 roll", "float32 pitch", "float32 yaw", f"{VECTOR} thrust_body"),
+        "1.14": _with_stamp(
             "float32 roll", "float32 pitch", "float32 yaw", f"{VECTOR} thrust_body", "bool reset_integral"
         ),
     },
@@ -69,15 +69,15 @@ DEFINITIONS: Mapping[str, Mapping[str, str]] = {
         ),
     },
     "px4_msgs/msg/TrajectorySetpoint": {
-        "1.14": _stamped(
+        "1.14": _with_stamp(
             f"{VECTOR} position", f"{VECTOR} velocity", f"{VECTOR} acceleration", f"{VECTOR} jerk", "float32 yaw",
             "float32 yawspeed",
         ),
     },
     "px4_msgs/msg/VehicleCommand": {"1.14": _command("uint8"), "1.15": _command("uint16")},
-    "px4_msgs/msg/MessageFormatRequest": {"1.14": _stamped("uint16 protocol_version", "char[50] topic_name")},
+    "px4_msgs/msg/MessageFormatRequest": {"1.14": _with_stamp("uint16 protocol_version", "char[50] topic_name")},
     "px4_msgs/msg/MessageFormatResponse": {
-        "1.14": _stamped("uint16 protocol_version", "char[50] topic_name", "bool success", "uint32 message_hash"),
+        "1.14": _with_stamp("uint16 protocol_version", "char[50] topic_name", "bool success", "uint32 message_hash"),
     },
     "mavros_msgs/msg/AttitudeTarget": {
         "1 and 2": _fields(

@@ -12,8 +12,8 @@ from .message_type import NO_HASH, MessageType
 from .node import Endpoint, Publish, Qos, Ros2Node, Take, check_topic, mismatches
 
 NUMBERS = itertools.count()
-KNOWN = "RIHS01_"
-SPIN_S = 0.05  # [s] until the thread looks whether the node was closed
+HASH_PREFIX = "RIHS01_"
+CLOSE_PERIOD_S = 0.05  # [s] until the thread looks whether the node was closed
 
 
 class RclpyNode(Ros2Node):
@@ -77,8 +77,8 @@ class RclpyNode(Ros2Node):
     def published_topics(self) -> Mapping[str, str]:
         """Return the topics on which other nodes publish."""
         names = [topic for topic, _ in self._node.get_topic_names_and_types()]
-        found = {topic: [each for each in self.endpoints(topic) if each.publishes] for topic in names}
-        return {topic: publishers[0].type_name for topic, publishers in found.items() if publishers}
+        publishers_of = {topic: [each for each in self.endpoints(topic) if each.publishes] for topic in names}
+        return {topic: publishers[0].type_name for topic, publishers in publishers_of.items() if publishers}
 
     def close(self) -> None:
         """Leave the network."""
@@ -94,7 +94,7 @@ class RclpyNode(Ros2Node):
 
     def _spin(self) -> None:
         while not self._over.is_set() and self._context.ok():
-            self._executor.spin_once(timeout_sec=SPIN_S)
+            self._executor.spin_once(timeout_sec=CLOSE_PERIOD_S)
 
     def _endpoints(self, topic: str) -> list[tuple[Endpoint, str]]:
         """Return all endpoints of a topic, with the names of their nodes."""
@@ -105,7 +105,9 @@ class RclpyNode(Ros2Node):
         ):
             for info in infos:
                 type_hash = str(getattr(info, "topic_type_hash", ""))
-                type_hash = type_hash if type_hash.startswith(KNOWN) and type_hash.strip("0") != KNOWN else NO_HASH
+                type_hash = (
+                    type_hash if type_hash.startswith(HASH_PREFIX) and type_hash.strip("0") != HASH_PREFIX else NO_HASH
+                )
                 reliable = info.qos_profile.reliability == self._qos_module.ReliabilityPolicy.RELIABLE
                 result.append((Endpoint(info.topic_type, type_hash, publishes, reliable), info.node_name))
         return result

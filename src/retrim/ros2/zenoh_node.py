@@ -19,7 +19,7 @@ GID_BYTES = 16
 ATTACHMENT = struct.Struct(f"<qqB{GID_BYTES}s")
 """Sequence number, time of publication [ns], and the number of the publisher with its length: rmw_zenoh since 0.2.4 in
 Jazzy and 0.6 in Kilted."""
-LOOK_S = 0.5  # [s] for the answers about other nodes
+DISCOVERY_S = 0.5  # [s] for the answers about other nodes
 RELIABLE, BEST_EFFORT, TRANSIENT_LOCAL = "", "2", "1"
 
 
@@ -124,7 +124,7 @@ class ZenohNode(Ros2Node):
 
     def _announcements(self) -> list[list[str]]:
         """Return the parts of the tokens of other nodes' publishers and subscriptions."""
-        replies = self._session.liveliness().get(f"{ADMIN}/{self._domain}/**", timeout=LOOK_S)
+        replies = self._session.liveliness().get(f"{ADMIN}/{self._domain}/**", timeout=DISCOVERY_S)
         tokens = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
         return [each for each in tokens if len(each) == 13 and each[2] != self._me and each[5] in ("MP", "MS")]
 

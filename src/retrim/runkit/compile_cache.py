@@ -9,10 +9,10 @@ from pathlib import Path
 import jax
 
 MAPS = Path("/proc/self/maps")
-ENOUGH = 30_000  # Linux allows a process 65,530 memory maps; at the limit the process crashes
+MOST_MAPS = 30_000  # Linux allows a process 65,530 memory maps; at the limit the process crashes
 
 
-def release_programs(above: int = ENOUGH) -> bool:
+def release_programs(above: int = MOST_MAPS) -> bool:
     """Release compiled programs if the process has more than ``above`` memory maps; they are reloaded when needed.
 
     Each program occupies several maps. Making a long table compiles thousands of programs, one set for each condition.

@@ -5,7 +5,7 @@ from importlib.metadata import entry_points, version
 
 from .compile_cache import enable_compile_cache
 
-LONG = ("reproduce", "sweep", "gauntlet", "bench")
+LONG_COMMANDS = ("reproduce", "sweep", "gauntlet", "bench")
 """Commands that compute for minutes or hours. Cluster workers, which no command starts, use the same flags."""
 QUICK = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
 KNOWN_VERSIONS = ("0.8.", "0.9.", "0.10.")
@@ -21,7 +21,11 @@ def compile_for(command: str) -> None:
     Args:
         command: Name of the command.
     """
-    if command not in LONG and version("jaxlib").startswith(KNOWN_VERSIONS) and not entry_points(group="jax_plugins"):
+    if (
+        command not in LONG_COMMANDS
+        and version("jaxlib").startswith(KNOWN_VERSIONS)
+        and not entry_points(group="jax_plugins")
+    ):
         flags = os.environ.get("XLA_FLAGS", "")
         new = [flag for flag in QUICK if flag.partition("=")[0] not in flags]
         os.environ["XLA_FLAGS"] = " ".join([*flags.split(), *new])

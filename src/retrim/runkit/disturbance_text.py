@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..physics.effects import ExternalEffects
-from .recovery import FEW, timeline
+from .recovery import FREQUENT, timeline
 
 MOST_CHANGES = 3  # changes of a disturbance that its description contains
 
@@ -38,7 +38,7 @@ def describe_disturbance(name: str, home: Array, seconds: float) -> str:
         One line; an empty string if there are no effects.
     """
     times, effects, changes = timeline(name, home, seconds)
-    if len(changes) > FEW:
+    if len(changes) > FREQUENT:
         return "changes all the time"
     parts = list[str]()
     for i in [0, *changes]:

@@ -12,7 +12,7 @@ from .provenance import command_line, describe_code, describe_hardware
 from .reporter import Reporter
 from .run import Run
 
-MOST = 2000  # largest number of characters in a text
+LONGEST_TEXT = 2000  # largest number of characters in a text
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class TableSection:
 
 def as_text(text: str) -> str:
     """Return a text on one line, escaped so that untrusted text cannot contain Markdown links or HTML."""
-    return _escape(one_line(text, MOST))
+    return _escape(one_line(text, LONGEST_TEXT))
 
 
 def _escape(text: str) -> str:

@@ -28,7 +28,7 @@ from ..transport import wire
 from .flights import Flight
 
 KIND = "memory"
-MOST = 1e12  # largest number in a file
+LARGEST_NUMBER = 1e12  # largest number in a file
 STRONGEST = 50.0  # [m/s^2], largest acceleration of a map
 MEMORY_TAG = 2**30 + 7  # folded into the seed of a flight for the parts of the state that are not remembered
 
@@ -77,16 +77,16 @@ class FlightMemory:
             raise CheckpointError(f"{error}; remove the file to fly without it") from error
         if owner != self.vehicle:  # two names may differ only in characters that a file name cannot have
             raise CheckpointError(f"{path}: is the memory of vehicle {owner!r}, expected {self.vehicle!r}")
-        check_size(residual, source=str(path), largest=MOST)
-        recalled = recall(residual)
+        check_size(residual, source=str(path), largest=LARGEST_NUMBER)
+        residual_state = recall(residual)
         model: Any = setup.learner.residual_model
-        if not (strength := float(model.strength(recalled))) <= STRONGEST:
+        if not (strength := float(model.strength(residual_state))) <= STRONGEST:
             raise CheckpointError(
                 f"{path}: its map has accelerations of {strength:.3g} m/s^2, at most {STRONGEST:g} can be flown; "
                 "remove the file to fly without it"
             )
         fresh = setup.learner.init(learns(setup, policy, key), key)
-        return dataclasses.replace(fresh, residual=recalled)
+        return dataclasses.replace(fresh, residual=residual_state)
 
     def describe(self, setup: Setup) -> str:
         """Return one line about the memory and its age."""

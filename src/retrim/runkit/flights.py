@@ -12,9 +12,9 @@ from ..config.scenario import Scenario
 from ..runtime.events import Event
 from ..runtime.flight import Log
 
-SETTLED = 0.05  # [m]
+SETTLING_ERROR = 0.05  # [m]
 LONGEST_SHIFT = 3.0  # [s], half of the paper's longest lap
-AS_GOOD, AS_GOOD_M = 0.02, 1e-3  # as a share, and [m]: shifts whose errors differ by less count as equally good
+TIE_SHARE, TIE_M = 0.02, 1e-3  # as a share, and [m]: shifts whose errors differ by less count as equally good
 LEARNER_TAG = 2**30 + 2  # folded into a seed, so that learners do not share keys with training, starts or disturbances
 
 
@@ -92,7 +92,7 @@ class Flight:
     @property
     def settle_s(self) -> float:
         """Time from which the error stays below 5 cm [s]; infinite if it does not."""
-        outside = np.flatnonzero(self.error >= SETTLED)
+        outside = np.flatnonzero(self.error >= SETTLING_ERROR)
         if self.log.terminated or (len(outside) and outside[-1] == len(self.error) - 1):
             return float("inf")
         return float(self.log.t[outside[-1] + 1]) if len(outside) else 0.0
@@ -113,7 +113,7 @@ class Flight:
         shifts, errors = sorted(range(-most, most + 1), key=abs), list[float]()
         for k in shifts:
             errors.append(float(np.linalg.norm(self.log.p[rows] - self.target[rows - k], axis=1).mean()))
-        best = int(np.argmax(np.array(errors) <= (1.0 + AS_GOOD) * min(errors) + AS_GOOD_M))
+        best = int(np.argmax(np.array(errors) <= (1.0 + TIE_SHARE) * min(errors) + TIE_M))
         return shifts[best] * self.log.dt, errors[best] if shifts[best] else self.steady
 
     @property

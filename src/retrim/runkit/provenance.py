@@ -18,7 +18,7 @@ import jax
 PACKAGES = ("retrim", "jax", "jaxlib", "equinox", "optax", "numpy")
 EXTRAS = ("rotorpy", "mujoco", "crazyflow", "foundation-policy")
 """Optional packages that some flights use."""
-UNKNOWN = "unknown"
+UNKNOWN_COMMIT = "unknown"
 """Placeholder for the commit if the package is not in a checkout."""
 FOLDERS = ("retrim", "retrim_paper")
 """Folders of the distribution."""
@@ -41,11 +41,11 @@ def commit() -> str:
 
     try:
         if Path(git("rev-parse", "--show-toplevel")) / "src" / "retrim" != here.parent:
-            return UNKNOWN
+            return UNKNOWN_COMMIT
         changes = git("status", "--porcelain", "--", *(f":/{path}" for path in PACKAGE))
         return git("rev-parse", "--short=12", "HEAD") + ("-dirty" if changes else "")
     except (OSError, subprocess.CalledProcessError):
-        return UNKNOWN
+        return UNKNOWN_COMMIT
 
 
 @functools.cache
@@ -60,7 +60,9 @@ def code() -> str:
 
 def describe_code() -> str:
     """Return the commit in words; for an installed package, which has no commit, return its version and code digest."""
-    return f"Commit {commit()}" if commit() != UNKNOWN else f"retrim {version('retrim')}, installed, code {code()}"
+    return (
+        f"Commit {commit()}" if commit() != UNKNOWN_COMMIT else f"retrim {version('retrim')}, installed, code {code()}"
+    )
 
 
 def versions() -> dict[str, str]:

@@ -12,8 +12,8 @@ from ..physics.effects import ExternalEffects
 from ..physics.state import State
 
 STEP = 0.1  # time between samples of a disturbance [s]
-AT_ONCE = 0.5  # changes within this time count as one [s]
-FEW = 10  # a disturbance with more changes per flight counts as changing all the time
+SAME_CHANGE = 0.5  # changes within this time count as one [s]
+FREQUENT = 10  # a disturbance with more changes per flight counts as changing all the time
 
 
 def timeline(name: str, home: Array, seconds: float) -> tuple[np.ndarray, ExternalEffects, list[int]]:
@@ -40,10 +40,10 @@ def change_times(name: str, home: Array, seconds: float) -> list[float]:
     Changes within half a second count as one; a kick is one change, not two.
     """
     times, _, changes = timeline(name, home, seconds)
-    if len(changes) > FEW:
+    if len(changes) > FREQUENT:
         return []
     result = [float(times[i]) for i in changes]
-    return [t for i, t in enumerate(result) if i == 0 or t - result[i - 1] > AT_ONCE]
+    return [t for i, t in enumerate(result) if i == 0 or t - result[i - 1] > SAME_CHANGE]
 
 
 def recoveries(

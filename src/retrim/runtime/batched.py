@@ -41,7 +41,7 @@ class Batch:
         self._simulations, self._starts = stack(simulations), stack(starts)
         self._progress, self._stop = progress, stop
         # Without disturbances, plants of one kind have the same structure, so one program launches all of them.
-        self._on_the_ground = stack([simulation.undisturbed() for simulation in simulations])
+        self._on_the_ground = stack([simulation.without_disturbances() for simulation in simulations])
         self._flights: InFlight | None = None
         self._tick_count = 0
         self._measurement: Any = None  # from the start on

@@ -70,5 +70,5 @@ def _angle(before: np.ndarray, after: np.ndarray, axis: np.ndarray) -> float:
 
 def _turn(x: np.ndarray, z: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return the axes ``x`` after turns about ``z`` [rad]."""
-    turned: np.ndarray = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * np.cross(z, x)
-    return turned
+    turned_nose: np.ndarray = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * np.cross(z, x)
+    return turned_nose

@@ -20,10 +20,10 @@ from .observation import POSITION_SCALE, VELOCITY_SCALE, AbstractObservation
 
 Statistics = tuple[Float[Array, "70"], Float[Array, "70 70"]]
 """Mean and whitening matrix of the pixels."""
-BELOW = 1.0  # [m], from the goal to the ground
+GOAL_HEIGHT = 1.0  # [m], from the goal to the ground
 FRAMES, COMMANDS = 5, 3
 FRAME_TIME = 0.06  # [s] between frames, as published
-FAR = 2.5  # limit at which normalised pixel coordinates are clipped
+PIXEL_LIMIT = 2.5  # limit at which normalised pixel coordinates are clipped
 FEATURE_LIMIT = 5.0  # whitened features are clipped at this many standard deviations
 
 
@@ -130,12 +130,12 @@ class Keypoints(AbstractObservation[KeypointMemory]):
     def pixels(self, x: State) -> tuple[Float[Array, "7 2"], Bool[Array, " 7"]]:
         """Return the projections of the points, clipped far outside the image, and whether each is visible."""
         projections = jax.vmap(self.camera.project)(in_camera(x, self.ground()))
-        return jnp.clip(projections.pixel, -FAR, FAR), projections.visible
+        return jnp.clip(projections.pixel, -PIXEL_LIMIT, PIXEL_LIMIT), projections.visible
 
     def ground(self) -> Float[Array, "7 3"]:
         """Return the keypoints on the ground in the world frame [m]."""
         flat = jnp.array(PATTERN, dtype=self.goal.dtype)
-        return self.goal[None] + jnp.concatenate([flat, jnp.full((7, 1), -BELOW, dtype=flat.dtype)], axis=1)
+        return self.goal[None] + jnp.concatenate([flat, jnp.full((7, 1), -GOAL_HEIGHT, dtype=flat.dtype)], axis=1)
 
     @property
     def measures_state(self) -> bool:

@@ -15,8 +15,8 @@ from .flatness import flat_command
 from .reference import Reference
 from .shifted_reference import ShiftedReference
 
-TABULATED = (Reference, ShiftedReference)
-GROWING = 0.4  # [s], time during which the pace of a clock changes
+TABLES = (Reference, ShiftedReference)
+PACE_CHANGE_TIME = 0.4  # [s], time during which the pace of a clock changes
 
 
 class Clock(eqx.Module):
@@ -44,12 +44,12 @@ class Clock(eqx.Module):
     def phase_at(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """Return the phase at flight time ``t`` [s]."""
         tau = (t - self.t).astype(self.phase.dtype)
-        growing = jnp.minimum(tau, GROWING)
+        growing = jnp.minimum(tau, PACE_CHANGE_TIME)
         return self.phase + self.pace * (tau + self.growth * growing * (tau - 0.5 * growing))
 
     def pace_at(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """Return the pace at flight time ``t`` [s]."""
-        return self.pace * (1.0 + self.growth * jnp.minimum((t - self.t).astype(self.phase.dtype), GROWING))
+        return self.pace * (1.0 + self.growth * jnp.minimum((t - self.t).astype(self.phase.dtype), PACE_CHANGE_TIME))
 
     def time_of(self, phase: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return the flight time at which a phase is reached if the present pace remains constant [s]."""
@@ -129,6 +129,6 @@ def pace_references(tree: Any, clock: Clock) -> Any:
     """Return a pytree, such as a task or a controller, in which every tabulated reference follows a clock."""
 
     def wrap(part: Any) -> Any:
-        return PacedReference(part, clock) if isinstance(part, TABULATED) else part
+        return PacedReference(part, clock) if isinstance(part, TABLES) else part
 
-    return jax.tree.map(wrap, tree, is_leaf=lambda part: isinstance(part, TABULATED))
+    return jax.tree.map(wrap, tree, is_leaf=lambda part: isinstance(part, TABLES))

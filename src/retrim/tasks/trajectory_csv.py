@@ -14,12 +14,12 @@ from .reference import POINTS, Reference
 from .shapes import RAMP, smooth_start
 from .trajectory_table import read_table
 
-CLOSED = 0.01  # [m]; ends closer than this coincide
+CLOSURE = 0.01  # [m]; ends closer than this coincide
 CLOSED_YAW = 0.02  # [rad]
 SHORTEST_LAP = 0.5  # [s]
-ALONGSIDE = 0.1  # share of the speed by which the velocities of two passes of one lap may differ
+VELOCITY_TOLERANCE = 0.1  # share of the speed by which the velocities of two passes of one lap may differ
 ROW = 0.02  # [s], largest time between rows
-AROUND = 12  # points added beyond a lap's end, since the end of a spline affects about that many points
+EXTRA_POINTS = 12  # points added beyond a lap's end, since the end of a spline affects about that many points
 
 
 def from_csv(file: Path, laps: bool | None = None) -> Reference:
@@ -87,7 +87,7 @@ def _lap_spline(table: np.ndarray, start: float) -> tuple[Callable[[float], np.n
         table[-1, 1:] = table[0, 1:]
         periodic = _spline(table, "periodic")
         return (lambda t: periodic(t) + t * turning), winding
-    after = table[table[:, 0] > start + 0.1 * (table[-1, 0] - table[-2, 0])][:AROUND].copy()
+    after = table[table[:, 0] > start + 0.1 * (table[-1, 0] - table[-2, 0])][:EXTRA_POINTS].copy()
     after[:, 0] += period
     after[:, 1:] += winding
     return _spline(np.concatenate([table, after]), (_end(table, 0), "not-a-knot")), winding
@@ -117,7 +117,7 @@ def _lap_start(table: np.ndarray) -> float | None:
             method="bounded",
             options={"xatol": 1e-9},
         ).x
-        as_fast = np.linalg.norm(spline(t, 1)[:3] - v_end) <= ALONGSIDE * np.linalg.norm(v_end)
+        as_fast = np.linalg.norm(spline(t, 1)[:3] - v_end) <= VELOCITY_TOLERANCE * np.linalg.norm(v_end)
         if as_fast and _same(spline(t), last):
             return float(t)
     return None
@@ -127,7 +127,7 @@ def _why_no_lap(table: np.ndarray) -> str:
     gap = float(np.linalg.norm(table[-1, 1:4] - table[0, 1:4]))
     if len(table) < 4:
         return f"{len(table)} points; a lap needs at least four"
-    if gap > CLOSED:
+    if gap > CLOSURE:
         return f"its last point is {gap:.3f} m from its first"
     if not _ends_meet(table):
         return "its last point is where its first is, but with another yaw"
@@ -139,7 +139,7 @@ def _ends_meet(table: np.ndarray) -> bool:
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:
-    near = bool(np.linalg.norm(a[:3] - b[:3]) <= CLOSED)
+    near = bool(np.linalg.norm(a[:3] - b[:3]) <= CLOSURE)
     return near and abs(math.remainder(a[3] - b[3], 2.0 * math.pi)) <= CLOSED_YAW
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..errors import ConfigError
 
-EXPECTED = "t [s], x, y, z [m] and, if wanted, yaw [rad]"
+COLUMN_NAMES = "t [s], x, y, z [m] and, if desired, yaw [rad]"
 COLUMNS = ("t", "x", "y", "z", "yaw")
 ALIASES = {"time": "t", "timestamp": "t", "heading": "yaw", "psi": "yaw"}
 POSITION = re.compile(r"(?:p|pos|position)[_.]?([xyz])")
-LEFT_OUT = re.compile(
+GAP_ROW = re.compile(
     r"_.*"
     r"|(?:v|vel|velocity|a|acc|accel|acceleration|a_lin|a_rot|j|jerk|s|snap|w|omega|rates?|alpha|tau|torque)[_.]?[xyz]"
     r"|(?:q|quat|orientation)[_.]?[wxyz]|q[0-3]|u[_.]?\d|thrust|roll|pitch|yaw_?(?:rate|dot)|d?heading_?rate"
@@ -26,12 +26,12 @@ UNITS = {
     "yaw": ("rad", "radian", "radians"),
 }
 MAX_BYTES = 32 * 2**20
-FARTHEST = 1000.0  # [m]
+LARGEST_COORDINATE = 1000.0  # [m]
 LARGEST_YAW = 2.0 * math.pi + 0.1  # [rad]; larger values look like degrees
 LONGEST = 600.0  # [s]
 FASTEST = 100.0  # [m/s] between points
 SAME_TIME, SAME_PLACE, SAME_YAW = 1e-6, 1e-3, 0.02  # [s], [m], [rad]; a point this near the last one repeats it
-SLOWEST = 0.02  # [m/s]; a vehicle of up to 20 m/s appears slower than this if its times are in ms
+LEAST_SPEED = 0.02  # [m/s]; a vehicle of up to 20 m/s appears slower than this if its times are in ms
 
 
 def read_table(file: Path) -> np.ndarray:
@@ -63,7 +63,7 @@ def read_table(file: Path) -> np.ndarray:
     try:
         text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{file} is not UTF-8 text; {EXPECTED} are expected, one point a line") from error
+        raise ConfigError(f"{file} is not UTF-8 text; {COLUMN_NAMES} are expected, one point a line") from error
     columns: list[str] | None = None
     points, numbers = list[list[float]](), list[int]()
     for number, line, comment in _lines(text):
@@ -125,7 +125,7 @@ def _words(line: str) -> list[str]:
     try:
         words = [word.strip() for word in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
     except csv.Error as error:
-        raise ConfigError(f"{error}; {EXPECTED} are expected") from error
+        raise ConfigError(f"{error}; {COLUMN_NAMES} are expected") from error
     while words and not words[-1]:
         words.pop()
     return words
@@ -146,19 +146,19 @@ def _header(words: list[str], *, comment: bool) -> list[str] | None:
         return None  # an ordinary comment
     for word, name, part in zip(words, names, parts, strict=True):
         if name not in COLUMNS:
-            if LEFT_OUT.fullmatch(name):
+            if GAP_ROW.fullmatch(name):
                 continue
             raise ConfigError(
-                f"column {word[:40]!r} is not known; {EXPECTED} are expected; a column whose name begins with _ is not "
-                f"read"
+                f"column {word[:40]!r} is not known; {COLUMN_NAMES} are expected; a column whose name begins with _ "
+                f"is not read"
             )
         if names.count(name) > 1:
-            raise ConfigError(f"column {name!r} appears twice; {EXPECTED} are expected")
+            raise ConfigError(f"column {name!r} appears twice; {COLUMN_NAMES} are expected")
         unit = part[2] if part else None
         if unit is not None and unit.lower() not in UNITS[name]:
             raise ConfigError(f"column {word!r}: {name} is expected in {UNITS[name][0]}, not in {unit}")
     if missing := [name for name in COLUMNS[:4] if name not in names]:
-        raise ConfigError(f"no column {', '.join(missing)}; {EXPECTED} are expected")
+        raise ConfigError(f"no column {', '.join(missing)}; {COLUMN_NAMES} are expected")
     return names
 
 
@@ -177,19 +177,21 @@ def _point(words: list[str], columns: list[str]) -> list[float]:
     """
     excerpt = ", ".join(words) if len(words) <= 6 else ", ".join(words[:6]) + ", ..."
     if len(words) != len(columns):
-        raise ConfigError(f"'{excerpt}' has {len(words)} columns; {', '.join(columns)} are expected: {EXPECTED}")
+        raise ConfigError(f"'{excerpt}' has {len(words)} columns; {', '.join(columns)} are expected: {COLUMN_NAMES}")
     values = dict[str, float]()
     for name, word in zip(columns, words, strict=True):
         if name not in COLUMNS:
             continue
         value = _number(word)
         if value is None:
-            raise ConfigError(f"{name} = {word!r} in '{excerpt}' is not a number; {EXPECTED} are expected")
+            raise ConfigError(f"{name} = {word!r} in '{excerpt}' is not a number; {COLUMN_NAMES} are expected")
         if not math.isfinite(value):
             raise ConfigError(f"{name} = {word!r} in '{excerpt}' is not finite")
         values[name] = value
-    if far := [name for name in "xyz" if abs(values[name]) > FARTHEST]:
-        raise ConfigError(f"{far[0]} = {values[far[0]]:g} m is beyond {FARTHEST:g} m; are the positions in m?")
+    if far := [name for name in "xyz" if abs(values[name]) > LARGEST_COORDINATE]:
+        raise ConfigError(
+            f"{far[0]} = {values[far[0]]:g} m is beyond {LARGEST_COORDINATE:g} m; are the positions in m?"
+        )
     if abs(values.get("yaw", 0.0)) > LARGEST_YAW:
         raise ConfigError(
             f"yaw = {values['yaw']:g} looks like degrees; radians between -2 pi and 2 pi are expected "
@@ -205,7 +207,7 @@ def _check_times(table: np.ndarray, numbers: list[int], file: Path) -> None:
     in_ms = "; are the times in ms? They are expected in s" if step >= 1.0 else ""
     if seconds > LONGEST:
         raise ConfigError(f"{file}: it lasts {seconds:g} s; at most {LONGEST:g} s can be flown{in_ms}")
-    if in_ms and 0.0 < speeds.max() < SLOWEST:
+    if in_ms and 0.0 < speeds.max() < LEAST_SPEED:
         raise ConfigError(f"{file}: its points are {step:g} s and {1e3 * speeds.max() * step:.1f} mm apart{in_ms}")
     k = int(np.argmax(speeds))
     if speeds[k] > FASTEST:

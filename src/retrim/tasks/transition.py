@@ -16,8 +16,8 @@ from .feasibility import beyond_limits
 from .flatness import FULL_TURN, flat_command
 from .reference import Reference
 
-BEFORE = 1.0  # [s], duration of the old reference in the table of a transition
-LASTING = (2.0, 3.0, 4.0, 6.0, 8.0)  # [s], possible durations; the first one that the vehicle can fly is used
+LEAD_TIME = 1.0  # [s], duration of the old reference in the table of a transition
+DURATIONS = (2.0, 3.0, 4.0, 6.0, 8.0)  # [s], possible durations; the first one that the vehicle can fly is used
 
 
 def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehicle) -> Reference:
@@ -36,7 +36,7 @@ def transition_between(old: Reference, new: Reference, at: float, vehicle: Vehic
         A table with the same sizes as ``old``, so that it can replace ``old`` in a compiled program. The table begins
         one second before ``at``. A roll-out may start in the lap of ``new``.
     """
-    for lasting in LASTING:
+    for lasting in DURATIONS:
         table = _table(old, new, at, lasting)
         if not beyond_limits(np.asarray(table.rows, dtype=float), float(table.every), vehicle):
             break
@@ -94,7 +94,7 @@ def _table(old: Reference, new: Reference, at: float, lasting: float) -> Referen
         lap = (begins, begins + end - start)
     else:
         lap = (at + max(end, lasting),) * 2
-    since = at - BEFORE
+    since = at - LEAD_TIME
     times = np.linspace(since, lap[1], old.rows.shape[0])
     join = lap if lap[0] < lap[1] else (since, lap[1])
     dtype = old.every.dtype

@@ -10,7 +10,7 @@ from .hover import L2Hover
 from .keypoints import Keypoints
 
 EDGE = 0.9  # share of half an image within which points are kept
-FARTHEST = 4.0  # multiple of half an image at which a point's distance is clipped
+LARGEST_DISTANCE = 4.0  # multiple of half an image at which a point's distance is clipped
 WEIGHT = 10.0  # weight of a point half an image outside, compared with 8 for a metre from the goal
 
 
@@ -21,5 +21,5 @@ class ViewHover(L2Hover):
         """Return the reward of :class:`L2Hover` minus 10 times the mean distance by which points leave the image."""
         observation: Keypoints = self.observation  # type: ignore[assignment]  # a field of the base class
         pixels = jax.vmap(observation.camera.project)(in_camera(x, observation.ground())).pixel
-        outside = jax.nn.relu(jnp.abs(jnp.clip(pixels, -FARTHEST, FARTHEST)) - EDGE)
+        outside = jax.nn.relu(jnp.abs(jnp.clip(pixels, -LARGEST_DISTANCE, LARGEST_DISTANCE)) - EDGE)
         return super().reward(t, x, u) - WEIGHT * jnp.mean(jnp.sum(outside, axis=1))

@@ -38,7 +38,7 @@ from ..ros2.node import SENSOR, Ros2Node
 
 DT = 0.01  # [s]
 HOVER = np.array([STANDARD_GRAVITY, 0.0, 0.0, 0.0])
-LISTENS_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
+RECEIVER_S, ARMING_S, SPIN_UP_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 MASK = 0b1001111  # four sticks, and the channel of ANGLE
 SETTINGS = [
@@ -52,7 +52,7 @@ HIGH_ABOVE = (0.0, 0.0, 50.0)  # [m], where the pilot flies by hand
 TURNS, TURN_S = np.array([1.5, 1.5, 1.0]), 0.1  # [rad/s], [s]: random rates and their memory
 PUSHES, PUSH_S = 2.0, 0.4  # [m/s^2], [s]: random thrusts
 LENGTHS_S = 5.0, 600.0  # [s], length of a flight by hand
-CLOSES_S = 2.0  # [s] that the board needs for the end of its log
+LOG_END_S = 2.0  # [s] that the board needs for the end of its log
 
 
 class BetaflightPeer:
@@ -135,7 +135,7 @@ class BetaflightPeer:
             PlantError: The board has written no log.
         """
         self.world.tell(0.0, np.zeros(3), armed=False)
-        time.sleep(CLOSES_S)
+        time.sleep(LOG_END_S)
         logs = sorted(self._firmware.folder.glob("LOG*"))
         if not logs:
             raise PlantError("the board has written no log")
@@ -159,17 +159,17 @@ class BetaflightPeer:
 
     def _arm(self) -> None:
         world = self.world
-        time.sleep(LISTENS_S)
+        time.sleep(RECEIVER_S)
         world.tell(0.0, np.zeros(3), armed=True, switches=self._switches)
-        until = time.monotonic() + ARMS_S
+        until = time.monotonic() + ARMING_S
         while world.motors.min() <= 0.0:
             if time.monotonic() > until:
                 self.close()
-                raise PlantError(f"the firmware does not arm within {ARMS_S:g} s")
+                raise PlantError(f"the firmware does not arm within {ARMING_S:g} s")
             time.sleep(0.02)
         world.place(State(jnp.asarray(self._place, float), rotz(jnp.asarray(0.0)), jnp.zeros(3)))
         world.tell(self._throttle(STANDARD_GRAVITY), np.zeros(3), switches=self._switches)
-        time.sleep(SPINS_S)
+        time.sleep(SPIN_UP_S)
         world.release()
 
     def _throttle(self, c: float) -> float:

@@ -22,11 +22,11 @@ from ..plants.bridges.crtp import Packet
 from .peer_vehicle import GROUND, PeerVehicle, fly_until_interrupt, port
 
 VERSION = 12  # protocol version
-LEVELS_S, STOPS_S = 0.5, 2.0  # [s]: time without a setpoint until the vehicle levels, and until the motors stop
+LEVELS_S, STOP_S = 0.5, 2.0  # [s]: time without a setpoint until the vehicle levels, and until the motors stop
 READY_S = 0.5  # [s]: time from the start until arming is possible
 FULL = 65_535.0  # full thrust
 VARIABLES = {**crtp.STATUS_LOG, "stateEstimate.x": "f", "stateEstimate.y": "f", **crtp.STATE_LOG}
-UNKNOWN = 2  # error code for an unknown block or variable
+UNKNOWN_ENTRY = 2  # error code for an unknown block or variable
 
 
 class CrazyfliePeer:
@@ -96,7 +96,7 @@ class CrazyfliePeer:
         if self._setpoint is not None:
             if since < LEVELS_S:
                 return self._setpoint
-            if since > STOPS_S:
+            if since > STOP_S:
                 return None
             upright = np.array([0.0, 0.0, 1.0])
             level = 6.0 * (self.vehicle.R.T @ np.cross(self.vehicle.R[:, 2], upright))
@@ -202,12 +202,12 @@ class CrazyfliePeer:
             whole = 2 + 3 * ((len(body) - 2) // 3)  # the firmware also ignores an incomplete entry
             numbers = [number for _, number in struct.iter_unpack("<BH", body[2:whole])]
             if max(numbers) >= len(VARIABLES) or (body[0] == crtp.APPEND and body[1] not in self._blocks):
-                return UNKNOWN
+                return UNKNOWN_ENTRY
             before = [] if body[0] == crtp.CREATE else self._blocks[body[1]]
             self._blocks[body[1]] = before + [list(VARIABLES)[number] for number in numbers]
         elif body[0] == crtp.START:
             if body[1] not in self._blocks:
-                return UNKNOWN
+                return UNKNOWN_ENTRY
             self._periods[body[1]] = max(1, body[2])
         return 0
 

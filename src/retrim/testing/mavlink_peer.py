@@ -109,11 +109,11 @@ class MavlinkPeer:
                     take(message)
 
     def _take_rates(self, m: Any) -> None:
-        omega = frames.turned_body(np.array([m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate]))
+        omega = frames.turn_body(np.array([m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate]))
         self._setpoint(np.concatenate([[m.thrust * self.vehicle.thrust_max], omega]))
 
     def _take_place(self, m: Any) -> None:
-        self._place, self._yaw = frames.turned_world(np.array([m.x, m.y, m.z])), frames.turned_heading(m.yaw)
+        self._place, self._yaw = frames.turn_world(np.array([m.x, m.y, m.z])), frames.turn_heading(m.yaw)
         self._setpoint(None)
 
     def _setpoint(self, rates: np.ndarray | None) -> None:
@@ -141,9 +141,9 @@ class MavlinkPeer:
     def _say(self) -> None:
         out, us = self._out, int(self._now() * 1e6)
         x = self.vehicle
-        place, velocity = frames.turned_world(x.p), frames.turned_world(x.v)
+        place, velocity = frames.turn_world(x.p), frames.turn_world(x.v)
         self._send(out.odometry_encode(
-            us, 1, 1, *place, frames.quaternion_of(x.R).tolist(), *velocity, *frames.turned_body(x.omega),
+            us, 1, 1, *place, frames.quaternion_of(x.R).tolist(), *velocity, *frames.turn_body(x.omega),
             [math.nan] * 21, [math.nan] * 21
         ))  # fmt: skip
         if self._tick % 4 == 0:

@@ -30,7 +30,7 @@ from .px4_world import STEP, Px4World, parameters_of
 
 GROUND_STATION = 14550  # port to which PX4 sends, in addition to the port for a companion computer
 PAYLOAD = 14030  # a further port to which PX4 sends
-OWN, EXTERNAL = "sihsim_quadx", "none_iris"
+OWN_MODEL, EXTERNAL = "sihsim_quadx", "none_iris"
 """PX4's models of vehicles: with its own physics, and with the physics of another program."""
 CAPTURE_RATE = 50.0  # [Hz]: rate of the motion capture
 MOCAP = {
@@ -44,7 +44,7 @@ With PX4's defaults for the delay (200 ms) and for the filters of the output (0.
 late.
 """
 START_S, SLIP_S = 10.0, 0.05  # [s]: start of PX4; lost time that is reported
-READY = "PX4 flies at udp:127.0.0.1:14540; Ctrl-C ends it"
+READY_TEXT = "PX4 flies at udp:127.0.0.1:14540; Ctrl-C ends it"
 TIMING = {"IMU_INTEG_RATE": 400, "COM_OBL_RC_ACT": 5}
 """PX4 parameters for a state every 10 ms, and for position hold when setpoints stop."""
 
@@ -52,7 +52,7 @@ TIMING = {"IMU_INTEG_RATE": 400, "COM_OBL_RC_ACT": 5}
 class Px4Simulation:
     """A PX4 process; leaving the context ends the process."""
 
-    def __init__(self, package: Path, run: Path, *, model: str = OWN, **parameters: float) -> None:
+    def __init__(self, package: Path, run: Path, *, model: str = OWN_MODEL, **parameters: float) -> None:
         """Prepare the simulation without starting PX4.
 
         Args:
@@ -74,7 +74,7 @@ class Px4Simulation:
         parameters = {f"PX4_PARAM_{name}": str(value) for name, value in self._parameters.items()}
         variables = {
             "PX4_SIM_MODEL": self._model,
-            "PX4_SIMULATOR": "sihsim" if self._model == OWN else "none",
+            "PX4_SIMULATOR": "sihsim" if self._model == OWN_MODEL else "none",
             "PX4_PARAM_SDLOG_BACKEND": "0",
         }
         with (self._run / "px4.log").open("wb") as log:
@@ -165,7 +165,7 @@ def _fly_own(options: argparse.Namespace, run: Path) -> None:
     """Run PX4 with its own physics until it ends."""
     with Px4Simulation(options.package, run, **dict(options.set)) as px4:
         cameras = MotionCapture()
-        print(READY, flush=True)
+        print(READY_TEXT, flush=True)
         while not px4.has_ended:
             cameras.step(time.monotonic() + 0.5)
 
@@ -183,7 +183,7 @@ def _fly_external(options: argparse.Namespace, run: Path) -> None:
         world.connect()
         be_punctual(25, os.sched_getaffinity(0))
         cameras = MotionCapture()
-        print(READY, flush=True)
+        print(READY_TEXT, flush=True)
         every, second, starting = (round(interval / STEP) for interval in (1.0 / CAPTURE_RATE, 1.0, START_S))
         steps, slip, listens = 0, 0.0, options.disturbance is not None
         while not px4.has_ended:

@@ -28,7 +28,7 @@ PORT = 4560  # TCP port to which PX4 connects
 STEP_MS = 4  # [ms] between two measurements of the inertial unit
 STEP = STEP_MS * SUBSTEP
 ANSWER_S = 0.02  # [s] within which PX4 answers a measurement
-BEHIND = 0.02  # [s], largest delay that the world still makes up for
+LONGEST_LAG = 0.02  # [s], largest delay that the world still makes up for
 GYRO, FORCE, FIELD = 3e-3, 0.05, 1e-3  # standard deviations: [rad/s], [m/s^2], [gauss]
 PLACE, SPEED, TURN = 3e-4, 3e-3, 1e-3  # standard deviations of motion capture: [m], [m/s], [rad]
 NORTH_DOWN = np.array([0.21, 0.0, 0.43])  # magnetic field, north-east-down [gauss]
@@ -114,7 +114,7 @@ class Px4World:
         late = time.monotonic() - self._due
         if late < 0.0:
             time.sleep(-late)
-        elif late > BEHIND:
+        elif late > LONGEST_LAG:
             self.slip, self._due = self.slip + late, self._due + late
         self._steps += 1
         self._send(self._sensor_message())
@@ -148,9 +148,9 @@ class Px4World:
 
     def _sensor_message(self) -> Any:
         draw, R = self._rng.normal, self._attitude()
-        omega = frames.turned_body(self._output[15:18]) + GYRO * draw(size=3)
-        force = frames.turned_body(self._output[18:21]) + FORCE * draw(size=3)
-        field = frames.turned_body(R.T @ frames.turned_world(NORTH_DOWN)) + FIELD * draw(size=3)
+        omega = frames.turn_body(self._output[15:18]) + GYRO * draw(size=3)
+        force = frames.turn_body(self._output[18:21]) + FORCE * draw(size=3)
+        field = frames.turn_body(R.T @ frames.turn_world(NORTH_DOWN)) + FIELD * draw(size=3)
         height = HOME[2] + self._output[2]
         pressure = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588 + 0.01 * draw()  # [hPa]
         return self._dialect.MAVLink_hil_sensor_message(
@@ -159,18 +159,18 @@ class Px4World:
 
     def _truth_message(self) -> Any:
         p, _, v, omega, force = np.split(self._output, [3, 12, 15, 18])
-        north, east, _ = frames.turned_world(p)
+        north, east, _ = frames.turn_world(p)
         place = [
             round(1e7 * (HOME[0] + north / METRES)),
             round(1e7 * (HOME[1] + east / METRES / math.cos(math.radians(HOME[0])))),
             round(1e3 * (HOME[2] + p[2])),
         ]
-        velocity = [round(100.0 * float(each)) for each in frames.turned_world(v)]
-        share = frames.turned_body(force) / STANDARD_GRAVITY
+        velocity = [round(100.0 * float(each)) for each in frames.turn_world(v)]
+        share = frames.turn_body(force) / STANDARD_GRAVITY
         milli_g = [round(1e3 * float(each)) for each in np.clip(share, -32.0, 32.0)]
         q = frames.quaternion_of(self._attitude()).tolist()
         return self._dialect.MAVLink_hil_state_quaternion_message(
-            self._now(), q, *frames.turned_body(omega), *place, *velocity, 0, 0, *milli_g
+            self._now(), q, *frames.turn_body(omega), *place, *velocity, 0, 0, *milli_g
         )
 
     def _attitude(self) -> np.ndarray:

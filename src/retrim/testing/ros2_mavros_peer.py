@@ -14,8 +14,8 @@ from ..ros2.message_type import MessageType, message_type
 from ..ros2.node import SENSOR, Publish, Qos, Ros2Node
 from .peer_vehicle import DT, PeerVehicle
 
-FRESH_S = 0.3  # [s]: time for which a target is valid
-SLOW = 4  # ticks between two messages about thrust
+VALIDITY_S = 0.3  # [s]: time for which a target is valid
+THRUST_PERIOD = 4  # ticks between two messages about thrust
 ODOMETRY, POSE, TARGET = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "mavros_msgs/msg/AttitudeTarget"
 
 
@@ -86,7 +86,7 @@ class Ros2Peer(abc.ABC):
         if self._calls % per_tick == 0:
             self._tick += 1
             self.advance()
-            if self._tick % SLOW == 0:
+            if self._tick % THRUST_PERIOD == 0:
                 self.report()
         later = (self._calls % per_tick) * self.habits.period
         every = max(1, round(1.0 / (self.habits.rate * self.habits.period)))
@@ -127,7 +127,7 @@ class MavrosPeer(Ros2Peer):
 
     def __init__(
         self, node: Ros2Node, scenario: Scenario, habits: Habits, *, place: np.ndarray, yaw: float,
-        poses: bool = False, reports_thrust: bool = True, namespace: str = "/mavros", fresh: float = FRESH_S,
+        poses: bool = False, reports_thrust: bool = True, namespace: str = "/mavros", fresh: float = VALIDITY_S,
     ) -> None:  # fmt: skip
         """Build a vehicle that is about to take off.
 

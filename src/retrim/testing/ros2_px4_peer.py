@@ -104,9 +104,9 @@ class Px4Peer(Ros2Peer):
             return
         self._send(
             "vehicle_odometry", timestamp_sample=self.habits.now_ns() // 1000, pose_frame=1, velocity_frame=1,
-            position=frames.turned_world(p).astype(np.float32), q=frames.quaternion_of(x.R).astype(np.float32),
-            velocity=frames.turned_world(x.v).astype(np.float32),
-            angular_velocity=frames.turned_body(x.omega).astype(np.float32),
+            position=frames.turn_world(p).astype(np.float32), q=frames.quaternion_of(x.R).astype(np.float32),
+            velocity=frames.turn_world(x.v).astype(np.float32),
+            angular_velocity=frames.turn_body(x.omega).astype(np.float32),
         )  # fmt: skip
 
     def _send(self, topic: str, **values: Any) -> None:
@@ -122,15 +122,15 @@ class Px4Peer(Ros2Peer):
             publish(data)
 
     def _take_rates(self, m: Any) -> None:
-        omega = frames.turned_body(np.array([m.roll, m.pitch, m.yaw]))
+        omega = frames.turn_body(np.array([m.roll, m.pitch, m.yaw]))
         self._rates = np.concatenate([[-m.thrust_body[2] * self.vehicle.thrust_max], omega])
         self._setpoint_time = time.monotonic()
         self.engage()
 
     def _take_place(self, m: Any) -> None:
         if self.mode == OFFBOARD or not self.vehicle.flies:
-            self._place = frames.turned_world(np.asarray(m.position, float))
-            self._yaw = frames.turned_heading(float(m.yaw))
+            self._place = frames.turn_world(np.asarray(m.position, float))
+            self._yaw = frames.turn_heading(float(m.yaw))
         self._setpoint_time = time.monotonic()
 
     def _take_wish(self, m: Any) -> None:

@@ -18,7 +18,7 @@ from .laws import close, require
 
 HEADING = 0.5  # [rad]
 OLDEST = 0.1  # [s]
-PUSHED_S, TURNED_S = 0.5, 0.4
+PUSH_S, TURN_S = 0.5, 0.4
 
 
 def check_vehicle(
@@ -86,17 +86,17 @@ def _check_flight(plant: VehiclePlant, first: Measurement, start: State, hover_s
     hold_hover(1.5)
 
     before = last
-    for _ in range(round(PUSHED_S / plant.dt)):
+    for _ in range(round(PUSH_S / plant.dt)):
         last, _ = plant.step(Command(jnp.array(STANDARD_GRAVITY + 2.0), jnp.zeros(3)))
-    require(float(last.x.v[2] - before.x.v[2]) > 0.3 * 2.0 * PUSHED_S, "more thrust accelerates it upwards, per mass")
+    require(float(last.x.v[2] - before.x.v[2]) > 0.3 * 2.0 * PUSH_S, "more thrust accelerates it upwards, per mass")
     hold_hover(2.0)
     for axis, name in enumerate("xyz"):
         before = last
-        for _ in range(round(TURNED_S / plant.dt)):
+        for _ in range(round(TURN_S / plant.dt)):
             last, _ = plant.step(Command(jnp.array(STANDARD_GRAVITY), jnp.zeros(3).at[axis].set(0.8)))
         angle = np.asarray(so3.log(before.x.R.T @ last.x.R))
         require(
-            float(angle[axis]) > 0.05 * 0.8 * TURNED_S, f"a body rate about {name} turns it about {name}, the right way"
+            float(angle[axis]) > 0.05 * 0.8 * TURN_S, f"a body rate about {name} turns it about {name}, the right way"
         )
         assert last.omega is not None
         require(float(last.omega[axis]) > 0.1, f"a body rate about {name} is measured")

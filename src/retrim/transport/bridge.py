@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from ..errors import MessageError
 from .bus import Bus
 
-EVERY = 0.05  # shortest time between two messages of a throttled topic [s]
+LEAST_INTERVAL = 0.05  # shortest time between two messages of a throttled topic [s]
 
 
 class Bridge:
@@ -30,8 +30,8 @@ class Bridge:
             there: Second bus.
             out: Topics carried from ``here`` to ``there``.
             into: Topics carried from ``there`` to ``here``.
-            slowly: Topics that are published more often than necessary; at most one message per ``EVERY`` seconds is
-                carried.
+            slowly: Topics that are published more often than necessary; at most one message per ``LEAST_INTERVAL``
+                seconds is carried.
             versions: Version of each topic up to which messages are not carried; None to carry every message.
             clock: Monotonic clock [s].
         """
@@ -47,7 +47,7 @@ class Bridge:
         """Carry new messages; return their number."""
         count = 0
         for source, target, topic in self._routes:
-            if topic in self._slowly and self._clock() - self._last_times[topic] < EVERY:
+            if topic in self._slowly and self._clock() - self._last_times[topic] < LEAST_INTERVAL:
                 continue
             message = source.latest(topic, self.versions[topic])
             if message is None:

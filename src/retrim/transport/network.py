@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from .bus import Bus, Message
 from .in_process import check_fits, check_topic
 from .session import HEAD as SEAL
-from .session import MARK, MISSING, Session
+from .session import MARK, MISSING_KEY, Session
 
 HEAD = struct.Struct("<QQ")
 """Writer and version, before each message."""
@@ -79,7 +79,7 @@ class NetworkBus(Bus):
         """Receive a message from the network, in any thread."""
         head = (HEAD if self._talk is None else SEAL).size
         if self._talk is None and frame.startswith(MARK):
-            self._refusals, self._fault = self._refusals + 1, MISSING
+            self._refusals, self._fault = self._refusals + 1, MISSING_KEY
         elif len(frame) > head + self._capacities[topic]:
             self._refusals += 1
         elif self._talk is not None:

@@ -9,7 +9,7 @@ from ..errors import ConfigError
 from ..ros2.node import LARGEST_DOMAIN, is_local
 from .network import NetworkBus
 from .session import GREETINGS, Session
-from .shared_key import MAKING, VARIABLE, SharedKey, read_key
+from .shared_key import KEY_COMMAND, VARIABLE, SharedKey, read_key
 
 KINDS = ("zenoh", "ros")
 ROS2 = "ros2"
@@ -68,7 +68,7 @@ class Address:
         if self.shared is None and not self.loopback:
             raise ConfigError(
                 f"{self}: learners beyond this machine need a shared key: --key FILE or the variable {VARIABLE}, the "
-                f"same at both ends; {MAKING}"
+                f"same at both ends; {KEY_COMMAND}"
             )
 
     def join(self, capacities: Mapping[str, int], *, listen: bool, writes: Iterable[str] = ()) -> NetworkBus:

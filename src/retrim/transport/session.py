@@ -20,12 +20,12 @@ MARK = b"signed1\xff"
 """Beginning of every signed message: format and version. Unsigned messages never begin with it."""
 HEAD = struct.Struct("<8s16s16sQ32s")
 """Mark, sender, receiver, count, code."""
-NOBODY = bytes(16)
+NO_SENDER = bytes(16)
 GREETINGS = "greeting.flight", "greeting.ground"
 """Greeting topics of the end that listens and of the end that connects."""
 UNSIGNED = "the other end has no key; start it with --key FILE or RETRIM_KEY, the same as here"
-FOREIGN = "the other end has another key; --key FILE or RETRIM_KEY must be the same at both ends"
-MISSING = "the other end has a key, and this one has none; start it with --key FILE or RETRIM_KEY"
+FOREIGN_KEY = "the other end has another key; --key FILE or RETRIM_KEY must be the same at both ends"
+MISSING_KEY = "the other end has a key, and this one has none; start it with --key FILE or RETRIM_KEY"
 
 
 class Due(NamedTuple):
@@ -57,8 +57,8 @@ class Session:
         """Set while a message is due."""
         self.pending.set()
         self._key, self._vehicle, self._me = key, vehicle.encode(), secrets.token_bytes(16)
-        self._peer, self._former = NOBODY, set[bytes]()
-        self._greet: bytes | None = NOBODY
+        self._peer, self._former = NO_SENDER, set[bytes]()
+        self._greet: bytes | None = NO_SENDER
         self._greeting: bytes | None = None
         self._again, self._greetings = False, 0
         self._newest = dict[str, int]()
@@ -76,7 +76,7 @@ class Session:
         _, sender, receiver, count, code = HEAD.unpack_from(frame)
         data = frame[HEAD.size :]
         if not hmac.compare_digest(code, self._code(topic, sender, receiver, count, data)):
-            self._refuse(FOREIGN)
+            self._refuse(FOREIGN_KEY)
             return None
         with self._lock:
             if sender == self._me:  # an echo
@@ -110,7 +110,7 @@ class Session:
 
     def _meet(self, sender: bytes) -> None:
         """Accept an end that has sent this end's number: it is running, and replaces the previous one."""
-        if self._peer != NOBODY:
+        if self._peer != NO_SENDER:
             self._former.add(self._peer)
         self._peer, self._newest, self.fault = sender, {}, ""
         self._again = True
@@ -120,7 +120,7 @@ class Session:
 
     def _refuse(self, why: str) -> None:
         self.refusals += 1
-        if self._peer == NOBODY:
+        if self._peer == NO_SENDER:
             self.fault = why or self.fault
 
     def _seal(self, topic: str, receiver: bytes, count: int, data: bytes) -> bytes:

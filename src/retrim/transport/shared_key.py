@@ -10,7 +10,7 @@ from ..errors import ConfigError
 
 VARIABLE = "RETRIM_KEY"
 SHORTEST, LONGEST = 16, 4096  # bytes
-MAKING = "openssl rand -hex 32 > FILE makes one"
+KEY_COMMAND = "openssl rand -hex 32 > FILE makes one"
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ def read_key(file: Path | None) -> SharedKey | None:
                 secret = stream.read(LONGEST + 2).strip()
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or "no such file"
-            raise ConfigError(f"{source}: the key cannot be read ({reason}); {MAKING}") from error
+            raise ConfigError(f"{source}: the key cannot be read ({reason}); {KEY_COMMAND}") from error
     elif not variable:
         return None
     if not SHORTEST <= len(secret) <= LONGEST:
-        raise ConfigError(f"{source}: a key has {SHORTEST} to {LONGEST} bytes, this one {len(secret)}; {MAKING}")
+        raise ConfigError(f"{source}: a key has {SHORTEST} to {LONGEST} bytes, this one {len(secret)}; {KEY_COMMAND}")
     return SharedKey(secret)

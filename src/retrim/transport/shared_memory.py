@@ -23,7 +23,7 @@ from .leftovers import begin, clear, hold
 WORD = 8
 HEADER = 8 * WORD  # version of the last message; then version, length, checksum of each slot
 VERSION, SLOTS = 0, (1, 4)
-TRIES = 100
+ATTEMPTS = 100
 PLAN = "topics.json"
 PREFIX = "retrim-"
 
@@ -111,7 +111,7 @@ class SharedMemoryBus(Bus):
         """Return the last message of ``topic`` if it is newer than ``after``."""
         check_topic(topic, self._capacities)
         memory, words = self._maps[topic]
-        for _ in range(TRIES):
+        for _ in range(ATTEMPTS):
             version = words[VERSION]
             if version <= after:
                 return None

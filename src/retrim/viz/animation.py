@@ -128,8 +128,8 @@ class _Stage:
         self._clock.set_text(f"{t:.1f} s\n{label}")
         for actor, scene, curve in zip(self._actors, self._scenes, self._curves, strict=True):
             scene.draw(t)
-            shown = actor.t <= t
-            curve.set_data(actor.t[shown], actor.error[shown])
+            visible = actor.t <= t
+            curve.set_data(actor.t[visible], actor.error[visible])
 
 
 class _Scene:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 SMALLEST, LARGEST = 1e-3, 1.0  # [m]: ends of the colour scale
-ACROSS = 4  # panels per row
+PANELS_PER_ROW = 4  # panels per row
 LOST = "#D55E00"
 
 
@@ -30,7 +30,7 @@ def vehicle_map(
     """
     from matplotlib.colors import LogNorm
 
-    down, across = -(-len(errors) // ACROSS), min(ACROSS, len(errors))
+    down, across = -(-len(errors) // PANELS_PER_ROW), min(PANELS_PER_ROW, len(errors))
     with sheet((2.9 * across + 0.8, 2.9 * down + 0.6), 9.0, boxed=True) as figure:
         grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
         figure.suptitle(title, fontsize=12, fontweight="bold", color=INK)

@@ -19,9 +19,9 @@ from retrim.estimation.prediction import Prediction, Underway
 from retrim.physics.state import STANDARD_GRAVITY, Command, State
 from retrim.tasks.task import AbstractTask
 
-AHEAD, APART = 10, 0.06  # number of reference points in the observation, and the time between them [s]
-OWN = 22  # size of the state part: error, velocity, attitude, disturbance, acting command
-SIZE = OWN + 3 * AHEAD
+POINTS, SPACING = 10, 0.06  # number of reference points in the observation, and the time between them [s]
+STATE_SIZE = 22  # size of the state part: error, velocity, attitude, disturbance, acting command
+SIZE = STATE_SIZE + 3 * POINTS
 SCALE = (5.0, 3.0, 3.0, 1.0)  # scales of the actions: [m/s^2], [rad/s]
 
 
@@ -41,7 +41,7 @@ class DattNet(eqx.Module):
     def of(cls, *, key: Key[Array, ""], width: int = 64) -> "DattNet":
         """Return a fresh network; its mean action is nearly zero, which is hover."""
         k_first, k_second, k_actor, k_critic = random.split(key, 4)
-        size = OWN + 8 * (AHEAD - 4)
+        size = STATE_SIZE + 8 * (POINTS - 4)
         actor = eqx.nn.MLP(size, 4, width, 3, key=k_actor)
         actor = eqx.tree_at(lambda m: m.layers[-1].weight, actor, 0.01 * actor.layers[-1].weight)
         actor = eqx.tree_at(lambda m: m.layers[-1].bias, actor, jnp.zeros(4))
@@ -57,8 +57,8 @@ class DattNet(eqx.Module):
 
     def __call__(self, o: Float[Array, " o"]) -> tuple[Float[Array, "4"], Float[Array, ""]]:
         """Return the mean action and the value for an observation from :func:`datt_observation`."""
-        ahead = jax.nn.relu(_along(o[OWN:].reshape(AHEAD, 3), self.first, self.first_bias))
-        features = jnp.concatenate([o[:OWN], _along(ahead, self.second, self.second_bias).reshape(-1)])
+        ahead = jax.nn.relu(_along(o[STATE_SIZE:].reshape(POINTS, 3), self.first, self.first_bias))
+        features = jnp.concatenate([o[:STATE_SIZE], _along(ahead, self.second, self.second_bias).reshape(-1)])
         return self.actor(features), self.critic(features)
 
 
@@ -130,7 +130,7 @@ class DattController(AbstractController[DattState]):
         estimate = self.estimator(memory.estimate, t, x, thrust)
         d = jnp.clip(estimate.d_hat, -self.known, self.known)
         soon, acting = self.prediction(memory.underway, x, estimate.d_hat)
-        times = t + self.prediction.path.delay.astype(t.dtype) + APART * jnp.arange(AHEAD, dtype=t.dtype)
+        times = t + self.prediction.path.delay.astype(t.dtype) + SPACING * jnp.arange(POINTS, dtype=t.dtype)
         ahead = jax.vmap(self.task.target)(times)
         mean, _ = self.net(datt_observation(soon, acting, d, ahead))
         u = datt_command(mean, self.low, self.high)

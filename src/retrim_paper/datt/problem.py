@@ -14,7 +14,7 @@ from retrim.physics.actuators import apply_lag
 from retrim.physics.dynamics import PointMass
 from retrim.physics.state import Command, State
 
-from .controller import AHEAD, APART, datt_command, datt_observation
+from .controller import POINTS, SPACING, datt_command, datt_observation
 
 EPISODE = 10.0  # [s]
 TICK = 0.02  # [s], tick for WALK and DISCOUNT; for a different tick they are scaled to the same effect per second
@@ -60,8 +60,8 @@ class DattProblem(eqx.Module):
 
     def observe(self, s: DattEnv, key: Key[Array, ""]) -> Float[Array, " o"]:
         """Return the policy's observation, with 5 mm of position noise, as in DATT."""
-        every = round(APART / self.dt)
-        at = jnp.minimum(s.tick + every * jnp.arange(AHEAD), self.bank.shape[1] - 1)
+        every = round(SPACING / self.dt)
+        at = jnp.minimum(s.tick + every * jnp.arange(POINTS), self.bank.shape[1] - 1)
         x = State(s.x.p + 0.005 * random.normal(key, (3,), s.x.p.dtype), s.x.R, s.x.v)
         return datt_observation(x, s.acting, s.d, self.bank[s.reference, at])
 
@@ -102,7 +102,7 @@ def reference_bank(seed: int, n: int = 512, *, dt: float = 0.02) -> np.ndarray:
     Returns:
         Positions around the origin, shape (n, ticks, 3) [m].
     """
-    draw, ticks = np.random.default_rng(seed), ticks_of(dt) + AHEAD * round(APART / dt) + 1
+    draw, ticks = np.random.default_rng(seed), ticks_of(dt) + POINTS * round(SPACING / dt) + 1
     t = dt * np.arange(ticks)
     bank = np.zeros((n, ticks, 3))
     for i in range(n):

@@ -20,7 +20,7 @@ from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 from retrim.runkit.store import Store
 
-from .controller import APART, DattNet
+from .controller import SPACING, DattNet
 from .ppo import PpoSettings, PpoState, ppo
 from .problem import DattProblem, discount, reference_bank
 
@@ -47,15 +47,15 @@ def check_period(preset: Preset) -> None:
     Raises:
         ConfigError: The period does not meet these conditions; the message names the preset.
     """
-    apart = APART / preset.dt
+    apart = SPACING / preset.dt
     if abs(apart - round(apart)) > 1e-6 or preset.dt > 0.02:
         raise ConfigError(
-            f"preset {preset.name!r}: DATT looks ahead in steps of {APART} s, which must be whole control periods of "
+            f"preset {preset.name!r}: DATT looks ahead in steps of {SPACING} s, which must be whole control periods of "
             f"20 ms or less, not of {1000 * preset.dt:g} ms"
         )
 
 
-def rounded_steps(steps: int) -> int:
+def round_steps(steps: int) -> int:
     """Return the number of training steps for a request of ``steps``, rounded up to whole updates."""
     settings = PpoSettings(**DATT_PPO)
     return settings.updates(steps) * settings.envs * settings.steps

@@ -25,7 +25,7 @@ from retrim.physics.substep import SUBSTEP, AbstractSubstepDynamics, RotorState
 from retrim.plants.extras import import_extra
 
 PERIOD = 10  # [ms], time between two decisions
-FARTHEST, FASTEST = 0.5, 1.0  # [m], [m/s]: largest differences from the reference in the observation
+LARGEST_DISTANCE, LARGEST_SPEED = 0.5, 1.0  # [m], [m/s]: largest differences from the reference in the observation
 ORDER = (0, 2, 1, 3)  # RAPTOR's rotor for each of ours; its order is front-right, back-right, back-left, front-left
 
 
@@ -141,7 +141,7 @@ class RaptorQuadrotor(AbstractSubstepDynamics[RaptorState]):
         body, x = s.body.body, self.state(s)
         setpoint = self.setpoint(SUBSTEP * s.ms.astype(x.p.dtype))
         facing = so3.rotz(setpoint.heading).T
-        p = jnp.clip(so3.act(facing, x.p - setpoint.p), -FARTHEST, FARTHEST)
-        v = jnp.clip(so3.act(facing, x.v - setpoint.v), -FASTEST, FASTEST)
+        p = jnp.clip(so3.act(facing, x.p - setpoint.p), -LARGEST_DISTANCE, LARGEST_DISTANCE)
+        v = jnp.clip(so3.act(facing, x.v - setpoint.v), -LARGEST_SPEED, LARGEST_SPEED)
         o = jnp.concatenate([p, so3.mul(facing, x.R).reshape(9), v, body.omega, s.action])
         return self.net(s.hidden, o)

@@ -30,7 +30,9 @@ class Published(NamedTuple):
 
 _LEARNED = (10, 14, 17, 22, 23, 11, 17, 27, 27, 46)
 _PERFECT = (1, 0, 1, 1, 2, 0, 1, 3, 11, 28)
-PUBLISHED = {name: Published(*pair) for name, pair in zip(NAMES, zip(_LEARNED, _PERFECT, strict=True), strict=True)}
+PUBLISHED_ERRORS = {
+    name: Published(*pair) for name, pair in zip(NAMES, zip(_LEARNED, _PERFECT, strict=True), strict=True)
+}
 """Published errors by the name of the reference."""
 
 

@@ -98,7 +98,7 @@ def mix(mean: Float[Array, ""], change: Float[Array, "3"]) -> Float[Array, "4"]:
 
     Args:
         mean: Mean thrust of the rotors [N].
-        change: Change of a rotor's thrust for the wanted torque about each axis [N].
+        change: Change of a rotor's thrust for the desired torque about each axis [N].
     """
     room = jnp.minimum(jnp.maximum(mean, LEAST_AUTHORITY), ROTOR_MAX - mean)
     tilt = signs(mean.dtype)[:2].T @ change[:2]

@@ -25,16 +25,16 @@ RAMP = 5.0  # [s], duration of the smooth start, so that every flight is on its 
 
 def circle_at_mean(speed: float) -> Reference:
     """Return the circle at a constant speed [m/s]."""
-    return _sampled("circle", speed, jax.config.values["jax_enable_x64"])
+    return _sample("circle", speed, jax.config.values["jax_enable_x64"])
 
 
 def lemniscate_at_mean(speed: float) -> Reference:
     """Return the lemniscate x = r cos(phi), y = r sin(phi) cos(phi) with a mean speed [m/s]; phi turns uniformly."""
-    return _sampled("lemniscate", speed, jax.config.values["jax_enable_x64"])
+    return _sample("lemniscate", speed, jax.config.values["jax_enable_x64"])
 
 
 @cache
-def _sampled(shape: str, speed: float, x64: bool) -> Reference:
+def _sample(shape: str, speed: float, x64: bool) -> Reference:
     """Return a trajectory, sampled once per process and precision: every cell trains on all ten."""
     if shape == "circle":
         return with_free_heading(circle(RADIUS, 2.0 * math.pi * RADIUS / speed, ramp=RAMP))

@@ -14,11 +14,11 @@ from retrim.transport.bus import Bus
 from retrim.transport.remote import Address
 from retrim.transport.shared_memory import SharedMemoryBus
 
-from ..latency import COUNT, EVERY, SIZES, TOPICS, free_port, measure_latencies, other_process, rosmaster, two_machines
+from ..latency import COUNT, PERIOD, SIZES, TOPICS, free_port, measure_latencies, other_process, rosmaster, two_machines
 
 INTRO = (
     "Made by `retrim reproduce buses`. One way, from the call in one process to the bytes in another, by the clock "
-    f"that both share; {COUNT} messages of each size, one every {1e3 * EVERY:g} ms. Between namespaces: two network "
+    f"that both share; {COUNT} messages of each size, one every {1e3 * PERIOD:g} ms. Between namespaces: two network "
     "namespaces of this machine with a virtual cable. ROS 1 with a real rosmaster, rospy at both ends. What is not "
     "installed, or not allowed, is left out."
 )

@@ -26,7 +26,7 @@ from ..design import (
     PUSH,
     ROLLOUT_S,
     ROLLOUTS,
-    SCORED_S,
+    SCORE_S,
     fly_batch_of_policy,
     retrain,
 )
@@ -54,14 +54,14 @@ def design(
         starts: Scored flights per seed.
         epochs: Re-training epochs; a multiple of ten.
     """
-    (base,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=SCORED_S)
+    (base,) = table_presets([preset], "hover", seeds=seeds, starts=starts, seconds=SCORE_S)
     if epochs < CHUNK or epochs % CHUNK:
         raise ConfigError(f"--epochs {epochs} must be a positive multiple of {CHUNK}")
     intro = (
         f"Made by `retrim reproduce design`, after the paper's protocol: {ROLLOUTS} flights of {ROLLOUT_S:g} s of the "
         f"base policy under 2 m/s² along +x on plant `{PLANT}`; one residual network for each model, "
         f"{FIT_EPOCHS} epochs; {epochs} epochs of the policy, {ENVS} roll-outs each; then {starts} flights of "
-        f"{SCORED_S:g} s without further learning, scored over their last 2 s. Times are medians over seeds and "
+        f"{SCORE_S:g} s without further learning, scored over their last 2 s. Times are medians over seeds and "
         f"programs of {CHUNK} epochs, with their range; the variants alternate. Compiling: as the "
         "machine's compile cache had it, for the first seed. High fidelity: rotors, thrust map, "
         "drag and rate controller at 1 kHz; its gradient is its own, or that of the point mass."
@@ -79,7 +79,7 @@ def design(
                 advance(len(rows) / (len(CHOICES) * len(study.policies)), f"{name}, seed {seed}")
                 result = retrain(setup, policy, logs, random.key(seed), choice, epochs=epochs)
                 spec = FlightSpec(Scenario(PUSH, PLANT), "base", 0, seed)
-                flight_logs = fly_batch_of_policy(setup, result.policy, starts, SCORED_S, seed)
+                flight_logs = fly_batch_of_policy(setup, result.policy, starts, SCORE_S, seed)
                 flights = [score_flight(setup, spec, cut_at_termination(setup.flight_task, log)) for log in flight_logs]
                 rows.append({
                     "model": name, "seed": seed, "order": i, "compile_s": result.compile_s, "epoch_s": result.epoch_s,

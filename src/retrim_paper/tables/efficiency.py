@@ -20,7 +20,7 @@ from retrim.runkit.training import train
 
 from ..datt.controller import DattNet
 from ..datt.method import datt_of
-from ..datt.training import DATT_STEPS, check_period, check_steps, rounded_steps, train_datt
+from ..datt.training import DATT_STEPS, check_period, check_steps, round_steps, train_datt
 
 INTRO = """\
 Made by `retrim reproduce efficiency`. Steps are control ticks of one simulated vehicle. Training: its time without
@@ -91,7 +91,7 @@ def efficiency(
         compiling = watch.compile_s
         if nets:
             rows.append({
-                "method": "datt", "steps": rounded_steps(datt_steps), "training_s": watch.total_s - compiling,
+                "method": "datt", "steps": round_steps(datt_steps), "training_s": watch.total_s - compiling,
                 "training_compile_s": compiling, "decision_s": decision_s(setup, datt_of(setup, nets[0])),
             })  # fmt: skip
     if rows:

@@ -22,7 +22,7 @@ def figures_table(rows: Sequence[dict[str, Any]], title: str, levels: Mapping[st
         "95 % interval [m]": lambda row: _interval(row["interval"]),
         "to 5 cm [s]": lambda row: _figure(row["settle_s"], 1),
         "worst after 5 s [m]": lambda row: _metres(row["peak_after_5s"]),
-        **(BEHIND_COLUMNS if tracks else {}),
+        **(DELAY_COLUMNS if tracks else {}),
         "body rates [rad/s]": lambda row: _figure(row["rates_rms"], 2),
         "their change in a tick [rad/s]": lambda row: _figure(row["rates_change_rms"], 3),
     }
@@ -38,7 +38,7 @@ def figures_table(rows: Sequence[dict[str, Any]], title: str, levels: Mapping[st
     return TableSection(("method", *columns), lines, f"{title}: {levels[level]}", about)
 
 
-BEHIND_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
+DELAY_COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
     "behind [s]": lambda row: _figure(row.get("behind_s"), 3),
     "error but for that [m]": lambda row: _metres(row.get("unshifted_m")),
 }

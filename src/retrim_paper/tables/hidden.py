@@ -26,9 +26,9 @@ from retrim.viz.vehicle_map import vehicle_map
 from .hidden_entrants import KNOWLEDGE, Entrant
 
 MOST_VEHICLES = 10_000
-PUSHED = 4.0  # [s], time of the push at hover
-AFTER = 5.0  # [s], time after the push from which the error is scored for one second
-SPUN_UP = 5.0  # [s], time from which tracking errors are scored; the reference has its full speed by then
+PUSH_TIME = 4.0  # [s], time of the push at hover
+SCORE_DELAY = 5.0  # [s], time after the push from which the error is scored for one second
+FULL_SPEED_TIME = 5.0  # [s], time from which tracking errors are scored; the reference has its full speed by then
 INTRO = """\
 Made by `retrim gauntlet --vehicles hidden{option}`: {count} vehicles, drawn from one size factor (seed {seed}), from
 30 g to 3 kg: lag of the body rates 15 to 150 ms (second order, damping ratio 0.4 to 1.2), command delay 0 to 60 ms,
@@ -67,21 +67,21 @@ class Scoring:
 def _hover_scores(flight: Flight) -> dict[str, float]:
     t, error, is_lost = flight.log.t, flight.error, flight.log.terminated
     return {
-        "error_m": np.inf if is_lost else float(np.mean(error[t >= PUSHED + AFTER - 1e-6])),
-        "to_10cm_s": recoveries(t, error, [PUSHED], 0.1, terminated=is_lost)[0],
-        "to_2cm_s": recoveries(t, error, [PUSHED], 0.02, terminated=is_lost)[0],
-        "peak_m": np.inf if is_lost else float(np.max(error[t >= PUSHED])),
+        "error_m": np.inf if is_lost else float(np.mean(error[t >= PUSH_TIME + SCORE_DELAY - 1e-6])),
+        "to_10cm_s": recoveries(t, error, [PUSH_TIME], 0.1, terminated=is_lost)[0],
+        "to_2cm_s": recoveries(t, error, [PUSH_TIME], 0.02, terminated=is_lost)[0],
+        "peak_m": np.inf if is_lost else float(np.max(error[t >= PUSH_TIME])),
     }
 
 
 def _track_scores(flight: Flight) -> dict[str, float]:
     if flight.log.terminated:
         return {"rmse_m": np.inf, "peak_m": np.inf}
-    error = flight.error[flight.log.t >= SPUN_UP]
+    error = flight.error[flight.log.t >= FULL_SPEED_TIME]
     return {"rmse_m": float(np.sqrt(np.mean(error**2))), "peak_m": float(np.max(error))}
 
 
-HOVER = Course("Hover, a push of 2 m/s² per axis at 4 s", "hidden", "early-step", PUSHED + AFTER + 1.0)
+HOVER = Course("Hover, a push of 2 m/s² per axis at 4 s", "hidden", "early-step", PUSH_TIME + SCORE_DELAY + 1.0)
 COURSES: dict[str, tuple[Course, ...]] = {
     "hover": (HOVER,),
     "track": (

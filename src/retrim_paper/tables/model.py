@@ -19,7 +19,7 @@ from retrim.runkit.run import Run
 from retrim.viz import plots
 from retrim.viz.panels import Curve, Panel, panel_figure
 
-from ..published import GOLDEN_HOVER, SteadyRotor, compare_published, settled_rotor
+from ..published import GOLDEN_HOVER, SteadyRotor, compare_published, steady_rotor
 
 DT = 0.02  # [s]
 QUADROTORS = ("small", "large", "kingfisher")  # vehicles shown; a user may have registered others
@@ -108,7 +108,7 @@ def inflow_panel() -> Panel:
     descents = np.linspace(-6.0, 14.0, 81)
     ring_values, plain = list[float](), list[float]()
     for v in descents:
-        _, inflow = settled_rotor(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
+        _, inflow = steady_rotor(five_inch(), jnp.array(1109.15), jnp.array(0.0), jnp.array(float(v)))
         ring_values.append(float(vortex_ring(inflow, jnp.array(float(v)))))
         plain.append(float(inflow.v_i))
     spec = np.array([[-4, 5.3631], [-2, 6.5346], [-1, 7.1522], [0, 7.7904], [1, 8.7662], [2, 9.5403], [4, 10.9296]])

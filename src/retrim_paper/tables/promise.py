@@ -10,7 +10,7 @@ from retrim.evaluation.metrics import metres
 from retrim.runkit.document import TableSection
 from retrim.runkit.flights import Flight
 
-ADAPTING = ("full", "lora")
+ADAPTIVE_METHODS = ("full", "lora")
 BASE, OBSERVER = "base", "base-do"
 FACTOR, MARGIN = 1.2, 0.005  # bound on the steady error: factor times the better of base and observer, plus margin [m]
 ABOUT = """\
@@ -28,7 +28,7 @@ def promise_rows(flights: Mapping[str, Sequence[Flight]]) -> list[dict[str, Any]
     for condition, group in flights.items():
         crashes = {(f.spec.method, f.spec.seed, f.spec.start): f.log.terminated for f in group}
         bound = FACTOR * min(_steady(group, method) for method in (BASE, OBSERVER)) + MARGIN
-        for method in ADAPTING:
+        for method in ADAPTIVE_METHODS:
             own = [f for f in group if f.spec.method == method]
             if not own:
                 continue

@@ -7,30 +7,33 @@ from pathlib import Path
 from typing import Any
 
 Options = dict[str, Any]
-FEW: Options = {"seeds": (0,), "starts": 2}
-SHORT: Options = {**FEW, "seconds": 12.0}
-WITHOUT_SAMPLING = ("base", "geometric-i", "indi", "full")  # MPPI takes longer than all of these together
+FEW_FLIGHTS: Options = {"seeds": (0,), "starts": 2}
+SHORT_FLIGHTS: Options = {**FEW_FLIGHTS, "seconds": 12.0}
+METHODS_WITHOUT_SAMPLING = ("base", "geometric-i", "indi", "full")  # MPPI takes longer than all of these together
 QUICK: dict[str, Options] = {
-    "hover": {**SHORT, "presets": ("hover/retrim",), "datt_steps": 1_000_000},
-    "track": {**SHORT, "presets": ("track/retrim",), "datt_steps": 1_000_000},
-    "vision": {**SHORT, "presets": ("vision/retrim",), "methods": ("base", "base-do", "indi", "full", "lora")},
-    "reversing": {**FEW, "seconds": 35.0},
-    "design": {**FEW, "epochs": 20},
+    "hover": {**SHORT_FLIGHTS, "presets": ("hover/retrim",), "datt_steps": 1_000_000},
+    "track": {**SHORT_FLIGHTS, "presets": ("track/retrim",), "datt_steps": 1_000_000},
+    "vision": {**SHORT_FLIGHTS, "presets": ("vision/retrim",), "methods": ("base", "base-do", "indi", "full", "lora")},
+    "reversing": {**FEW_FLIGHTS, "seconds": 35.0},
+    "design": {**FEW_FLIGHTS, "epochs": 20},
     "efficiency": {"presets": ("hover/retrim",), "datt_steps": 1_000_000},
-    "transfer": {**SHORT, "methods": WITHOUT_SAMPLING},
-    "raptor": {**SHORT, "methods": ("raptor", "indi", "full")},
-    "fast": {**FEW, "seconds": 24.0, "references": ("figure8=8",), "methods": WITHOUT_SAMPLING},
-    "phase": {**FEW, "seconds": 24.0, "references": ("figure8",)},
-    "plants": {**SHORT, "plant": ("bem", "simple")},
-    "ablation": {**FEW, "seconds": 14.0},
-    "where_learning_pays": {**FEW, "columns": ("base", "observer", "geometric + I", "INDI", "INDI, wrong by two")},
+    "transfer": {**SHORT_FLIGHTS, "methods": METHODS_WITHOUT_SAMPLING},
+    "raptor": {**SHORT_FLIGHTS, "methods": ("raptor", "indi", "full")},
+    "fast": {**FEW_FLIGHTS, "seconds": 24.0, "references": ("figure8=8",), "methods": METHODS_WITHOUT_SAMPLING},
+    "phase": {**FEW_FLIGHTS, "seconds": 24.0, "references": ("figure8",)},
+    "plants": {**SHORT_FLIGHTS, "plant": ("bem", "simple")},
+    "ablation": {**FEW_FLIGHTS, "seconds": 14.0},
+    "where_learning_pays": {
+        **FEW_FLIGHTS,
+        "columns": ("base", "observer", "geometric + I", "INDI", "INDI, wrong by two"),
+    },
     "scaling": {"flights": (12, 40), "seconds": 6.0},
     "tuning": {"candidates": 12, "starts": 1, "methods": ("geometric", "geometric-i", "indi")},
 }
 """Options for the quick version, by table."""
-ALONE = ("model", "efficiency", "buses", "tuning", "design", "scaling")
+SMALL_TABLES = ("model", "efficiency", "buses", "tuning", "design", "scaling")
 """Tables that do not use other machines."""
-GO_ON = (
+PIECES = (
     "hover", "track", "phase", "vision", "fast", "transfer", "raptor", "ablation", "reversing", "plants", "everything",
     "where_learning_pays",
 )  # fmt: skip
@@ -41,11 +44,11 @@ REMARK = "A quick look, smaller than the table: figures to look at, not to quote
 def options_of(make: Callable[..., None]) -> list[Parameter]:
     """Return the options of a table's command: those of its function, and ``on``, ``quick`` and ``out``.
 
-    A function's options are its keyword-only parameters. ``on`` is omitted for tables in ``ALONE``. ``quick`` is not
-    added for tables without a quick version, or with their own ``quick`` option.
+    A function's options are its keyword-only parameters. ``on`` is omitted for tables in ``SMALL_TABLES``. ``quick``
+    is not added for tables without a quick version, or with their own ``quick`` option.
     """
     options = [each for each in inspect.signature(make).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
-    if make.__name__ not in ALONE:
+    if make.__name__ not in SMALL_TABLES:
         options.append(Parameter("on", Parameter.KEYWORD_ONLY, default=None, annotation=str | None))
     if make.__name__ in QUICK:
         options.append(Parameter("quick", Parameter.KEYWORD_ONLY, default=False, annotation=bool))
@@ -55,7 +58,7 @@ def options_of(make: Callable[..., None]) -> list[Parameter]:
 def help_of(make: Callable[..., None]) -> str:
     """Return the docstring for a table's command."""
     text = inspect.getdoc(make) or ""
-    if make.__name__ not in ALONE:
+    if make.__name__ not in SMALL_TABLES:
         text += "\n    on: tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler, whose workers train and fly."
     if make.__name__ in QUICK:
         text += (
@@ -67,7 +70,7 @@ def help_of(make: Callable[..., None]) -> str:
 
 def folder_of(make: Callable[..., None], *, quick: bool = False) -> Path | None:
     """Return the default folder of a table; None means a new folder, for commands that do not resume after a kill."""
-    if make.__name__ not in GO_ON:
+    if make.__name__ not in PIECES:
         return None
     whole = make.__name__ == "everything"  # it has its own folder for the quick version
     return Path("runs") / f"reproduce-{'all' if whole else make.__name__}{'-quick' * (quick and not whole)}"

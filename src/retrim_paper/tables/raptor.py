@@ -17,7 +17,7 @@ of the blade-element plant instead of the rate controller: it reads the state it
 act immediately; all other methods command body rates at 50 Hz with 20 ms of delay. Error over the last 2 s of hover and
 the last 10 s of tracking [m]: mean ± standard deviation over flights. Trained policies receive the vehicle's mass and
 limits; RAPTOR does not receive vehicle data. Learning is charged to flight time by the preset's fixed latencies."""
-DISTURBED = {
+DISTURBANCES = {
     "none": "no disturbance",
     "weak-rotor": "weak rotor",
     "payload": "payload of 70 g",
@@ -67,7 +67,7 @@ def raptor(
                     Scenario(reference=reference),
                     stem,
                     methods,
-                    levels=DISTURBED,
+                    levels=DISTURBANCES,
                     drawn_methods=drawn_methods,
                 )
             )

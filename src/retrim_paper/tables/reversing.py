@@ -19,7 +19,7 @@ from retrim.runkit.reporter import Reporter
 from retrim.runkit.run import Run
 
 PERIOD = 15.0  # [s]
-MOST = 6  # largest number of updates that each have a column
+MOST_UPDATES = 6  # largest number of updates that each have a column
 METHODS: dict[str, str] = {
     "base": "base policy",
     "base-i": "integral action",
@@ -99,7 +99,7 @@ def _moments(adapt: Adapt, seconds: float) -> tuple[np.ndarray, list[int]]:
     turns = np.arange(PERIOD, seconds - PERIOD / 2, PERIOD)
     swaps = np.arange(adapt.update_latency, PERIOD, adapt.update_every)
     updates = list(range(len(swaps)))
-    if len(swaps) > MOST:
+    if len(swaps) > MOST_UPDATES:
         updates = [0, *(2**k for k in range(len(swaps)) if 2**k < len(swaps))]
     after = np.concatenate([[0.0], swaps[updates], [PERIOD]])
     moments: np.ndarray = np.minimum(turns[:, None] + after[None], seconds)

@@ -26,8 +26,8 @@ from retrim.viz.plots import save
 
 CONDITIONS = ("gusts", "payload")
 METHODS = ("base", "full")
-EACH = len(CONDITIONS) * len(METHODS)
-MANY, MACHINES = 1_000_000, (1, 3, 10, 30, 100, 300, 1000)
+FLIGHTS_PER_SEED = len(CONDITIONS) * len(METHODS)
+TOTAL, MACHINES = 1_000_000, (1, 3, 10, 30, 100, 300, 1000)
 LINK, JOB_S = 117e6, 1e-3  # [bytes/s], [s], both assumed
 COLUMNS = (
     "flights",
@@ -59,9 +59,9 @@ def scaling(
     """
     (base,) = table_presets([preset], "hover", seeds=(0,), starts=1, seconds=seconds)
     for n in flights or (0,):
-        if n < EACH or n % EACH:
-            raise ConfigError(f"--flights {n} must be a positive multiple of {EACH}")
-        check_flights(n // EACH, seconds)
+        if n < FLIGHTS_PER_SEED or n % FLIGHTS_PER_SEED:
+            raise ConfigError(f"--flights {n} must be a positive multiple of {FLIGHTS_PER_SEED}")
+        check_flights(n // FLIGHTS_PER_SEED, seconds)
     scenarios = [Scenario(name) for name in CONDITIONS]
     refuse_misfits(base, scenarios, methods=METHODS, starts=1, seconds=seconds)
     intro = (
@@ -77,7 +77,7 @@ def scaling(
     for n in flights if study.policies else ():
         if run.interrupted:
             break
-        fleet = Fleet(base, study.policies, scenarios, methods=METHODS, starts=n // EACH, seconds=seconds)
+        fleet = Fleet(base, study.policies, scenarios, methods=METHODS, starts=n // FLIGHTS_PER_SEED, seconds=seconds)
         watch, errors = Stopwatch(), list[float]()
 
         def note(on_result: Sequence[Flight], errors: list[float] = errors) -> None:
@@ -107,14 +107,14 @@ def _on_machines(rows: Sequence[dict[str, Any]]) -> TableSection:
     lines = []
     for m in MACHINES:
         bounds = {
-            "flying": MANY * per_flight / m,
-            "the client's network": MANY * size / LINK,
-            "the scheduler": MANY / CPU_LIMIT * JOB_S,
+            "flying": TOTAL * per_flight / m,
+            "the client's network": TOTAL * size / LINK,
+            "the scheduler": TOTAL / CPU_LIMIT * JOB_S,
         }
         most = max(bounds, key=lambda name: bounds[name])
         lines.append((f"{m}", _time(compiling + bounds[most]), most))
     about = (
-        f"Not measured, but computed: {MANY:,} such flights on this number of machines of this kind, with a Dask "
+        f"Not measured, but computed: {TOTAL:,} such flights on this number of machines of this kind, with a Dask "
         f"scheduler. Time = compiling ({compiling:.0f} s, on all machines at once, as measured above) + the largest "
         f"of: flying ({1e3 * per_flight:.0f} ms a flight, measured above, divided by the machines); the network of "
         f"the client, who receives {size / 1e3:.0f} kB a flight (measured) at {LINK / 1e6:.0f} MB/s (assumed, a "

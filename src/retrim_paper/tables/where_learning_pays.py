@@ -26,8 +26,9 @@ OPPONENTS: dict[str, tuple[str, ...]] = {
     "MPPI + L1": ("l1-mpc",),
 }
 """Methods of each column; with several methods, the cell shows the worst one."""
-ADAPTED, COMPARABLE = "adapted", ("observer", "geometric + I", "INDI", "MPPI + L1")
-TIE, AS_GOOD = 1e-3, 0.7  # [m]; differences below TIE are ties, and an error below AS_GOOD times another one is better
+ADAPTED_COLUMN, OPPONENT_COLUMNS = "adapted", ("observer", "geometric + I", "INDI", "MPPI + L1")
+TIE = 1e-3  # [m]; smaller differences are ties
+CLEAR_RATIO = 0.7  # an error below this ratio of another one is better
 SAMPLING, SAMPLING_STARTS = ("l1-mpc",), 2
 """Methods with thousands of predictions per command, and their largest number of starts per seed. All starts would take
 as long as all other methods together."""
@@ -87,7 +88,7 @@ def where_learning_pays(
         line, rows = _line(row, flights, columns)
         lines.append(line)
         results += rows
-    head = ("regime", "condition", "score", *columns, ADAPTED, "published", "verdict")
+    head = ("regime", "condition", "score", *columns, ADAPTED_COLUMN, "published", "verdict")
     document.add(TableSection(head, tuple(lines)), results)
     if not run.interrupted:
         clear_flights(run)
@@ -126,7 +127,7 @@ def _line(
     for column in columns:
         worst = max(OPPONENTS[column], key=lambda method: (float(np.median(scores[method])), np.sum(scores[method])))
         cells[column], medians[column] = _cell(scores[worst]), float(np.median(scores[worst]))
-    cells[ADAPTED], medians[ADAPTED] = _cell(scores[row.adapted]), float(np.median(scores[row.adapted]))
+    cells[ADAPTED_COLUMN], medians[ADAPTED_COLUMN] = _cell(scores[row.adapted]), float(np.median(scores[row.adapted]))
     verdict = decide(medians, {name: _lost_share(scores, name, row) for name in medians})
     line = (row.name, row.about, row.score.about, *cells.values(), row.published, verdict)
     rows = [
@@ -142,7 +143,7 @@ def _scores(row: Regime, flights: Sequence[Flight], method: str) -> np.ndarray:
 
 
 def _lost_share(scores: dict[str, np.ndarray], name: str, row: Regime) -> float:
-    methods = (row.adapted,) if name == ADAPTED else OPPONENTS[name]
+    methods = (row.adapted,) if name == ADAPTED_COLUMN else OPPONENTS[name]
     return max(float(np.mean(np.isinf(scores[method]))) for method in methods)
 
 
@@ -170,20 +171,20 @@ def decide(medians: dict[str, float], losses: dict[str, float]) -> str:
         medians: Median score of each column [m]; infinite if most flights were lost.
         losses: Share of lost flights of each column.
     """
-    rivals = {name: medians[name] for name in COMPARABLE if name in medians}
+    rivals = {name: medians[name] for name in OPPONENT_COLUMNS if name in medians}
     if not rivals:
         return "no opponent was flown"
     fewest = min(losses[name] for name in rivals)
-    if losses[ADAPTED] > fewest:
+    if losses[ADAPTED_COLUMN] > fewest:
         best = min((name for name in rivals if losses[name] == fewest), key=lambda name: rivals[name])
         return f"use {best} here: adapted flights are lost"
-    safe = {name: value for name, value in rivals.items() if losses[name] == losses[ADAPTED]}
+    safe = {name: value for name, value in rivals.items() if losses[name] == losses[ADAPTED_COLUMN]}
     if not safe:
         return "learning pays: every opponent loses flights"
     best = min(safe, key=lambda name: safe[name])
-    gain = safe[best] - medians[ADAPTED]
+    gain = safe[best] - medians[ADAPTED_COLUMN]
     if abs(gain) <= TIE:
         return f"a tie: {best} is as good and simpler"
-    if medians[ADAPTED] < AS_GOOD * safe[best]:
-        return f"learning pays: {safe[best] / max(medians[ADAPTED], 1e-6):.1f} times less error than {best}"
+    if medians[ADAPTED_COLUMN] < CLEAR_RATIO * safe[best]:
+        return f"learning pays: {safe[best] / max(medians[ADAPTED_COLUMN], 1e-6):.1f} times less error than {best}"
     return f"use {best} here" if gain < 0.0 else f"learning helps a little; {best} is simpler"

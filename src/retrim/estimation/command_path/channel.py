@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .noise import KINDS, Whitening
 
 GATE = 6.0  # standard deviations of the prediction beyond which a measurement does not count
-DOUBT_TAU, DOUBTFUL = 0.3, 0.5  # [s], and share of recent measurements beyond GATE that shows a wrong prediction
+DOUBT_TAU, DOUBT_SHARE = 0.3, 0.5  # [s], and share of recent measurements beyond GATE that shows a wrong prediction
 
 
 class Sample(eqx.Module):
@@ -135,7 +135,7 @@ class Channel(eqx.Module):
         far = jnp.any(misfit[self.kind] ** 2 > GATE**2 * expected[self.kind])
         doubt = self.doubt + dt / DOUBT_TAU * (far.astype(keep.dtype) - self.doubt)
         doubt = jnp.where(sample.usable, doubt, self.doubt)
-        counts = sample.usable & (~far | (self.doubt > DOUBTFUL))
+        counts = sample.usable & (~far | (self.doubt > DOUBT_SHARE))
         # The beginning of a push is not a property of the vehicle, so the disturbance is estimated again.
         jumps = sample.usable & ~counts & may_jump
         weight = counts.astype(keep.dtype)
@@ -153,7 +153,7 @@ class Channel(eqx.Module):
             self.region,
         )  # fmt: skip
 
-    def predicted_by(self, posterior: PathPosterior) -> "Channel":
+    def predict(self, posterior: PathPosterior) -> "Channel":
         """Return the channel with a new prediction, and with its sums relative to that prediction."""
         m = self.response.shape[0]
         change = posterior.response - self.response

@@ -11,7 +11,7 @@ from .prior import LONGEST_DELAY, MOST_RINGING
 from .response import damping_of, first_order_equivalent
 
 NINETY = 1.645  # standard deviations on each side of a normal distribution that contain 90 %
-EXCITED = 0.6  # share of the prior deviation; a parameter with a larger deviation is not excited
+EXCITATION_SHARE = 0.6  # share of the prior deviation; a parameter with a larger deviation is not excited
 
 
 class Estimate(eqx.Module):
@@ -61,7 +61,7 @@ def normal_estimate(mean: Float[Array, ""], deviation: Float[Array, ""], before:
         before: Standard deviation of the prior.
     """
     reach = NINETY * deviation
-    return Estimate(mean, deviation, mean - reach, mean + reach, deviation < EXCITED * before)
+    return Estimate(mean, deviation, mean - reach, mean + reach, deviation < EXCITATION_SHARE * before)
 
 
 def delay_estimate(posterior: PathPosterior) -> Estimate:
@@ -76,7 +76,7 @@ def lag_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimate
     mean, deviation = _moments(posterior.cells[:, 1], posterior.weight)
     value, reach = jnp.exp(mean + 0.5 * deviation**2), NINETY * deviation
     off = value * jnp.sqrt(jnp.expm1(deviation**2))
-    return Estimate(value, off, jnp.exp(mean - reach), jnp.exp(mean + reach), deviation < EXCITED * before)
+    return Estimate(value, off, jnp.exp(mean - reach), jnp.exp(mean + reach), deviation < EXCITATION_SHARE * before)
 
 
 def damping_estimate(posterior: PathPosterior) -> Estimate:
@@ -84,7 +84,9 @@ def damping_estimate(posterior: PathPosterior) -> Estimate:
     mean, deviation = _moments(posterior.cells[:, 2], posterior.weight)
     ends = jnp.clip(jnp.stack([mean, mean + NINETY * deviation, mean - NINETY * deviation]), 0.0, MOST_RINGING)
     value, low, high = damping_of(ends)
-    return Estimate(value, (high - low) / (2.0 * NINETY), low, high, deviation < EXCITED * MOST_RINGING / 12.0**0.5)
+    return Estimate(
+        value, (high - low) / (2.0 * NINETY), low, high, deviation < EXCITATION_SHARE * MOST_RINGING / 12.0**0.5
+    )
 
 
 def gain_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimate:

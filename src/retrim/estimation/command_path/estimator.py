@@ -242,10 +242,10 @@ def _estimate(channels: Channels, rates: Prior, yaw: Prior, thrust: Prior, dt: f
         gain_estimate(of_thrust, thrust.gain_spread),
     )
     result = Channels(
-        channels.rates.predicted_by(of_rates),
-        channels.yaw.predicted_by(of_yaw),
-        channels.thrust.predicted_by(of_thrust),
-        channels.force.predicted_by(of_force),
+        channels.rates.predict(of_rates),
+        channels.yaw.predict(of_yaw),
+        channels.thrust.predict(of_thrust),
+        channels.force.predict(of_force),
     )
     return result, estimate
 

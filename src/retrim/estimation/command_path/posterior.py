@@ -20,9 +20,9 @@ from .prior import MOST_RINGING, Belief, GainPrior, Prior, gain_prior, log_prior
 from .response import mean_step_response
 
 TEMPER = 0.03  # share of the information that a coarse grid uses
-ELSEWHERE = 2.0  # excess of the log posterior outside the grid at which the grid moves there
-WIDER = 1.2  # factor on the covariance for the next grid, since a posterior may also widen
-COARSE = 0.35  # smallest deviation of the next grid, as a share of the spacing of the present one
+MOVE_EXCESS = 2.0  # excess of the log posterior outside the grid at which the grid moves there
+COVARIANCE_FACTOR = 1.2  # factor on the covariance for the next grid, since a posterior may also widen
+LEAST_DEVIATION = 0.35  # smallest deviation of the next grid, as a share of the spacing of the present one
 GAINS = (0.2, 5.0)  # range in which a gain is linearised
 FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the noise variance
 
@@ -65,13 +65,13 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
 
     def around(region: Region) -> tuple[Float[Array, "cells 3"], Float[Array, "3 3"]]:
         factor = cholesky(region.covariance)
-        least = (factor * (COARSE * step[None]) ** 2) @ factor.T
+        least = (factor * (LEAST_DEVIATION * step[None]) ** 2) @ factor.T
         return region.mean[None] + grid @ factor.T, least
 
     def region_of(cells: Float[Array, "cells 3"], fit: _Fit, temper: float, least: Float[Array, "3 3"]) -> Region:
         weight = _weight(fit.log_likelihood, cells, prior, belief, temper)
         mean, covariance = moments(cells, weight)
-        return Region(mean, WIDER * covariance + least)
+        return Region(mean, COVARIANCE_FACTOR * covariance + least)
 
     cells, least = around(channel.region)
     h = responses(cells, channel.age, channel.width, prior.hover, dt)
@@ -86,7 +86,7 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
         jnp.max(each.log_likelihood + log_prior(at, prior, belief)) for each, at in ((far, coarse), (fit, cells))
     )
     restart = region_of(coarse, far, TEMPER, within)
-    region = jax.tree.map(lambda new, old: jnp.where(best > result + ELSEWHERE, new, old), restart, region)
+    region = jax.tree.map(lambda new, old: jnp.where(best > result + MOVE_EXCESS, new, old), restart, region)
     cells, least = around(region)
     fit, h = likelihood_of(cells, one)
     weight = _weight(fit.log_likelihood, cells, prior, belief, 1.0)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 SMALLEST_KAPPA = 1e-3  # below it the second pole is a thousand times faster than the first
 SMALLEST_ROOT = 1e-2  # root of |1 - 4 kappa|; nearer to critical damping, the two poles cancel in single precision
-NARROW = 1e-4  # [s], width below which a mean is computed as a value
+NARROW_WIDTH = 1e-4  # [s], width below which a mean is computed as a value
 LONGEST = 60.0  # exponents beyond which the exponential is zero to rounding
 SHARE_AT = np.linspace(0.0, 0.6, 7)
 SHARE = np.array([1.0, 0.94, 0.88, 0.79, 0.70, 0.61, 0.56])  # share of the lag in lag + delay, first order
@@ -42,7 +42,7 @@ def mean_step_response(
     """
     value, integral = _step_and_ramp(t, lag, ringing)
     _, before = _step_and_ramp(t - width, lag, ringing)
-    return jnp.where(width < NARROW, value, (integral - before) / jnp.maximum(width, NARROW))
+    return jnp.where(width < NARROW_WIDTH, value, (integral - before) / jnp.maximum(width, NARROW_WIDTH))
 
 
 def _step_and_ramp(

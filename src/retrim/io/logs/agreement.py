@@ -15,9 +15,10 @@ from .on_one_clock import UP, Ticks, turning
 from .resampling import smooth
 
 SMOOTH = 0.2  # time span of differences [s]
-MOVES, TILTS, TURNS, CLIMBS = 0.15, 0.03, 0.1, 0.25  # [m/s], [rad], [rad/s], [m/s^2]: least motion that is compared
-AGAINST = -0.3  # agreement of one axis below which its sign is wrong, even if the axis contributes little
-SLOW = 3.0  # [s]: slower changes, for example from a battery, are removed
+LEAST_SPEED, LEAST_TILT = 0.15, 0.03  # [m/s], [rad]: least motion that is compared
+LEAST_TURN, LEAST_CLIMB = 0.1, 0.25  # [rad/s], [m/s^2], also
+WRONG_SIGN = -0.3  # agreement of one axis below which its sign is wrong, even if the axis contributes little
+SLOW_CHANGE = 3.0  # [s]: slower changes, for example from a battery, are removed
 LATE = 0.2  # longest delay between a thrust command and the acceleration [s]
 
 CLAIMS: Mapping[str, str] = {
@@ -45,9 +46,9 @@ def agreement(log_map: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, flo
     scores = dict[str, float]()
     velocity, velocity_log = ((ticks.p[k:] - ticks.p[:-k]) / (k * ticks.dt))[both], mean(ticks.v)
     independent = log_map.position is not None and log_map.velocity is not None
-    if independent and max(_rms(velocity), _rms(velocity_log)) > MOVES:
+    if independent and max(_rms(velocity), _rms(velocity_log)) > LEAST_SPEED:
         scores["motion"] = with_signs(
-            _explained_share(velocity, velocity_log), velocity, velocity_log, MOVES, _explained_share
+            _explained_share(velocity, velocity_log), velocity, velocity_log, LEAST_SPEED, _explained_share
         )
     specific_force, axis = mean(ticks.a + UP), mean(ticks.R[:, :, 2])
     scores["lift"] = _lift(specific_force, axis)
@@ -56,9 +57,9 @@ def agreement(log_map: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, flo
         thrust = scale * float(np.median(mean(ticks.thrust[:, None])))
         had = float(np.median(np.abs(along)))
         scores["thrust"] = 1.0 - abs(math.log2(max(thrust, 1e-6) / max(had, 1e-6)))
-    rows = max(1, round(SLOW / ticks.dt))
+    rows = max(1, round(SLOW_CHANGE / ticks.dt))
     changes = along - smooth(along, rows)
-    if _beyond_noise(changes, k) > CLIMBS:
+    if _beyond_noise(changes, k) > LEAST_CLIMB:
         late = max(1, round(LATE / ticks.dt))
         shifts = [np.concatenate([np.full(lag, ticks.thrust[0]), ticks.thrust])[: len(ticks.t)] for lag in range(late)]
         thrusts = [mean(each[:, None])[:, 0] for each in shifts]
@@ -66,8 +67,8 @@ def agreement(log_map: LogMap, ticks: Ticks, valid: np.ndarray) -> dict[str, flo
         scores["climb"] = result * abs(result)
     turn_rates = mean(turning(ticks.R, ticks.dt))
     for name, rates in (("turning", ticks.command), ("gyroscope", ticks.rates if ticks.gyroscope else None)):
-        if rates is not None and max(_rms(mean(rates)), _rms(turn_rates)) > TURNS:
-            scores[name] = with_signs(alike(turn_rates, mean(rates)), turn_rates, mean(rates), TURNS, alike)
+        if rates is not None and max(_rms(mean(rates)), _rms(turn_rates)) > LEAST_TURN:
+            scores[name] = with_signs(alike(turn_rates, mean(rates)), turn_rates, mean(rates), LEAST_TURN, alike)
     return scores
 
 
@@ -84,10 +85,10 @@ def _lift(specific_force: np.ndarray, axis: np.ndarray) -> float:
         np.mean(np.sum(specific_force * axis, axis=1) / np.maximum(np.linalg.norm(specific_force, axis=1), 1e-9))
     )
     sideways, tilt = (x[:, :2] - x[:, :2].mean(axis=0) for x in (specific_force, axis))
-    if _rms(tilt) <= TILTS:
+    if _rms(tilt) <= LEAST_TILT:
         return alignment
     leans = float(np.sum(sideways * tilt) / max(np.linalg.norm(sideways) * np.linalg.norm(tilt), 1e-12))
-    return min(alignment, with_signs(leans, sideways, tilt, TILTS, correlation))
+    return min(alignment, with_signs(leans, sideways, tilt, LEAST_TILT, correlation))
 
 
 def with_signs(
@@ -95,7 +96,7 @@ def with_signs(
 ) -> float:
     """Return the agreement of all axes, or the agreement of a wrong-signed axis whose motion exceeds ``least``."""
     axes = [(p, q) for p, q in zip(x.T, by.T, strict=True) if min(_size(p), _size(q)) > least]
-    return min([score, *(result for p, q in axes if (result := agree(p, q)) < AGAINST)])
+    return min([score, *(result for p, q in axes if (result := agree(p, q)) < WRONG_SIGN)])
 
 
 def _beyond_noise(changes: np.ndarray, k: int) -> float:

@@ -15,7 +15,7 @@ class DamagedFrameError(Exception):
     """Bytes are not a frame."""
 
 
-def unsigned(data: bytes, at: int) -> tuple[int, int]:
+def read_unsigned(data: bytes, at: int) -> tuple[int, int]:
     """Return a variable-length unsigned integer of at most 32 bits."""
     byte = data[at]
     at += 1
@@ -33,24 +33,24 @@ def unsigned(data: bytes, at: int) -> tuple[int, int]:
             raise DamagedFrameError
 
 
-def signed(data: bytes, at: int) -> tuple[int, int]:
+def read_signed(data: bytes, at: int) -> tuple[int, int]:
     """Return a variable-length signed integer (zigzag)."""
-    value, at = unsigned(data, at)
+    value, at = read_unsigned(data, at)
     return (value >> 1) ^ -(value & 1), at
 
 
 def _one_unsigned(data: bytes, at: int, count: int) -> tuple[tuple[int, ...], int]:
-    value, at = unsigned(data, at)
+    value, at = read_unsigned(data, at)
     return (value,), at
 
 
 def _one_signed(data: bytes, at: int, count: int) -> tuple[tuple[int, ...], int]:
-    value, at = signed(data, at)
+    value, at = read_signed(data, at)
     return (value,), at
 
 
 def _negative_14(data: bytes, at: int, count: int) -> tuple[tuple[int, ...], int]:
-    value, at = unsigned(data, at)
+    value, at = read_unsigned(data, at)
     return (-_extend(value & 0x3FFF, 14),), at
 
 
@@ -67,7 +67,7 @@ def _eight(data: bytes, at: int, count: int) -> tuple[tuple[int, ...], int]:
     for k in range(count):
         value = 0
         if tag >> k & 1:
-            value, at = signed(data, at)
+            value, at = read_signed(data, at)
         values.append(value)
     return tuple(values), at
 

@@ -22,8 +22,8 @@ MICROSECOND = 1e-6
 TIME = "time"
 TAIL = 64 * 1024  # part of a flight that is searched for its last main frame [bytes]
 MOST_FLIGHTS = 1000
-SLOWER = 3.0  # factor by which a loop may be slower than its setting
-FINE = 10.0  # factor of rates in a log of high resolution
+SLOW_LOOP_FACTOR = 3.0  # factor by which a loop may be slower than its setting
+FINE_FACTOR = 10.0  # factor of rates in a log of high resolution
 SETTINGS = {"gyro": "blackbox_disable_gyro", "motor": "blackbox_disable_motors"}
 TWO_POLES = 1.554  # ratio of the cut-off of each of two equal poles to that of both together
 DSHOT, PWM = (48.0, 2047.0), (1000.0, 2000.0)  # motor commands without thrust, and at full thrust
@@ -96,7 +96,7 @@ def _absent(path: Path, name: str, error: LogError) -> LogError:
 def scale(header: BlackboxHeader, name: str, values: np.ndarray) -> np.ndarray:
     """Return a field's values in deg/s, g, or shares of the full motor command; other fields are unchanged."""
     base = name.partition("[")[0]
-    fine = FINE if header.values.get("blackbox_high_resolution", "0").startswith("1") else 1.0
+    fine = FINE_FACTOR if header.values.get("blackbox_high_resolution", "0").startswith("1") else 1.0
     low = header.numbers("motorOutput", (0.0, 0.0))[0]
     zero, full = PWM if low >= PWM[0] else DSHOT
     if base in ("gyroADC", "gyroUnfilt"):
@@ -149,7 +149,7 @@ def _span(data: bytes, header: BlackboxHeader, end: int) -> Span:
     last, at = first[1], max(header.end, end - TAIL)
     for loop, time in decoder.main_frames_after(at):
         loops = loop - first[0]
-        fits = loop_time <= 0.0 or time - first[1] <= SLOWER * loop_time * loops + 1e6
+        fits = loop_time <= 0.0 or time - first[1] <= SLOW_LOOP_FACTOR * loop_time * loops + 1e6
         if loop % every == 0 and loops >= 0 and fits:
             last = max(last, time)
     return Span(MICROSECOND * first[1], MICROSECOND * last)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .blackbox_codes import DamagedFrameError, Decode, decoding_plan, signed, unsigned
+from .blackbox_codes import DamagedFrameError, Decode, decoding_plan, read_signed, read_unsigned
 from .blackbox_header import BlackboxHeader
 
 FRAMES = frozenset(b"IPSGHE")
@@ -18,7 +18,7 @@ LATE_US, LATE_LOOPS = 10_000_000, 5_000  # largest steps of the time [us] and of
 LAST = b"End of log\x00"
 END = -1  # offset behind the end mark
 CENTRE = 1500  # [us]
-HALF, WHOLE = 1 << 31, 1 << 32
+HALF, FULL_RANGE = 1 << 31, 1 << 32
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ class FrameDecoder:
                 total = one[k] + two[k]
                 expected = total >> 1 if total >= 0 else -(-total >> 1)  # rounds towards zero
             else:
-                expected = one[k] + 1 + self._skipped(one[k])
+                expected = one[k] + 1 + self._count_skips(one[k])
             value += expected
-            frame.append((value + HALF) % WHOLE - HALF if signs[k] else value % WHOLE)
+            frame.append((value + HALF) % FULL_RANGE - HALF if signs[k] else value % FULL_RANGE)
         return tuple(frame)
 
     def _constant(self, predictor: int, frame: list[int]) -> int:
@@ -163,7 +163,7 @@ class FrameDecoder:
             predictor, 0
         )
 
-    def _skipped(self, loop: int) -> int:
+    def _count_skips(self, loop: int) -> int:
         """Return how many loops after this one are not logged."""
         if self._number == self._count:
             return 0
@@ -185,15 +185,15 @@ class FrameDecoder:
             if data[at] & 128:
                 _ = data[at + 4]
                 return at + 5
-            return signed(data, at + 1)[1]
+            return read_signed(data, at + 1)[1]
         if kind == 14:  # the log continues after a pause
-            loop, at = unsigned(data, at)
-            time, at = unsigned(data, at)
+            loop, at = read_unsigned(data, at)
+            time, at = read_unsigned(data, at)
             if self._last is not None and time >= self._last[1]:
                 self._last = (loop, time)
             return at
         for _ in range({0: 1, 15: 1, 30: 2}.get(kind, 0)):
-            _, at = unsigned(data, at)
+            _, at = read_unsigned(data, at)
         if kind not in (0, 15, 30):
             raise DamagedFrameError
         return at

@@ -31,8 +31,11 @@ class BodyMap:
 
     @model_validator(mode="after")
     def _fitting(self) -> "BodyMap":
-        if self.acceleration is not None and (self.acceleration.axes, self.acceleration.gravity) != ("body", "felt"):
-            raise ValueError('without [attitude], acceleration needs axes = "body" and gravity = "felt"')
+        if self.acceleration is not None and (self.acceleration.axes, self.acceleration.gravity) != (
+            "body",
+            "included",
+        ):
+            raise ValueError('without [attitude], acceleration needs axes = "body" and gravity = "included"')
         if self.thrust.unit != "share" or self.thrust.hover is not None:
             raise ValueError('without [attitude], thrust needs unit = "share" and no hover, which is identified')
         return self

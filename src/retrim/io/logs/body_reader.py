@@ -15,15 +15,15 @@ from .body_map import BodyMap
 from .collective import share_of
 from .marks import landed_at
 from .on_one_clock import COMMAND_HELD, MOTORS
-from .resampling import held_mean, mark_known, mean_between, period, smooth
+from .resampling import mark_known, mean_between, mean_of_steps, period, smooth
 from .series import Series
 
-FINEST, SLOWEST = 0.002, 0.052  # [s]: shortest tick, and slowest rates from which a lag can be identified
+SHORTEST_TICK, LONGEST_TICK = 0.002, 0.052  # [s]: shortest tick, and slowest rates from which a lag can be identified
 LONGEST_S = 180.0  # [s]: longer flights are not needed to identify a vehicle
 SHORT_GAP = 0.02  # [s]: a shorter gap between samples is bridged
 LEAST_S = 1.0  # [s]: shortest flight
 FILTER = "acceleration filter"  # series of one sample: the lag of the accelerometer's filter [s]
-FLIES = 0.3  # share of the largest thrusts below which a vehicle is not in the air
+FLIGHT_THRUST = 0.3  # share of the largest thrusts below which a vehicle is not in the air
 
 
 @np.errstate(all="ignore")  # ticks with numbers that overflow are excluded later
@@ -45,13 +45,13 @@ def body_log_of(path: Path, body_map: BodyMap, series: Mapping[str, Series], not
     spin = turn * np.linalg.det(turn)  # a rate is a pseudovector
     thrust = body_map.thrust
     shares = share_of(replace(thrust, curve=0.0), thrust.sign * series["thrust"].values)
-    motors = held_mean(Series(series["thrust"].t, shares), t, dt)
+    motors = mean_of_steps(Series(series["thrust"].t, shares), t, dt)
     valid = mark_known(series["thrust"], t, dt, hold_s=COMMAND_HELD)
     rates = _rates(body_map.measured_rates, mean_between(series["measured_rates"], t, dt), spin)
     valid &= mark_known(series["measured_rates"], t, dt, hold_s=SHORT_GAP)
     command = force = None
     if body_map.rates is not None and "rates" in series:
-        command = _rates(body_map.rates, held_mean(series["rates"], t, dt), spin)
+        command = _rates(body_map.rates, mean_of_steps(series["rates"], t, dt), spin)
         valid &= mark_known(series["rates"], t, dt, hold_s=COMMAND_HELD)
     if body_map.acceleration is not None and "acceleration" in series:
         unit = maps.ACCELERATIONS[body_map.acceleration.unit]
@@ -82,17 +82,17 @@ def _grid(path: Path, body_map: BodyMap, series: Mapping[str, Series]) -> tuple[
     """Return the clock, its tick, and whether the flight was cut."""
     needed = {name: each for name, each in series.items() if " " not in name}
     own = max(period(series[name]) for name in ("measured_rates", "rates") if name in series)
-    if own > SLOWEST:
+    if own > LONGEST_TICK:
         raise LogError(
-            f"{path}: rates come every {own:.3g} s; lags need a sample every {SLOWEST:.2g} s at least; log them faster "
-            f"(Betaflight: blackbox_sample_rate; ArduPilot: LOG_BITMASK with fast attitude)"
+            f"{path}: rates come every {own:.3g} s; lags need a sample every {LONGEST_TICK:.2g} s at least; "
+            f"log them faster (Betaflight: blackbox_sample_rate; ArduPilot: LOG_BITMASK with fast attitude)"
         )
     zero = min(each.t[0] for each in needed.values())
     first = max(max(each.t[0] for each in needed.values()), zero + body_map.part.start)
     last = min(each.t[-1] for each in needed.values())
     if body_map.part.end is not None:
         last = min(last, zero + body_map.part.end)
-    cut, dt = bool(last - first > LONGEST_S), max(own, FINEST)
+    cut, dt = bool(last - first > LONGEST_S), max(own, SHORTEST_TICK)
     n = int(min(last - first, LONGEST_S) / dt + 1e-9)
     if n < 4:
         spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in needed.items())
@@ -112,7 +112,7 @@ def _on_ground(path: Path, motors: np.ndarray, valid: np.ndarray, dt: float) -> 
     high = float(np.percentile(thrust[valid], 95))
     if high <= 0.0:
         raise LogError(f"{path}: thrust is never above zero; thrust.fields must name the command that is in use")
-    return np.asarray(thrust <= FLIES * high)
+    return np.asarray(thrust <= FLIGHT_THRUST * high)
 
 
 def _check_widths(path: Path, series: Mapping[str, Series]) -> None:

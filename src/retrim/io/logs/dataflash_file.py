@@ -22,7 +22,7 @@ FORMAT, FORMAT_LENGTH = 128, 89  # type and length of the message that describes
 MICROSECOND = 1e-6
 TIME = "TimeUS"
 INSTANCES = ("I", "C", "Instance", "Core")  # fields that count the instances of a message
-BACK_US = 1_000_000  # step back of the time that means a restart [us]
+RESTART_US = 1_000_000  # step back of the time that means a restart [us]
 ARMED, DISARMED = 10, 11  # events
 MOST_MESSAGES = 50_000_000
 CODES: Mapping[str, tuple[str, float]] = {
@@ -72,10 +72,10 @@ def read_dataflash(
     raw = path.read_bytes()
     data, contents = np.frombuffer(raw, np.uint8), _scan(path, raw)
     names = {name: message for name, message in contents.layouts.items() if len(contents.offsets[name])}
-    found = dict[str, list[tuple[str, int, str]]]()
+    fields_of = dict[str, list[tuple[str, int, str]]]()
     for what, fields in request.items():
         try:
-            found[what] = [first_of(each, lambda one: _find(path, one, names)) for each in fields]
+            fields_of[what] = [first_of(each, lambda one: _find(path, one, names)) for each in fields]
         except LogError:
             if what not in optional:
                 raise
@@ -85,7 +85,7 @@ def read_dataflash(
     if contents.skipped:
         notes.append(f"{contents.skipped} bytes of the file belong to no message, and are left out")
     result = dict[str, Series]()
-    for what, parts in found.items():
+    for what, parts in fields_of.items():
         if len({part[:2] for part in parts}) > 1:
             raise LogError(f"{path}: the fields of {what} come from several messages: {', '.join(request[what])}")
         name, instance, _ = parts[0]
@@ -216,9 +216,11 @@ def _boots(data: np.ndarray, contents: Contents) -> Iterator[tuple[np.ndarray, n
     order = np.argsort(np.concatenate([at for at, _ in parts]))
     at, t = (np.concatenate(each)[order] for each in zip(*parts, strict=True))
     steps = np.diff(t)
-    lone = np.flatnonzero((np.abs(steps[:-1]) > BACK_US) & (np.abs(t[2:] - t[:-2]) < BACK_US)) + 1  # a damaged time
+    lone = (
+        np.flatnonzero((np.abs(steps[:-1]) > RESTART_US) & (np.abs(t[2:] - t[:-2]) < RESTART_US)) + 1
+    )  # a damaged time
     at, t = np.delete(at, lone), np.delete(t, lone)
-    starts = np.flatnonzero(np.diff(t) < -BACK_US) + 1
+    starts = np.flatnonzero(np.diff(t) < -RESTART_US) + 1
     for first, last in zip([0, *starts], [*starts, len(t)], strict=True):
         yield at[first:last], t[first:last]
 

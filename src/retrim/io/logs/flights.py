@@ -8,7 +8,7 @@ from ...errors import LogError
 from .series import Clock, Series
 
 SHORTEST = 1.0  # [s]: shorter flights are not offered if there are longer ones
-MANY = 20  # largest number of flights in an error message
+MOST_FLIGHTS = 20  # largest number of flights in an error message
 
 
 class FlightReader(Protocol):
@@ -51,16 +51,16 @@ def choose_flight(path: Path, spans: Sequence[Span], number: int | None) -> tupl
         LogError: There are several flights and no number, or no flight has this number.
     """
     whole = [k for k, span in enumerate(spans) if span.seconds >= SHORTEST]
-    shown = ", ".join(f"{k + 1} of {span.seconds:.1f} s" for k, span in list(enumerate(spans))[:MANY])
-    if len(spans) > MANY:
-        shown += f", and {len(spans) - MANY} more"
+    description = ", ".join(f"{k + 1} of {span.seconds:.1f} s" for k, span in list(enumerate(spans))[:MOST_FLIGHTS])
+    if len(spans) > MOST_FLIGHTS:
+        description += f", and {len(spans) - MOST_FLIGHTS} more"
     if number is not None:
         if not 1 <= number <= len(spans):
-            raise LogError(f"{path}: --flight {number}: the flights in this file are {shown}")
+            raise LogError(f"{path}: --flight {number}: the flights in this file are {description}")
         return number - 1, []
     if len(whole) > 1:
         raise LogError(
-            f"{path}: {len(spans)} flights are in this file: {shown}; choose one, as --flight {whole[0] + 1}"
+            f"{path}: {len(spans)} flights are in this file: {description}; choose one, as --flight {whole[0] + 1}"
         )
     k = whole[0] if whole else max(range(len(spans)), key=lambda k: spans[k].seconds)
     others = len(spans) - 1

@@ -6,31 +6,32 @@ from ...physics.state import STANDARD_GRAVITY
 from .on_one_clock import UP, Ticks
 from .resampling import runs, smooth
 
-FLIES = 0.3  # share of the largest thrusts below which a vehicle is not in the air
-AROUND, LASTS = 0.3, 0.5  # averaging time, and shortest duration of a contact [s]
-STILL, AT_REST = 0.2, 0.1  # largest speeds of a vehicle in contact, and of one before it leaves its position [m/s]
-STEADY, TURNS = 1.0, 0.2  # [m/s^2], [rad/s]: a vehicle in contact accelerates and turns less
-CARRIES = 0.85  # share of hover thrust below which a vehicle cannot stay in the air
+FLIGHT_THRUST = 0.3  # share of the largest thrusts below which a vehicle is not in the air
+AVERAGING_TIME, LEAST_DURATION = 0.3, 0.5  # averaging time, and shortest duration of a contact [s]
+CONTACT_SPEED = 0.2  # [m/s], largest speed in contact
+REST_SPEED = 0.1  # [m/s], largest speed before the vehicle leaves its position
+CONTACT_ACCELERATION, CONTACT_RATES = 1.0, 0.2  # [m/s^2], [rad/s]: a vehicle in contact accelerates and turns less
+LEAST_SUPPORT = 0.85  # share of hover thrust below which a vehicle cannot stay in the air
 PLACE = 0.05  # height tolerance around the contact height [m]
-MOVES, HIGH = 0.3, 0.3  # [m/s], [m] above the lowest position: a vehicle that exceeds either one flies
-ENOUGH = 2.0  # flight time that is sufficient to determine hover thrust [s]
+FLIGHT_SPEED, FLIGHT_HEIGHT = 0.3, 0.3  # [m/s], [m] above the lowest position: a vehicle that exceeds either one flies
+LEAST_FLIGHT = 2.0  # flight time that is sufficient to determine hover thrust [s]
 
 
 def on_ground(ticks: Ticks) -> np.ndarray:
     """Return a mask of the ticks at which the vehicle is not in the air, (n,)."""
     thrust = smooth(ticks.thrust, max(1, round(1.0 / ticks.dt)))
-    idle = thrust <= FLIES * np.percentile(thrust[ticks.known], 95)
-    rows = max(1, round(AROUND / ticks.dt))
+    idle = thrust <= FLIGHT_THRUST * np.percentile(thrust[ticks.known], 95)
+    rows = max(1, round(AVERAGING_TIME / ticks.dt))
     speed, push, turn = (
         np.linalg.norm(np.stack([smooth(column, rows) for column in x.T], axis=1), axis=1)
         for x in (ticks.v, ticks.a, ticks.rates)
     )
     hover = _hover(ticks, ~idle & ticks.known, speed)
     lift = smooth(ticks.thrust * ticks.R[:, 2, 2], rows)
-    stands = (speed < STILL) & (push < STEADY) & (turn < TURNS)
+    stands = (speed < CONTACT_SPEED) & (push < CONTACT_ACCELERATION) & (turn < CONTACT_RATES)
     z = ticks.p[:, 2]
-    contact = runs(stands & (lift < CARRIES * hover), max(1, round(LASTS / ticks.dt)))
-    for first, last in _spans(np.minimum(speed, np.linalg.norm(ticks.v, axis=1)) < AT_REST):
+    contact = runs(stands & (lift < LEAST_SUPPORT * hover), max(1, round(LEAST_DURATION / ticks.dt)))
+    for first, last in _spans(np.minimum(speed, np.linalg.norm(ticks.v, axis=1)) < REST_SPEED):
         part = slice(first, last)
         if contact[part].any():
             height = float(np.median(z[part][contact[part]]))
@@ -43,8 +44,8 @@ def _hover(ticks: Ticks, candidates: np.ndarray, speed: np.ndarray) -> float:
     if not candidates.any():
         return 0.0
     z = ticks.p[:, 2]
-    flies = candidates & ((speed > MOVES) | (z > np.percentile(z[candidates], 5) + HIGH))
-    if np.sum(flies) * ticks.dt < ENOUGH:
+    flies = candidates & ((speed > FLIGHT_SPEED) | (z > np.percentile(z[candidates], 5) + FLIGHT_HEIGHT))
+    if np.sum(flies) * ticks.dt < LEAST_FLIGHT:
         flies = candidates
     upwards = np.maximum((ticks.a + UP)[flies, 2], 0.3 * STANDARD_GRAVITY)  # vertical only, as wind pushes sideways
     return float(np.median(ticks.thrust[flies] * ticks.R[flies, 2, 2] * STANDARD_GRAVITY / upwards))

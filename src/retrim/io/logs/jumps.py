@@ -6,10 +6,10 @@ from .on_one_clock import Ticks
 
 LEAST = {"velocity": 4.0, "attitude": 4.0}  # minimum difference between a tick and its neighbours [m/s^2], [rad/s]
 LEAST_SPEED = 2.0  # minimum difference between a position step and its neighbours [m/s]
-BEYOND = 5.0  # threshold in multiples of the noise
+NOISE_FACTOR = 5.0  # threshold in multiples of the noise
 ENDS = 3.0  # factor on the threshold for a step at an end of the log
-CALM = 0.25  # for a step at an end of the log: largest difference between its neighbours, as a share of the step
-BESIDE = 2  # distance between compared steps in ticks; a sample every two ticks is spread over both
+CALM_SHARE = 0.25  # for a step at an end of the log: largest difference between its neighbours, as a share of the step
+STEP_DISTANCE = 2  # distance between compared steps in ticks; a sample every two ticks is spread over both
 
 
 def jumps_of(ticks: Ticks, name: str) -> np.ndarray:
@@ -34,17 +34,21 @@ def stands_out(steps: np.ndarray, usable: np.ndarray, least: float) -> np.ndarra
         usable: Steps that are used to estimate the noise, (n,).
         least: Minimum difference for a detected step, whatever the noise.
     """
-    if len(steps) < 4 * BESIDE:
+    if len(steps) < 4 * STEP_DISTANCE:
         return np.zeros(len(steps), dtype=bool)
     before, after = np.zeros_like(steps), np.zeros_like(steps)
-    before[BESIDE:] = steps[BESIDE:] - steps[:-BESIDE]
-    after[:-BESIDE] = steps[:-BESIDE] - steps[BESIDE:]
-    before[:BESIDE] = np.where(np.abs(after[BESIDE : 2 * BESIDE]) < CALM * np.abs(after[:BESIDE]), after[:BESIDE], 0.0)
-    late = np.abs(before[-2 * BESIDE : -BESIDE]) < CALM * np.abs(before[-BESIDE:])
-    after[-BESIDE:] = np.where(late, before[-BESIDE:], 0.0)
+    before[STEP_DISTANCE:] = steps[STEP_DISTANCE:] - steps[:-STEP_DISTANCE]
+    after[:-STEP_DISTANCE] = steps[:-STEP_DISTANCE] - steps[STEP_DISTANCE:]
+    before[:STEP_DISTANCE] = np.where(
+        np.abs(after[STEP_DISTANCE : 2 * STEP_DISTANCE]) < CALM_SHARE * np.abs(after[:STEP_DISTANCE]),
+        after[:STEP_DISTANCE],
+        0.0,
+    )
+    late = np.abs(before[-2 * STEP_DISTANCE : -STEP_DISTANCE]) < CALM_SHARE * np.abs(before[-STEP_DISTANCE:])
+    after[-STEP_DISTANCE:] = np.where(late, before[-STEP_DISTANCE:], 0.0)
     far = np.where(before * after > 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
     bent = np.abs(0.5 * (before + after))[usable] if usable.any() else np.zeros((1, 3))
-    limit = np.maximum(least, BEYOND * 1.4826 * np.median(bent, axis=0))
-    far[:BESIDE] /= ENDS  # so that a vehicle that starts or stops does not count as a jump
-    far[-BESIDE:] /= ENDS
+    limit = np.maximum(least, NOISE_FACTOR * 1.4826 * np.median(bent, axis=0))
+    far[:STEP_DISTANCE] /= ENDS  # so that a vehicle that starts or stops does not count as a jump
+    far[-STEP_DISTANCE:] /= ENDS
     return np.asarray(np.any(far > limit, axis=1))

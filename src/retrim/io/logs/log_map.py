@@ -156,8 +156,8 @@ class Acceleration:
     fields: Fields
     unit: Literal["m/s^2", "g"] = "m/s^2"
     axes: Literal["world", "body"] = "body"
-    gravity: Literal["felt", "removed"] = "felt"
-    """An accelerometer's specific force, one g upwards at rest (felt); or the derivative of the velocity (removed)."""
+    gravity: Literal["included", "removed"] = "included"
+    """included: specific force of an accelerometer, one g upwards at rest; removed: derivative of the velocity."""
     optional: bool = False
 
 

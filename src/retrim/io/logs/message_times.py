@@ -9,13 +9,12 @@ import numpy as np
 from .series import Clock
 
 MICROSECOND, NANOSECOND = 1e-6, 1e-9
-APART = 1.0  # difference above which two clocks are different [s]
-FEWEST, AROUND = 50, 0.5  # minimum number of messages, and time around each [s], from which its delay is estimated
-EVEN, LOST = (
-    3.0,
-    0.5,
-)  # limits in periods for an even rate: spread of delays, and spread of the shortest delays if no message is lost
-EARLY = 5.0  # percentile of delays that counts as the delay of a message that did not wait
+CLOCK_DIFFERENCE = 1.0  # difference above which two clocks are different [s]
+LEAST_MESSAGES = 50  # for an estimate of delays
+NEIGHBOURHOOD = 0.5  # [s], time around a message from which its delay is estimated
+EVEN = 3.0  # [periods], largest spread of delays at an even rate
+LOST = 0.5  # [periods], largest spread of the shortest delays without a lost message
+EARLY_PERCENTILE = 5.0  # percentile of delays that counts as the delay of a message that did not wait
 
 
 def stamp_of(message: Any, time: Clock | None) -> float:
@@ -61,10 +60,10 @@ def on_one_time(stamps: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray]
             notes.append(f"{topic} has no stamps; its times are those of reception{remark}")
         else:
             times[topic] = stamp
-            ahead[topic] = float(np.nanpercentile(arrival - stamp, EARLY))
-    alike = not ahead or max(ahead.values()) - min(ahead.values()) < APART
+            ahead[topic] = float(np.nanpercentile(arrival - stamp, EARLY_PERCENTILE))
+    alike = not ahead or max(ahead.values()) - min(ahead.values()) < CLOCK_DIFFERENCE
     if len(ahead) < len(times):
-        alike = alike and all(abs(shift) < APART for shift in ahead.values())
+        alike = alike and all(abs(shift) < CLOCK_DIFFERENCE for shift in ahead.values())
     if not alike:
         for topic, shift in ahead.items():
             times[topic] = times[topic] + shift
@@ -79,12 +78,12 @@ def evenly(arrival: np.ndarray) -> tuple[np.ndarray, bool]:
     the messages around it. If the rate is not even, or if messages are lost, the times of reception are returned.
     """
     n = len(arrival)
-    if n < FEWEST:
+    if n < LEAST_MESSAGES:
         return arrival, False
     turn = np.arange(n)
     slope, start = np.polyfit(turn, arrival - arrival[0], 1)
     late = arrival - arrival[0] - start - slope * turn
-    reach = max(1, round(AROUND / slope)) if slope > 0.0 else n
+    reach = max(1, round(NEIGHBOURHOOD / slope)) if slope > 0.0 else n
     if reach >= n or np.ptp(late) > EVEN * slope:
         return arrival, False
     from scipy.ndimage import minimum_filter1d, uniform_filter1d  # local: they take as long to import as all of retrim

@@ -5,13 +5,13 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
-from ...config.validation import read_toml, validated
+from ...config.validation import read_toml, validate
 from .body_map import BodyMap, is_body_map
 from .log_map import LogMap
 
 AnyMap = LogMap | BodyMap
 
-USUAL: dict[str, tuple[str, ...]] = {
+USUAL_NAMES: dict[str, tuple[str, ...]] = {
     ".npz": ("retrim-npz",),
     ".csv": (
         "retrim-csv", "crazyflie", "crazyflie-quaternion", "crazyswarm", "crazyswarm-quaternion", "betaflight-csv",
@@ -23,7 +23,12 @@ USUAL: dict[str, tuple[str, ...]] = {
     ".mcap": ("retrim-mcap", "px4-dds", "px4-dds-1.13", "mavros", "mavros-pose", "crazyswarm-ros"),
 }  # fmt: skip
 """Default maps by file suffix; the first one whose fields exist in the log is used."""
-USUAL |= {".ulog": USUAL[".ulg"], ".bfl": USUAL[".bbl"], ".db3": USUAL[".mcap"], "": USUAL[".mcap"]}
+USUAL_NAMES |= {
+    ".ulog": USUAL_NAMES[".ulg"],
+    ".bfl": USUAL_NAMES[".bbl"],
+    ".db3": USUAL_NAMES[".mcap"],
+    "": USUAL_NAMES[".mcap"],
+}
 
 
 @cache
@@ -44,4 +49,4 @@ def read_map(source: str | Path) -> AnyMap:
         name = f"map {source}"
     else:
         tables, name = read_toml(Path(source)), str(source)
-    return validated(BodyMap, tables, source=name) if is_body_map(tables) else validated(LogMap, tables, source=name)
+    return validate(BodyMap, tables, source=name) if is_body_map(tables) else validate(LogMap, tables, source=name)

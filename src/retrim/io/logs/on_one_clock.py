@@ -12,17 +12,26 @@ from .attitudes import attitudes
 from .axes import to_body, to_world
 from .collective import collective_of, share_of
 from .log_map import LogMap
-from .resampling import around, derivative, held_mean, hold_last, interpolate, interpolate_attitudes, mark_known, period
+from .resampling import (
+    around,
+    derivative,
+    hold_last,
+    interpolate,
+    interpolate_attitudes,
+    mark_known,
+    mean_of_steps,
+    period,
+)
 from .series import Series
 
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 STATES = ("position", "velocity", "attitude")
-SLOWEST = 0.1  # [s]: slower states do not determine accelerations, and no preset has such a tick
+LONGEST_TICK = 0.1  # [s]: slower states do not determine accelerations, and no preset has such a tick
 SHORTEST = 2e-5  # [s]: states never arrive that often
 ROUNDING = 0.045  # relative deviation of a logger that is set to ten samples per second
 LONGEST = 5_000_000  # maximum number of ticks; times that span more do not belong to one flight
 MOTORS = 4  # smallest number of motors
-ALIKE = 0.02  # relative difference up to which the log's period and the control period count as equal
+PERIOD_TOLERANCE = 0.02  # relative difference up to which the log's period and the control period count as equal
 COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
 
 
@@ -66,11 +75,11 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     states = [name for name in STATES if name in series]
     own = max(period(series[name]) for name in states)
     slowest = max(states, key=lambda name: period(series[name]))
-    if own > (1.0 + ROUNDING) * SLOWEST:
+    if own > (1.0 + ROUNDING) * LONGEST_TICK:
         remedy = "is time in ms or us?" if own > 5.0 else "log it at 50 Hz (PX4: SDLOG_PROFILE with high rate)"
         raise LogError(
-            f"{path}: {slowest} comes every {own:.3g} s; accelerations need a sample every {SLOWEST:g} s at least; "
-            + remedy
+            f"{path}: {slowest} comes every {own:.3g} s; accelerations need a sample every "
+            f"{LONGEST_TICK:g} s at least; {remedy}"
         )
     if own < SHORTEST:
         raise LogError(f"{path}: {slowest} comes every {own:.3g} s; is time in ms, us or ns?")
@@ -78,7 +87,7 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     zero = min(each.t[0] for each in required.values())
     first = max(max(each.t[0] for each in required.values()), zero + part.start)
     last = min(min(series[name].t[-1] for name in states), np.inf if part.end is None else zero + part.end)
-    tick = dt if own <= (1.0 + ALIKE) * dt else own
+    tick = dt if own <= (1.0 + PERIOD_TOLERANCE) * dt else own
     if last - first < 4.0 * tick:
         spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in required.items())
         raise LogError(f"{path}: the quantities have no time in common: {spans}")
@@ -87,7 +96,7 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     stamps = series["velocity"].t
     alike = all(np.array_equal(series[name].t, stamps) for name in states)
     steps = np.diff(stamps)
-    if alike and abs(own - tick) <= ALIKE * tick and np.all(np.abs(steps - own) < 0.25 * own):
+    if alike and abs(own - tick) <= PERIOD_TOLERANCE * tick and np.all(np.abs(steps - own) < 0.25 * own):
         return Grid(stamps[(stamps >= first) & (stamps <= last)], own, True)
     return Grid(first + tick * np.arange(int((last - first) / tick + 1e-9) + 1), tick, False)
 
@@ -142,7 +151,7 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     else:
         a = maps.ACCELERATIONS[log_map.acceleration.unit] * interpolate(of["acceleration"], t)
         a = a @ W.T if log_map.acceleration.axes == "world" else np.einsum("nij,nj->ni", R, a @ B.T)
-        a = a - UP * (log_map.acceleration.gravity == "felt")
+        a = a - UP * (log_map.acceleration.gravity == "included")
         there &= mark_known(of["acceleration"], t, dt)
     rates = turning(R, dt) if measurement is None else measurement
     return Ticks(t, p, R, v, a, rates, thrust, command, there, hover, dt, measurement is not None)
@@ -158,7 +167,7 @@ def _speed(log_map: LogMap) -> float:
 def _sample_command(command: Series, grid: Grid) -> np.ndarray:
     """Return a command at each tick: its sample, or its mean over the tick if the command has its own times."""
     samples = grid.sampled and np.array_equal(np.intersect1d(command.t, grid.t), grid.t)
-    return hold_last(command, grid.t) if samples else held_mean(command, grid.t, grid.dt)
+    return hold_last(command, grid.t) if samples else mean_of_steps(command, grid.t, grid.dt)
 
 
 def turning(R: np.ndarray, dt: float) -> np.ndarray:

@@ -71,8 +71,8 @@ def _frames(log_map: LogMap) -> Iterator[Other]:
             words = _differences("frames", (frames.world, frames.body), (world, body))
             yield Other(words, dataclasses.replace(log_map, frames=maps.Frames(world, body)), {})
     own = log_map.attitude.world or frames.world, log_map.attitude.body or frames.body
-    variants = [(world, own[1]) for world in turned_about_z(own[0], "ENWS")]
-    variants += [(own[0], body) for body in turned_about_z(own[1], "FLBR")]
+    variants = [(world, own[1]) for world in turn_about_z(own[0], "ENWS")]
+    variants += [(own[0], body) for body in turn_about_z(own[1], "FLBR")]
     for world, body in [*pairs, *variants]:
         if left_handed(world) == left_handed(body):
             attitude = dataclasses.replace(log_map.attitude, world=world, body=body)
@@ -87,7 +87,7 @@ def _differences(table: str, old: tuple[str, str], new: tuple[str, str]) -> str:
     return " and ".join(statements)
 
 
-def turned_about_z(name: str, letters: str) -> list[str]:
+def turn_about_z(name: str, letters: str) -> list[str]:
     """Return other axes with the same vertical last axis and the same handedness."""
     if name[2] not in "UD":
         return []

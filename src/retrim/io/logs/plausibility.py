@@ -16,12 +16,13 @@ from .log_map import LogMap
 from .on_one_clock import Ticks
 from .other_maps import Other, others, with_heading
 
-SUSPECT = 0.05  # unexplained share above which other maps are tried
-BETTER, AGREES = 5.0, 0.75  # required of another map: factor by which the remainder shrinks, and minimum agreement
+SUSPICION = 0.05  # unexplained share above which other maps are tried
+IMPROVEMENT = 5.0  # factor by which another map must reduce the remainder
+LEAST_AGREEMENT = 0.75  # of another map
 PART = 3000  # number of ticks in a long log that are used to try other maps
-REFUSED = {"motion": 0.0, "lift": 0.0, "thrust": 0.0, "turning": -0.3, "gyroscope": -0.3}
+REFUSAL_LIMITS = {"motion": 0.0, "lift": 0.0, "thrust": 0.0, "turning": -0.3, "gyroscope": -0.3}
 """Agreement below which a log is refused."""
-DOUBTFUL = {"motion": 0.75, "lift": 0.5, "thrust": 0.65, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
+DOUBT_LIMITS = {"motion": 0.75, "lift": 0.5, "thrust": 0.65, "climb": 0.25, "turning": 0.5, "gyroscope": 0.75}
 """Agreement below which a report begins with a warning."""
 
 
@@ -44,19 +45,19 @@ def check_plausible(
         LogError: The quantities do not agree; the message names the wrong statement in the map, if there is one.
     """
     scores = agreement(log_map, ticks, valid)
-    wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
+    wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPICION and name != "climb"}
     if wrong and (correction := _find_correction(log_map, read, valid)):
         raise LogError(f"{path}: {correction}")
     for name, score in sorted(wrong.items(), key=lambda item: item[1]):
-        if score < REFUSED[name]:
+        if score < REFUSAL_LIMITS[name]:
             raise LogError(
-                f"{path}: {EXPLAINED[name]} ({100 * score:.0f} % agreement), and no other unit, frame or sign of the "
-                f"map corrects it"
+                f"{path}: {EXPLANATIONS[name]} ({100 * score:.0f} % agreement), and no other unit, frame or sign of "
+                f"the map corrects it"
             )
     return scores, tuple(
-        f"{CLAIMS[name].format(max(0, round(100 * score)))}, {100 * DOUBTFUL[name]:.0f} % are expected"
+        f"{CLAIMS[name].format(max(0, round(100 * score)))}, {100 * DOUBT_LIMITS[name]:.0f} % are expected"
         for name, score in scores.items()
-        if score < DOUBTFUL[name]
+        if score < DOUBT_LIMITS[name]
     )
 
 
@@ -65,7 +66,7 @@ def _find_correction(log_map: LogMap, read: Callable[[Other, slice], Ticks], val
     part = _part(valid)
     ticks = read(Other("", log_map, {}), part)
     scores = agreement(log_map, ticks, valid[part])
-    wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPECT and name != "climb"}
+    wrong = {name: score for name, score in scores.items() if score < 1.0 - SUSPICION and name != "climb"}
     best, result = (0.0, 0.0), ""
     rotated_map = with_heading(log_map, heading_between(ticks, valid[part]) if valid[part].any() else 0.0)
     for other in (*others(log_map), rotated_map) if wrong else ():
@@ -73,14 +74,14 @@ def _find_correction(log_map: LogMap, read: Callable[[Other, slice], Ticks], val
             after = agreement(other.log_map, read(other, part), valid[part])
         except LogError:
             continue
-        correction = [name for name in wrong if 1.0 - after.get(name, -1.0) < (1.0 - wrong[name]) / BETTER]
-        holds = all(after.get(name, -1.0) > score - SUSPECT for name, score in scores.items())
-        if not correction or not holds or _least(after) < AGREES:
+        correction = [name for name in wrong if 1.0 - after.get(name, -1.0) < (1.0 - wrong[name]) / IMPROVEMENT]
+        holds = all(after.get(name, -1.0) > score - SUSPICION for name, score in scores.items())
+        if not correction or not holds or _least(after) < LEAST_AGREEMENT:
             continue
         # Rounded, so that of two equivalent statements, the first one is named.
         if (rank := (round(_least(after), 1), round(sum(after.values()), 6))) > best:
             name, best = min(correction, key=lambda each: wrong[each]), rank
-            result = f"{EXPLAINED[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
+            result = f"{EXPLANATIONS[name]} ({100 * wrong[name]:.0f} % agreement); with {other.words} they would"
     return result
 
 
@@ -97,7 +98,7 @@ def _least(scores: dict[str, float]) -> float:
     return min(score for name, score in scores.items() if name != "climb")
 
 
-EXPLAINED = {
+EXPLANATIONS = {
     "motion": "positions do not move as velocities say",
     "lift": "the vehicle does not accelerate along its thrust axis",
     "thrust": "accelerations are not those of the commanded thrust",

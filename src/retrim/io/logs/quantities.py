@@ -15,7 +15,7 @@ from .csv_file import read_csv
 from .dataflash_file import read_dataflash
 from .flights import FlightReader
 from .log_map import METRES, SECONDS
-from .named_maps import USUAL, AnyMap, names, read_map
+from .named_maps import USUAL_NAMES, AnyMap, names, read_map
 from .npz_file import read_npz
 from .ros_bag import read_bag
 from .series import Clock, LogReader, Series
@@ -28,7 +28,7 @@ READERS: dict[str, LogReader] = {
     ".bag": read_bag, ".mcap": read_bag, ".db3": read_bag,
 }  # fmt: skip
 """Readers by file suffix; a folder is a ROS 2 bag."""
-WITH_FLIGHTS: dict[str, FlightReader] = {".bbl": read_blackbox, ".bfl": read_blackbox, ".bin": read_dataflash}
+FLIGHT_READERS: dict[str, FlightReader] = {".bbl": read_blackbox, ".bfl": read_blackbox, ".bin": read_dataflash}
 """Readers of files that can contain several flights."""
 MOST_BYTES = {".csv": 256 * 2**20, ".bbl": 128 * 2**20, ".bfl": 128 * 2**20, ".bin": 512 * 2**20}
 """Maximum sizes of logs that take much time or memory [bytes]."""
@@ -160,10 +160,10 @@ def _valid(series: dict[str, Series], name: str) -> Series:
 def _reader(path: Path, flight: int | None) -> LogReader:
     suffix = path.suffix.lower()
     _check_file(path, suffix)
-    if not path.is_dir() and suffix in WITH_FLIGHTS:
-        return partial(WITH_FLIGHTS[suffix], flight=flight)
+    if not path.is_dir() and suffix in FLIGHT_READERS:
+        return partial(FLIGHT_READERS[suffix], flight=flight)
     if flight is not None:
-        raise LogError(f"{path}: --flight {flight}: only {', '.join(WITH_FLIGHTS)} files can contain several flights")
+        raise LogError(f"{path}: --flight {flight}: only {', '.join(FLIGHT_READERS)} files can contain several flights")
     return read_bag if path.is_dir() else READERS[suffix]
 
 
@@ -175,9 +175,9 @@ def _check_file(path: Path, suffix: str) -> None:
         return
     if suffix in CONVERTERS:
         raise LogError(f"{path}: {suffix} is not read; {CONVERTERS[suffix]}, to be read with --map map.toml")
-    if suffix not in READERS and suffix not in WITH_FLIGHTS:
+    if suffix not in READERS and suffix not in FLIGHT_READERS:
         raise LogError(
-            f"{path}: unknown kind of log; there are {', '.join([*READERS, *WITH_FLIGHTS])}, and folders of ROS 2"
+            f"{path}: unknown kind of log; there are {', '.join([*READERS, *FLIGHT_READERS])}, and folders of ROS 2"
         )
     if not path.is_file():
         raise LogError(f"{path}: not a regular file")
@@ -188,7 +188,7 @@ def _check_file(path: Path, suffix: str) -> None:
 
 
 def _usual(path: Path) -> tuple[str, ...]:
-    usual = USUAL.get("" if path.is_dir() else path.suffix.lower())
+    usual = USUAL_NAMES.get("" if path.is_dir() else path.suffix.lower())
     if usual is None:
         raise LogError(f"{path}: describe its fields with --map map.toml; maps by name: {', '.join(names())}")
     return usual

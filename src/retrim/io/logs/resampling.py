@@ -40,7 +40,7 @@ def hold_last(series: Series, grid: np.ndarray) -> np.ndarray:
     return series.values[np.clip(np.searchsorted(series.t, grid, side="right") - 1, 0, None)]
 
 
-def held_mean(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
+def mean_of_steps(series: Series, grid: np.ndarray, dt: float) -> np.ndarray:
     """Return the mean of a command over the tick after each grid time; each value is held until the next."""
     steps = np.diff(series.t)[:, None]
     total = np.concatenate([np.zeros((1, series.values.shape[1])), np.cumsum(series.values[:-1] * steps, axis=0)])

@@ -12,7 +12,7 @@ from ...config.validation import suggestion
 from ...errors import LogError
 
 T = TypeVar("T")
-MANY = 30  # maximum number of names in an error message
+MOST_NAMES = 30  # maximum number of names in an error message
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ def sign_of(name: str) -> float:
 
 def missing_field(path: Path, name: str, names: Sequence[str]) -> LogError:
     """Return the error for a missing field."""
-    more = f", and {len(names) - MANY} more" if len(names) > MANY else ""
+    more = f", and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
     near = get_close_matches(name, names, n=1)
     shown_names = [
         "".join(c if c.isprintable() else "\ufffd" for c in each[:80]) for each in dict.fromkeys([*near, *names])
-    ][:MANY]
+    ][:MOST_NAMES]
     return LogError(f"{path}: no field {name[:80]!r}; {suggestion(name, shown_names)}{more}")

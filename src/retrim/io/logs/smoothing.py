@@ -10,8 +10,8 @@ from .on_one_clock import SHORTEST
 from .resampling import GAP
 from .series import Series
 
-FEWEST, WIDEST = 2, 0.15  # half-width of a window: smallest number of samples, and longest time [s]
-QUIET = 0.3  # noise in the second derivative at which a window is wide enough [m/s^2]
+LEAST_SAMPLES, LONGEST_HALF_WIDTH = 2, 0.15  # half-width of a window: smallest number of samples, and longest time [s]
+NOISE_TARGET = 0.3  # noise in the second derivative at which a window is wide enough [m/s^2]
 PROBES, CHUNK = 2000, 4096  # number of samples used to choose the window, and number fitted at a time
 
 
@@ -19,8 +19,8 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     """Return the derivative of positions, and a note on its window and noise.
 
     A cubic is fitted to the samples around each sample. The window is centred, so the derivative has no lag. It is
-    the shortest window for which the noise in the second derivative is at most ``QUIET``, but it extends by at most
-    ``WIDEST`` to each side.
+    the shortest window for which the noise in the second derivative is at most ``NOISE_TARGET``, but it extends by at
+    most ``LONGEST_HALF_WIDTH`` to each side.
 
     Args:
         path: The log file, for messages.
@@ -31,7 +31,7 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
         LogError: There are too few samples.
     """
     t, p = position.t, position.values
-    if len(t) < 4 * FEWEST + 2:
+    if len(t) < 4 * LEAST_SAMPLES + 2:
         raise LogError(f"{path}: {len(t)} positions are too few to differentiate")
     tick = float(np.median(np.diff(t)))
     if tick < SHORTEST:
@@ -39,11 +39,11 @@ def slope_of(path: Path, position: Series, metres: float) -> tuple[Series, str]:
     steps = metres * np.diff(p, axis=0) / np.diff(t)[:, None]
     jumps = stands_out(steps, np.ones(len(steps), dtype=bool), LEAST_SPEED)
     pieces = np.concatenate([[0], np.cumsum(jumps | (np.diff(t) >= GAP * tick))])
-    most = min(max(FEWEST, int(WIDEST / tick)), (len(t) - 1) // 2)
-    for half in sorted({min(most, round(FEWEST * 1.4**k)) for k in range(20)}):
+    most = min(max(LEAST_SAMPLES, int(LONGEST_HALF_WIDTH / tick)), (len(t) - 1) // 2)
+    for half in sorted({min(most, round(LEAST_SAMPLES * 1.4**k)) for k in range(20)}):
         probes = np.linspace(half, len(t) - 1 - half, min(PROBES, len(t) - 2 * half)).astype(int)
         noise, shake = (metres * each for each in _cubics(t, p, pieces, probes, half, tick)[1:])
-        if shake <= QUIET:
+        if shake <= NOISE_TARGET:
             break
     v = np.full(p.shape, np.nan)
     for first in range(half, len(t) - half, CHUNK):

@@ -12,9 +12,10 @@ from .series import Series
 
 LATE_S = 0.5  # time by which a sample may be older than the previous one [s]; a larger step indicates another flight
 LARGEST = 1e15  # in any unit; larger values are damaged
-RARE = 0.05  # largest share of samples with an impossible time
-FAR_S, FAR = 60.0, 3.0  # minimum distance between such a time and all others, in [s] and in lengths of the log
-FEWEST = 50  # minimum number of samples among which a time may be impossible
+MOST_IMPOSSIBLE = 0.05  # largest share of samples with an impossible time
+LEAST_GAP_S = 60.0  # [s], least distance of such a time from all others
+LEAST_GAP = 3.0  # the same in lengths of the log
+LEAST_SAMPLES = 50  # minimum number of samples among which a time may be impossible
 
 
 def in_order(series: Series, what: str, path: Path) -> tuple[Series, list[str]]:
@@ -59,11 +60,11 @@ def impossible(t: np.ndarray) -> np.ndarray:
 
     If too many times are far away, none of them is marked.
     """
-    none, most = np.zeros(len(t), dtype=bool), math.ceil(RARE * len(t))
-    if len(t) < FEWEST:
+    none, most = np.zeros(len(t), dtype=bool), math.ceil(MOST_IMPOSSIBLE * len(t))
+    if len(t) < LEAST_SAMPLES:
         return none
-    first, last = np.quantile(t, [RARE, 1.0 - RARE])
-    reach = max(FAR_S, FAR * (last - first))
+    first, last = np.quantile(t, [MOST_IMPOSSIBLE, 1.0 - MOST_IMPOSSIBLE])
+    reach = max(LEAST_GAP_S, LEAST_GAP * (last - first))
     earliest = np.min(t, where=t > 0.0, initial=np.inf)
     out = (t < first - reach) | (t > last + reach) | ((t == 0.0) & (earliest > LATE_S))
     inside = t[~out]

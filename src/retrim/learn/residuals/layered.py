@@ -22,9 +22,9 @@ class LayeredState(eqx.Module):
 
     first: RegressionState
     second: EnsembleState
-    agreed: Float[Array, ""]
+    agreement: Float[Array, ""]
     """Sum, with exponential forgetting, of remainder times prediction [m^2/s^4]."""
-    foretold: Float[Array, ""]
+    power: Float[Array, ""]
     """Sum, with exponential forgetting, of the squared prediction [m^2/s^4]."""
     smooth: Float[Array, ""]
     """Share of the remainder in the last window that is not tick-to-tick noise."""
@@ -32,7 +32,7 @@ class LayeredState(eqx.Module):
     @property
     def share(self) -> Float[Array, ""]:
         """Share of the ensemble's prediction that is used, between 0 and 1."""
-        return self.smooth * jnp.clip(self.agreed / (self.foretold + DOUBT), 0.0, 1.0)
+        return self.smooth * jnp.clip(self.agreement / (self.power + DOUBT), 0.0, 1.0)
 
 
 class LayeredModel(eqx.Module):
@@ -65,8 +65,8 @@ class LayeredModel(eqx.Module):
         left = rows.a_res - jax.vmap(lambda x, u: self.first.predict(first, x, u))(rows.x, rows.u)
         prediction = jax.vmap(lambda x, u: self._certain(state.second, x, u))(rows.x, rows.u)
         newest = (jnp.arange(weight.shape[0]) >= weight.shape[0] - BLOCK) & (weight > 0.0)
-        agreement = DECAY * state.agreed + jnp.sum(jnp.where(newest, jnp.sum(left * prediction, axis=1), 0.0))
-        square = DECAY * state.foretold + jnp.sum(jnp.where(newest, jnp.sum(prediction**2, axis=1), 0.0))
+        agreement = DECAY * state.agreement + jnp.sum(jnp.where(newest, jnp.sum(left * prediction, axis=1), 0.0))
+        square = DECAY * state.power + jnp.sum(jnp.where(newest, jnp.sum(prediction**2, axis=1), 0.0))
         rest = Targets(rows.x, rows.u, left, rows.omega, weight > 0.0)
         second, _ = self.second.fit(state.second, rest)
         result = LayeredState(first, second, agreement, square, _smooth(left, weight))

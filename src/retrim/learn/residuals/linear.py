@@ -11,7 +11,7 @@ from .targets import Targets
 
 SIZE = 19
 """Number of features: constant (1), velocity (3), attitude (9), thrust vector beyond hover (3), body rates (3)."""
-STEEP = 3.0 / STANDARD_GRAVITY  # [s^2/m], scales thrust beyond hover to the size of the other features
+THRUST_SCALE = 3.0 / STANDARD_GRAVITY  # [s^2/m], scales thrust beyond hover to the size of the other features
 
 
 class LinearState(eqx.Module):
@@ -106,5 +106,5 @@ class LinearModel(eqx.Module):
 
 def features_of(x: State, u: Command) -> Float[Array, "19"]:
     """Return the features, which are all of order one in flight."""
-    thrust = STEEP * (u.c - STANDARD_GRAVITY) * x.R[:, 2]
+    thrust = THRUST_SCALE * (u.c - STANDARD_GRAVITY) * x.R[:, 2]
     return jnp.concatenate([jnp.ones(1, dtype=x.p.dtype), x.v, x.R.reshape(9), thrust, u.omega])

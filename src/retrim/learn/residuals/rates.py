@@ -17,7 +17,7 @@ from ...physics.state import Command, where
 from .targets import Targets
 
 GRID, SHORTEST, LONGEST = 32, 0.002, 1.0  # grid of time constants: number, smallest and largest [s]
-UNSETTLED = 0.16  # [s], beginning of a window, during which the lag settles; these rows do not count
+SETTLING = 0.16  # [s], beginning of a window, during which the lag settles; these rows do not count
 
 
 class RateFit(eqx.Module):
@@ -68,7 +68,7 @@ class RateModel(eqx.Module):
         """Return the posterior given ``rows`` (newest last); return the prior if no row is valid."""
         n = rows.valid.shape[0]
         age = jnp.arange(n - 1, -1, -1, dtype=rows.omega.dtype)
-        counts = rows.valid & (jnp.cumsum(rows.valid) > round(UNSETTLED / self.dt))
+        counts = rows.valid & (jnp.cumsum(rows.valid) > round(SETTLING / self.dt))
         weight = jnp.exp(-self.dt * age / self.memory) * counts.astype(age.dtype)
         taus = jnp.geomspace(SHORTEST, LONGEST, GRID, dtype=age.dtype)
         errors = rows.omega[None] - jax.vmap(lambda tau: self._follow(rows, tau))(taus)

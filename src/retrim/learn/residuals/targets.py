@@ -68,7 +68,7 @@ def residual_targets(
         raise ValueError(f"a window of {n} ticks is too short for a delay of {delay_ticks} ticks")
     x = jax.tree.map(lambda leaf: leaf[delay_ticks : delay_ticks + rows], window.x)
     v_next = window.x.v[delay_ticks + 1 :]
-    u, before, covered = _acting(window, rows, delay_ticks, nominal.dt)
+    u, before, is_complete = _acting(window, rows, delay_ticks, nominal.dt)
 
     def tick(s: Any, row: tuple[State, Command, Float[Array, "3"]]) -> tuple[Any, Float[Array, "3"]]:
         x, u, v_next = row
@@ -81,7 +81,7 @@ def residual_targets(
     _, a_res = lax.scan(tick, first, (x, u, v_next))
     omega = jax.vmap(_turn_between)(x.R, window.x.R[delay_ticks + 1 :]) / nominal.dt
     has_settled = _mark_settled(window, nominal.settling_ticks)[:rows]
-    valid = covered & _regular(window, nominal.dt, delay_ticks, before) & has_settled
+    valid = is_complete & _regular(window, nominal.dt, delay_ticks, before) & has_settled
     if consistent is not None:
         valid &= consistent[delay_ticks : delay_ticks + rows]
         a_res = jnp.where(

@@ -42,7 +42,7 @@ CONTROLLER_TEXTS = {
 }
 """Explanations of the mode names."""
 NO_ROTATION = 0.1  # largest error of R R^T for which an attitude is drawn
-FAR = 1e6  # [m], limit on drawn coordinates
+COORDINATE_LIMIT = 1e6  # [m], limit on drawn coordinates
 
 
 @dataclass(frozen=True)
@@ -159,9 +159,11 @@ class _Page:
         status, sample = last_note(self._bus, "status"), self._sample()
         if sample is not None and sample.tick != self._tick:
             self._tick = sample.tick
-            disturbance, estimate = (_bound_vector(status.get(name, (0.0, 0.0, 0.0))) for name in ("felt", "estimate"))
+            disturbance, estimate = (
+                _bound_vector(status.get(name, (0.0, 0.0, 0.0))) for name in ("disturbance", "estimate")
+            )
             target, R = _bound_vector(status.get("target", sample.state[:3])), sample.truth[3:12].reshape(3, 3)
-            if np.abs(R).max() < FAR and np.allclose(R @ R.T, np.eye(3), atol=NO_ROTATION):
+            if np.abs(R).max() < COORDINATE_LIMIT and np.allclose(R @ R.T, np.eye(3), atol=NO_ROTATION):
                 self._scene.move(_bound_vector(sample.truth[:3]), R, target, disturbance, estimate)
             policies = int(status.get("newest", {}).get("policy", 0))
             self._panel.note(sample.t, float(np.linalg.norm(_bound_vector(sample.truth[:3]) - target)), policies)
@@ -249,7 +251,7 @@ def _text(
     if "policy" in versions:
         lines.append(f"policy updates in use: {versions['policy']}, rolled back: {len(status.get('given_up', []))}")
     lines.append(f"error {100.0 * status.get('error', 0.0):.1f} cm, missed ticks {status.get('missed', 0)}")
-    disturbance, estimate = (_arrow(status.get(name, [])) for name in ("felt", "estimate"))
+    disturbance, estimate = (_arrow(status.get(name, [])) for name in ("disturbance", "estimate"))
     lines.append(f"<span style='color:#d64541'>disturbance</span> {disturbance} m/s²")
     lines.append(f"<span style='color:#3070d6'>estimate</span> {estimate} m/s²")
     for layer, note in learners.items():
@@ -269,7 +271,9 @@ def _text(
 
 def _bound_vector(vector: Any) -> np.ndarray:
     """Return a vector for drawing, with finite and bounded values, whatever values were reported."""
-    bounded_vector: np.ndarray = np.clip(np.nan_to_num(np.asarray(vector, dtype=float)), -FAR, FAR)
+    bounded_vector: np.ndarray = np.clip(
+        np.nan_to_num(np.asarray(vector, dtype=float)), -COORDINATE_LIMIT, COORDINATE_LIMIT
+    )
     return bounded_vector
 
 

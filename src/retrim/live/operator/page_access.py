@@ -16,9 +16,9 @@ from typing import Any
 
 from ...errors import PlantError
 
-EVERYWHERE = ("", "0.0.0.0", "::")
+ALL_ADDRESSES = ("", "0.0.0.0", "::")
 """Addresses that stand for all addresses of this machine."""
-SEALED = {
+HEADERS = {
     "Referrer-Policy": "no-referrer",  # otherwise a link to another site would send the token
     "Cache-Control": "no-store",
     "X-Frame-Options": "DENY",
@@ -30,7 +30,7 @@ SEALED = {
 
 def page_url(host: str, port: int, token: str) -> str:
     """Return the address, including the token, of a page that listens on ``host``."""
-    return f"http://{_bracket(_outward() if host in EVERYWHERE else host)}:{port}/{token}"
+    return f"http://{_bracket(_outward() if host in ALL_ADDRESSES else host)}:{port}/{token}"
 
 
 def refusal(
@@ -88,7 +88,7 @@ def only_for(token: str, host: str) -> Iterator[None]:
                 inner = request.path.partition(token)[2]
                 response = process_request(connection, replace(request, path=inner or "/"))
             if response is not None:
-                for name, value in SEALED.items():
+                for name, value in HEADERS.items():
                     response.headers[name] = value
             return response
 
@@ -109,7 +109,7 @@ def _authorities(host: str, local: tuple[Any, ...]) -> set[str]:
     if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
         address = address.ipv4_mapped
     names = {_bracket(str(address))} | ({"localhost"} if address.is_loopback else set())
-    if host not in EVERYWHERE:
+    if host not in ALL_ADDRESSES:
         names.add(_bracket(host.lower()))
     return {f"{name}:{port}" for name in names} | (names if port == 80 else set())
 

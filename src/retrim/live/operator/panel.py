@@ -12,7 +12,7 @@ HISTORY_S = 60.0  # [s]
 START_S = 2.5  # [s], flight to the goal
 LEAST = 0.5  # [cm], smallest top of the scale
 KICKS = {"+x": (8.0, 0.0, 0.0), "-x": (-8.0, 0.0, 0.0), "+y": (0.0, 8.0, 0.0), "-y": (0.0, -8.0, 0.0)}  # [m/s^2]
-WAITING = "Waiting for take-off."
+WAITING_TEXT = "Waiting for take-off."
 
 
 class Panel:
@@ -50,7 +50,7 @@ class Panel:
         self._tell, self._wish, self._gui, self._pull = turn, wish, server.gui, np.zeros(3)
         self._setting, self._choices = False, dict[str, Any]()
         self._history: deque[tuple[float, float, float]] = deque(maxlen=round(HISTORY_S * rate))
-        self._text = self._gui.add_markdown(WAITING)
+        self._text = self._gui.add_markdown(WAITING_TEXT)
         self._plot = _history_plot(self._gui)
         self._gui.add_markdown(world)
         with self._gui.add_folder("Added to the scenario"):

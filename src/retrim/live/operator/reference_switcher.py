@@ -10,14 +10,14 @@ from ...onboard.messages import FlightRows, Parameters, pack_note
 from ...onboard.topics import REFERENCE
 from ...runtime.events import Event
 from ...tasks.reference import Reference
-from ...tasks.transition import BEFORE, transition_between
+from ...tasks.transition import LEAD_TIME, transition_between
 from ...transport import wire
 from ..live_options import choices
 from ..session import LiveRequest
 from ..status import Status
 from ..supervisor import Supervisor
 
-LEAD = 0.8 * BEFORE  # [s] between the publication of a table and the start of its transition
+LEAD = 0.8 * LEAD_TIME  # [s] between the publication of a table and the start of its transition
 ATTEMPTS = 3
 REFERENCE_TOPIC = "followed"
 """Topic with the name of the current reference."""
@@ -64,7 +64,7 @@ class ReferenceSwitcher:
             try:
                 at, table = reference.result()
             except RetrimError as error:
-                return [Event(status.t, "asked", f"reference {name} cannot be followed: {error}")]
+                return [Event(status.t, "request", f"reference {name} cannot be followed: {error}")]
             self._publish(table, at - LEAD)
             self._pending = name, at, table
         if self._pending is not None:
@@ -80,7 +80,7 @@ class ReferenceSwitcher:
                     self._make(name)
                 else:
                     self._publish(self.pieces[-1][1], t)  # make learners return to the reference in flight
-                    new = [Event(status.t, "asked", f"reference {name} cannot be followed: it was not taken")]
+                    new = [Event(status.t, "request", f"reference {name} cannot be followed: it was not taken")]
         return new + self._begin(status.t)
 
     def _begin(self, t: float) -> list[Event]:
@@ -90,7 +90,7 @@ class ReferenceSwitcher:
         if self._request == self.name:
             return []
         self._make(self._request)
-        return [Event(t, "asked", f"reference {self._request}")]
+        return [Event(t, "request", f"reference {self._request}")]
 
     def _make(self, name: str) -> None:
         self._attempts += 1

@@ -20,7 +20,7 @@ from .manual_disturbance import ManualDisturbance
 from .reference_switcher import ReferenceSwitcher
 
 KNOBS, UNITS = ("push", "wind", "load", "rotor"), {"push": "m/s²", "wind": "m/s", "load": "kg", "kick": "m/s²"}
-SETTLED_S = 0.5  # [s] without a further change, after which the new knob positions become an event
+KNOB_REST_S = 0.5  # [s] without a further change, after which the new knob positions become an event
 
 
 class OperatorRequests:
@@ -57,7 +57,7 @@ class OperatorRequests:
     def _ask(self, request: dict[str, Any], status: Status) -> list[Event]:
         if request.get("land"):
             self._supervisor.land()
-            return [Event(status.t, "asked", "land")]
+            return [Event(status.t, "request", "land")]
         method, pause = request.get("method", self._wish["method"]), request.get("paused", self._wish["paused"])
         now = {"method": method, "paused": pause}
         if now == self._wish or not self._supervisor.spec.layers:
@@ -70,7 +70,7 @@ class OperatorRequests:
         if method != "none" and method != self._method:
             self._method = method
             self._coming = method, self._work.submit(self._start_of, method, status)
-        return [Event(status.t, "asked", f"method {method}" + (", paused" if pause else ""))]
+        return [Event(status.t, "request", f"method {method}" + (", paused" if pause else ""))]
 
     def _start_of(self, method: str, status: Status) -> Path:
         """Write the policy and the residual in flight in the form that ``method`` learns; return the path."""
@@ -94,14 +94,14 @@ class OperatorRequests:
         try:
             self._supervisor.learn_from(future.result())
         except (RetrimError, OSError) as error:
-            return [Event(t, "asked", f"method {method} is not available: {error}")]
-        return [Event(t, "asked", f"the policy's learner starts again: {method}")]
+            return [Event(t, "request", f"method {method} is not available: {error}")]
+        return [Event(t, "request", f"the policy's learner starts again: {method}")]
 
     def _knobs(self, t: float) -> list[Event]:
         if (knob_message := self._new("knobs")) is not None:
             with contextlib.suppress(MessageError):
                 self._knob_change = time.monotonic(), t, ManualDisturbance.unpack(knob_message)
-        if self._knob_change is None or time.monotonic() - self._knob_change[0] < SETTLED_S:
+        if self._knob_change is None or time.monotonic() - self._knob_change[0] < KNOB_REST_S:
             return []
         (_, at, knobs), self._knob_change = self._knob_change, None
         before, self._knobs_before = self._knobs_before, knobs

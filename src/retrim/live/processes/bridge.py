@@ -10,7 +10,7 @@ from types import FrameType
 from ...onboard.heartbeat import Pacemaker
 from ...onboard.messages import pack_note
 from ...onboard.realtime import ParentWatch
-from ...onboard.topics import INTO, MOST, OUT, SLOWLY
+from ...onboard.topics import INPUT_TOPICS, NETWORK_SIZES, OUTPUT_TOPICS, SLOW_TOPICS
 from ...transport.bridge import Bridge
 from ...transport.bus import Bus
 from ...transport.remote import Address
@@ -40,9 +40,9 @@ def carry(plan: BridgePlan) -> None:
     """
     signal.signal(signal.SIGTERM, _stop_on_signal)  # close the network properly in this case, too
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
-    network = plan.address.join(dict.fromkeys((*OUT, *INTO), MOST), listen=True, writes=OUT)
+    network = plan.address.join(NETWORK_SIZES, listen=True, writes=OUTPUT_TOPICS)
     try:
-        bridge = Bridge(bus, network, out=OUT, into=INTO, slowly=SLOWLY)
+        bridge = Bridge(bus, network, out=OUTPUT_TOPICS, into=INPUT_TOPICS, slowly=SLOW_TOPICS)
         bus.publish("ready.bridge", pack_note("ready"))
         versions, since, refusals = (0, 0), time.monotonic(), (0, "")
         with Pacemaker(bus, "bridge") as heart:

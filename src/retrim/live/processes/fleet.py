@@ -20,7 +20,7 @@ from ...onboard.realtime import ParentWatch
 from ...runkit.compile_cache import enable_compile_cache
 from ...transport.shared_memory import SharedMemoryBus
 from .fleet_learner import FleetLearner
-from .learner import CHECK_EVERY, NICE, LearnerPlan
+from .learner import CHECK_EVERY, NICENESS, LearnerPlan
 
 FAILED = ".failed"
 LOOK_EVERY = 0.1  # [s] between two checks for vehicles that have joined or left
@@ -38,7 +38,7 @@ class FleetPlan:
 def learn_for_all(plan: FleetPlan) -> None:
     """Learn until the parent has ended; this is the main function of the process."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(NICE)
+        os.nice(NICENESS)
     enable_compile_cache()
     fleet, parent, last_look, done = FleetLearner(), ParentWatch(plan.parent), 0.0, set[str]()
     while not parent.has_ended():

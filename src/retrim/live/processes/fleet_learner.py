@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from jax import random
 
-from ...adapt.batched_workers import learn_base, learn_together, refused_by_all, room_for, shared_base
+from ...adapt.batched_workers import all_refuse, learn_base, learn_together, room_for, shared_base
 from ...adapt.updates import Update
 from ...config.loading import dump
 from ...config.presets import Preset
@@ -18,7 +18,7 @@ from ...learn.window import Window
 from ...transport.bus import Bus
 from .learner import LearnerLoop, LearnerPlan
 
-AT_ONCE, MANY = 4, 1024  # vehicles per program on a CPU and on an accelerator
+CPU_BATCH, ACCELERATOR_BATCH = 4, 1024  # vehicles per program on a CPU and on an accelerator
 
 
 class FleetLearner:
@@ -32,7 +32,7 @@ class FleetLearner:
         self._compiled = set[tuple[Any, int, bool]]()
         self._bases = dict[Any, PolicyState]()
         self._key = random.key(0)
-        self._most = AT_ONCE if jax.default_backend() == "cpu" else MANY
+        self._most = CPU_BATCH if jax.default_backend() == "cpu" else ACCELERATOR_BATCH
 
     @property
     def loops(self) -> dict[str, LearnerLoop]:
@@ -107,7 +107,7 @@ class FleetLearner:
         self._key, key = random.split(self._key)
         base = learn_base(workers, windows, before, key)
         updates = learn_together(workers, windows, base)
-        self._bases[kind] = before if refused_by_all(updates) else base
+        self._bases[kind] = before if all_refuse(updates) else base
         return updates
 
     def _setup_of(self, preset: Preset, reference: str | None) -> Setup:

@@ -33,11 +33,11 @@ from ...transport.bus import Bus
 from ...transport.shared_memory import SharedMemoryBus
 from ..states import state_of
 
-EVERY = 0.1  # [s] between two messages
+PERIOD = 0.1  # [s] between two messages
 CHECK_EVERY = 0.005  # [s]
 ALLOWANCE = 5.0  # [s], longest time to read the bus once and process the rows
-AT_ONCE = 5 * PIECE  # rows per step
-SMALL = 1e-3  # an estimate is published only if one of its numbers changes by more than this amount
+ROWS_PER_STEP = 5 * PIECE  # rows per step
+LEAST_CHANGE = 1e-3  # an estimate is published only if one of its numbers changes by more than this amount
 
 
 @dataclass(frozen=True)
@@ -98,10 +98,10 @@ class IdentifierLoop:
         self._look()
         if not self._rows:
             return False
-        for _ in range(min(AT_ONCE, len(self._rows))):
+        for _ in range(min(ROWS_PER_STEP, len(self._rows))):
             self._take(self._rows.popleft())
         if not self._rows and self._t >= self._due:
-            self._due = self._t + EVERY
+            self._due = self._t + PERIOD
             self._conclude(self._t)
         return True
 
@@ -132,7 +132,7 @@ class IdentifierLoop:
         self._state = _estimate(self._estimator, self._state)
         arrays = wire.names(_vehicle(self._family, self._state))
         numbers = np.concatenate([np.ravel(np.asarray(leaf, dtype=float)) for leaf in arrays.values()])
-        if self._published is None or np.abs(numbers - self._published).max() > SMALL:
+        if self._published is None or np.abs(numbers - self._published).max() > LEAST_CHANGE:
             self._published, self._version = numbers, self._version + 1
             self.bus.publish(f"parameters.{VEHICLE}", Parameters(VEHICLE, self._version, self._base, t, arrays).pack())
         if len(self._reports) < len(REPORTS) and t >= REPORTS[len(self._reports)]:

@@ -17,7 +17,7 @@ from jax import random
 
 from ...adapt.buffer import RollingBuffer
 from ...adapt.learner_state import LearnerState
-from ...adapt.updates import NOTHING, Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
+from ...adapt.updates import NO_REJECTIONS, Layer, PolicyUpdate, ResidualUpdate, Update, pack_update
 from ...adapt.worker import Worker
 from ...adapt.workers import make_worker
 from ...config.presets import Preset
@@ -41,10 +41,10 @@ from .controllers import parameter_groups
 from .published_updates import active_learner_state, active_update, keep, newest_update
 
 CHECK_EVERY = 0.005  # [s]
-LOOKING, COMPUTING = 5.0, 60.0  # [s], longest time to read the bus and to compute an update
+READ_LIMIT, UPDATE_LIMIT = 5.0, 60.0  # [s], longest time to read the bus and to compute an update
 VERDICT = 1.0  # [s] for control to accept or refuse a policy; the policy then counts as lost
-NICE = 10
-REMEMBERED = 8  # number of the flight's past policies that are kept for a rollback
+NICENESS = 10
+HISTORY = 8  # number of the flight's past policies that are kept for a rollback
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class LearnerLoop:
         """Publish an update learned from the window of :meth:`due`, if control still accepts updates."""
         self._update_count += 1
         topic, took = f"learner.{self.plan.layer}", self._clock() - self._began
-        exclusions = list(update.excluded if isinstance(update, ResidualUpdate) else NOTHING)
+        exclusions = list(update.excluded if isinstance(update, ResidualUpdate) else NO_REJECTIONS)
         note = pack_note(topic, learnt=self._update_count, took=took, until=update.computed_from, excluded=exclusions)
         self.bus.publish(topic, note)
         if self.plan.layer == "policy" and self._judge():
@@ -229,7 +229,7 @@ class LearnerLoop:
             self._pending = None
         elif status.get("newest", {}).get("policy", 0) >= version:
             self.worker.receive(update)
-            self._history, self._pending = [*self._history[-REMEMBERED:], (version, update)], None
+            self._history, self._pending = [*self._history[-HISTORY:], (version, update)], None
         elif self._clock() - publish_time > VERDICT:
             self._pending = None  # the policy was corrupted in transit, or control no longer accepts policies
         return back
@@ -276,7 +276,7 @@ def _start(state: LearnerState) -> PolicyUpdate:
 def learn(plan: LearnerPlan) -> None:
     """Learn until the flight is over; this is the main function of the process."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(NICE)  # a browser or terminal on the same machine must not wait for an update
+        os.nice(NICENESS)  # a browser or terminal on the same machine must not wait for an update
     enable_compile_cache()
     bus, parent = SharedMemoryBus(plan.folder), ParentWatch(plan.parent)
     loop = LearnerLoop(plan, bus)
@@ -285,14 +285,14 @@ def learn(plan: LearnerPlan) -> None:
     bus.publish(f"ready.{plan.layer}", pack_note("ready", base=plan.base, device=jax.devices()[0].platform))
     with Pacemaker(bus, plan.layer) as heart:
         while not parent.has_ended() and bus.latest("ended") is None:
-            heart.touch(LOOKING)
+            heart.touch(READ_LIMIT)
             window = loop.due()
             if window is None:
                 time.sleep(CHECK_EVERY)
                 continue
-            heart.touch(COMPUTING)
+            heart.touch(UPDATE_LIMIT)
             loop.publish_update(loop.worker.learn(window))
     if plan.layer == "policy" and plan.out is not None:
-        while not parent.has_ended(LOOKING):  # the supervisor writes the learned state and ends this process
+        while not parent.has_ended(READ_LIMIT):  # the supervisor writes the learned state and ends this process
             pass
         loop.leave(plan.out)

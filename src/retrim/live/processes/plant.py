@@ -25,7 +25,7 @@ from ...transport.shared_memory import SharedMemoryBus
 from ..operator.manual_disturbance import ManualDisturbance, PlantWithKnobs
 from ..states import state_of, vector_of
 
-ALONE = 5.0  # [s] without a command, after which a plant without a supervisor ends
+SUPERVISOR_TIMEOUT = 5.0  # [s] without a command, after which a plant without a supervisor ends
 CRASHED = "crashed"
 """Reason for the end of a flight without a landing."""
 
@@ -99,7 +99,7 @@ def _fly(
         silent_ticks = 0 if setpoint is not None else silent_ticks + 1
         if setpoint is None:
             holds += 1  # like a vehicle, keep the last command
-            if silent_ticks * plan.dt > ALONE and parent.has_ended():
+            if silent_ticks * plan.dt > SUPERVISOR_TIMEOUT and parent.has_ended():
                 return "no commands arrive, and the supervisor is gone"
         elif setpoint.is_final:
             return setpoint.ending(float(sample.truth[2]))

@@ -18,7 +18,7 @@ from ...plants.bridges.vehicle_plant import VehiclePlant
 from ...plants.bridges.vehicle_state import VehicleState
 from ...transport.bus import Bus
 from ...transport.shared_memory import SharedMemoryBus
-from .plant import ALONE, PlantPlan, answer
+from .plant import SUPERVISOR_TIMEOUT, PlantPlan, answer
 
 HOLD_S = 0.05  # [s] between two reads of the orders while the autopilot holds the vehicle
 
@@ -75,7 +75,7 @@ def _carry(plan: PlantPlan, plant: VehiclePlant, bus: Bus, parent: ParentWatch, 
         silent_ticks = 0 if setpoint is not None else silent_ticks + 1
         if setpoint is None:
             holds += 1  # without a new command the autopilot keeps the last one for as long as it permits
-            if silent_ticks * plan.dt > ALONE and parent.has_ended():
+            if silent_ticks * plan.dt > SUPERVISOR_TIMEOUT and parent.has_ended():
                 return "no commands arrive, and the supervisor is gone"
         elif setpoint.is_final:
             return setpoint.ending(float(now.p[2]))

@@ -20,9 +20,9 @@ from .polling import KeepOn
 from .vehicle_plant import VehiclePlant
 from .vehicle_state import VehicleState
 
-LISTENS_S, ARMS_S, SPINS_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
+RECEIVER_S, ARMING_S, SPIN_UP_S = 2.0, 6.0, 0.4  # [s]: start of the receiver; arming; motors reach hover
 MARGIN = 1.05  # ratio of the body rate at full stick to the fastest command
-ON = 0.8 * IDLE  # smallest motor command of an armed board
+LEAST_MOTOR = 0.8 * IDLE  # smallest motor command of an armed board
 
 
 class BetaflightPlant(VehiclePlant):
@@ -61,10 +61,10 @@ class BetaflightPlant(VehiclePlant):
         self._firmware = Firmware(find_firmware(), self._steps)
         try:
             world = self._world = World(self._model, self._disturbance, math.radians(10.0 * self._steps))
-            self.until(lambda: False, LISTENS_S, keep_on)
+            self.until(lambda: False, RECEIVER_S, keep_on)
             world.tell(0.0, np.zeros(3), armed=True)
-            if not self.until(lambda: bool(world.motors.min() > ON), ARMS_S, keep_on):
-                raise PlantError(f"the firmware does not arm within {ARMS_S:g} s")
+            if not self.until(lambda: bool(world.motors.min() > LEAST_MOTOR), ARMING_S, keep_on):
+                raise PlantError(f"the firmware does not arm within {ARMING_S:g} s")
         except BaseException:
             self.land()
             raise
@@ -76,7 +76,7 @@ class BetaflightPlant(VehiclePlant):
         world.place(State(place, rotz(jnp.asarray(yaw or 0.0, dtype=place.dtype)), jnp.zeros_like(place)))
         self._flies = False
         world.tell(self._throttle(STANDARD_GRAVITY), np.zeros(3))
-        self.until(lambda: False, SPINS_S, keep_on)
+        self.until(lambda: False, SPIN_UP_S, keep_on)
 
     def hold(self, until: float) -> None:
         """Leave the vehicle on the stand."""

@@ -19,14 +19,14 @@ from ...errors import PlantError
 from .betaflight_wire import CLI, settings
 
 VARIABLE = "RETRIM_BETAFLIGHT"
-STARTS_S, ANSWERS_S, SAVES_S = 20.0, 10.0, 10.0  # [s], time limits
+STARTS_S, ANSWERS_S, SAVE_LIMIT_S = 20.0, 10.0, 10.0  # [s], time limits
 PORT_IN_USE = "bind port"  # part of the program's message about a port in use
-AGAIN_S = 0.5  # [s] until the next attempt
+RETRY_S = 0.5  # [s] until the next attempt
 PRIORITY = 40  # above the processes for control, learning and display
-LISTENING = "0A"  # state of a socket in the kernel's tables
-SETTLES_S = 0.5  # [s] from the start until its command line listens
+LISTEN_STATE = "0A"  # state of a socket in the kernel's tables
+BOOT_S = 0.5  # [s] from the start until its command line listens
 # The board ignores termination signals when its parent has ended, so the kernel kills it (PR_SET_PDEATHSIG, SIGKILL).
-TIED = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
+RUN_WITH_PARENT = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 
 
 def find_firmware() -> Path:
@@ -115,19 +115,19 @@ class Firmware:
         while not _listens():
             has_ended = process.poll() is not None
             if has_ended and PORT_IN_USE in self._output() and time.monotonic() < until:
-                time.sleep(AGAIN_S)  # the system has not freed the port of the board before the restart
+                time.sleep(RETRY_S)  # the system has not freed the port of the board before the restart
                 process = self._launch()
             elif has_ended or time.monotonic() > until:
                 raise PlantError(f"{self._program}: does not start; its output is {self._output()}")
             time.sleep(0.02)
-        time.sleep(SETTLES_S)
+        time.sleep(BOOT_S)
         return process.pid
 
     def _launch(self) -> "subprocess.Popen[bytes]":
         log = Path(self._folder.name, "board.log").open("wb")  # noqa: SIM115 the process uses it from now on
         with log:
             self._process = subprocess.Popen(
-                [sys.executable, "-S", "-E", "-c", TIED, str(self._program)], cwd=self._folder.name,
+                [sys.executable, "-S", "-E", "-c", RUN_WITH_PARENT, str(self._program)], cwd=self._folder.name,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             )  # fmt: skip
         return self._process
@@ -145,7 +145,7 @@ class Firmware:
             with contextlib.suppress(OSError):
                 while line.recv(4096):  # the process ends only after its whole output has been read
                     pass
-        until = time.monotonic() + SAVES_S
+        until = time.monotonic() + SAVE_LIMIT_S
         while self.runs and time.monotonic() < until:
             time.sleep(0.02)
         self._end()
@@ -183,7 +183,7 @@ def _listens() -> bool:
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         with contextlib.suppress(OSError):
             sockets = [line.split() for line in Path(table).read_text().splitlines()[1:]]
-            if any(fields[1].endswith(f":{CLI:04X}") and fields[3] == LISTENING for fields in sockets):
+            if any(fields[1].endswith(f":{CLI:04X}") and fields[3] == LISTEN_STATE for fields in sockets):
                 return True
     return False
 

@@ -22,7 +22,7 @@ from .vehicle_state import VehicleState
 GROUND = 0.0  # [m]
 HOST = "127.0.0.1"
 STICKS_EVERY = 5  # [ms] between receiver packets
-BEHIND = 0.02  # [s], largest delay that the world still makes up for
+LONGEST_LAG = 0.02  # [s], largest delay that the world still makes up for
 
 
 class MotorListener:
@@ -138,7 +138,7 @@ class World:
             late = time.monotonic() - due
             if late < 0.0:
                 time.sleep(-late)
-            elif late > BEHIND:
+            elif late > LONGEST_LAG:
                 self.slip += late if self._free else 0.0
                 due += late
             self.motors = self._ears.hear(self.motors)

@@ -6,12 +6,12 @@ from collections import deque
 import numpy as np
 
 MEMORY = 10  # exchanges
-ENOUGH = 3  # smallest number of exchanges for an estimate of the rate
-APART = 0.03  # [s], smallest standard deviation of the exchange times for an estimate of the rate
+LEAST_EXCHANGES = 3  # smallest number of exchanges for an estimate of the rate
+LEAST_SPREAD = 0.03  # [s], smallest standard deviation of the exchange times for an estimate of the rate
 SLIP = 3e-3  # [s], largest deviation in excess of the error bound by the round trip
 JITTER = 1e-4  # [s], of the quickest exchange
 JUMP_S = 0.5  # [s] by which a clock must be ahead of the arrival times to be a clock that was set
-LATER = 3  # messages in a row with older but rising stamps, after which the clock was set back
+LEAST_STEPS_BACK = 3  # messages in a row with older but rising stamps, after which the clock was set back
 WINDOW_S = 2.0  # [s] in which at least one message is assumed to arrive without a delay
 
 
@@ -36,7 +36,7 @@ class RemoteClock:
             remote: Time in the answer, on the other clock [s].
             answer_time: Arrival time of the answer, on our clock [s].
         """
-        remote_time = self.here(remote) if len(self._exchanges) >= ENOUGH else None
+        remote_time = self.here(remote) if len(self._exchanges) >= LEAST_EXCHANGES else None
         clock_slips = (
             remote_time is not None
             and abs(0.5 * (request_time + answer_time) - remote_time) > 0.5 * (answer_time - request_time) + SLIP
@@ -49,7 +49,7 @@ class RemoteClock:
         weights /= weights.sum()
         centre, height = float(weights @ x), float(weights @ y)
         spread = float(weights @ (x - centre) ** 2)
-        if len(x) >= ENOUGH and spread > APART**2:
+        if len(x) >= LEAST_EXCHANGES and spread > LEAST_SPREAD**2:
             self._rate = float(np.clip(weights @ ((x - centre) * (y - height)) / spread, 0.2, 5.0))
         self._line = centre, height
 
@@ -108,7 +108,7 @@ class StampClock:
             if stamp != self._newest:
                 self._older = self._older + 1 if stamp > self._last else 1
             self._last = stamp
-            if self._older < LATER:
+            if self._older < LEAST_STEPS_BACK:
                 return None
             self._restart()
         elif math.isfinite(self._newest) and stamp - self._newest - (now - self._arrival) > JUMP_S:

@@ -17,15 +17,15 @@ from .polling import KeepOn, insisting
 from .vehicle_state import VehicleState
 
 ADDRESS = "udp:127.0.0.1:19850"  # of a simulated Crazyflie, or a bridge to the radio, on this machine
-ANSWERS_S, READY_S, STILL_S, ARM_S, GO_S, LANDING_S = 5.0, 20.0, 2.0, 5.0, 20.0, 15.0  # [s]
-AGAIN_S = 1.0  # [s] after which an order without effect is sent again
+ANSWERS_S, READY_S, REST_S, ARM_S, APPROACH_S, LANDING_S = 5.0, 20.0, 2.0, 5.0, 20.0, 15.0  # [s]
+REPEAT_S = 1.0  # [s] after which an order without effect is sent again
 LOST_S = 2.0  # [s] of silence; by then the Crazyflie has stopped its motors
 WANDERS = 0.1  # [m], largest change in the estimated position while it stands still
 SPEED, RISE_S = 0.5, 2.0  # [m/s] during the flight to the start; [s] of a take-off
 THRUST_S = 2.0  # [s] over which the thrust at hover is identified
 GROUND = 0.1  # [m] above its take-off height
 ORDER_EVERY_S, ORDERS_S = 0.05, 0.25  # [s]: the guardian repeats the order to land, since a radio loses packets
-WRONG = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crtp.CRASHED: "has crashed"}
+FAULT_TEXTS = {crtp.TUMBLED: "lies on its back", crtp.LOCKED: "has locked itself", crtp.CRASHED: "has crashed"}
 
 
 class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
@@ -86,12 +86,12 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         heading = heading_of(x.R) if yaw is None else yaw
         self._flies = True  # from now on it must be landed and disarmed
         ready = lambda: self._is(crtp.ARMED) and self._is(crtp.CAN_FLY)  # noqa: E731
-        arming = insisting(lambda: link.send(crtp.arm(True, link.version)), ready, AGAIN_S)
+        arming = insisting(lambda: link.send(crtp.arm(True, link.version)), ready, REPEAT_S)
         if not self.until(arming, ARM_S, keep_on):
             raise PlantError(f"{self.address}: the Crazyflie refuses to be armed{link.console_text()}")
         if not self._is(crtp.FLYING):
             rise = crtp.take_off(float(place[2]), heading, RISE_S)
-            rising = insisting(lambda: link.send(rise), lambda: self._is(crtp.FLYING), AGAIN_S)
+            rising = insisting(lambda: link.send(rise), lambda: self._is(crtp.FLYING), REPEAT_S)
             if not self.until(rising, ARM_S, keep_on):
                 raise PlantError(f"{self.address}: the Crazyflie does not take off{link.console_text()}")
             self.until(lambda: False, RISE_S, keep_on)
@@ -100,8 +100,8 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             way = max(1.0, float(np.linalg.norm(place - self.reading().p)) / SPEED)
             link.send(crtp.go_to(place, heading, way, link.version))
 
-        patience = GO_S + float(np.linalg.norm(place - self.reading().p)) / SPEED
-        if not self.until(insisting(go, self.staying(place), 0.5 * GO_S), patience, keep_on):
+        patience = APPROACH_S + float(np.linalg.norm(place - self.reading().p)) / SPEED
+        if not self.until(insisting(go, self.staying(place), 0.5 * APPROACH_S), patience, keep_on):
             at, target = (each.round(2).tolist() for each in (self.reading().p, place))
             raise PlantError(
                 f"{self.address}: it is at {at} m after {patience:.0f} s, not at {target}{link.console_text()}"
@@ -122,7 +122,7 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         now = time.monotonic()
         if now - link.last_message > LOST_S:
             raise PlantError(f"the link has been silent for {LOST_S:g} s; a Crazyflie stops its motors then")
-        for bit, what in WRONG.items():
+        for bit, what in FAULT_TEXTS.items():
             if self._is(bit):
                 raise PlantError(f"the Crazyflie reports that it {what}{link.console_text()}")
         if self._flies and not self._is(crtp.ARMED):
@@ -195,11 +195,11 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
             wanders = max(wanders, float(np.abs(self.reading().p - first).max()))
             return False
 
-        self.until(is_away, STILL_S, keep_on)
+        self.until(is_away, REST_S, keep_on)
         if wanders > WANDERS:
             raise PlantError(
                 f"{self.address}: the Crazyflie is at rest, and its estimate drifted by {wanders:.2f} m "
-                f"in {STILL_S:g} s; is there a positioning system?"
+                f"in {REST_S:g} s; is there a positioning system?"
             )
 
 

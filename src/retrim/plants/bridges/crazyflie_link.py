@@ -20,7 +20,7 @@ from .vehicle_state import Reading
 STATES, STATUSES = 1, 2  # numbers of our log blocks
 STATE_S, STATUS_S = 0.01, 0.05  # [s] between two states and between two statuses
 ECHO_S = 0.1  # [s] between two measurements of the round-trip time
-AGAIN_S = 0.2  # [s] after which an unanswered request is repeated
+REPEAT_S = 0.2  # [s] after which an unanswered request is repeated
 WRAP_MS = 1 << 24  # [ms], period after which the Crazyflie's time wraps around
 LATE_S, EARLY_S = 0.5, 1.0  # [s] by which this time may go back, and run ahead of ours, between two messages
 # [m], largest plausible jump between two states; [s] for which the last state is used for this check; [m/s]
@@ -84,7 +84,7 @@ class CrazyflieLink:
             PlantError: The Crazyflie does not answer, or the flight was aborted.
         """
         self._request, self._answer = question._replace(body=question.body[:same]), None
-        asking = insisting(lambda: self.send(question), lambda: self._answer is not None, AGAIN_S)
+        asking = insisting(lambda: self.send(question), lambda: self._answer is not None, REPEAT_S)
         try:
             if not wait_until(asking, patience, keep_on, self.pump) or self._answer is None:
                 raise PlantError(f"the Crazyflie does not answer on port {question.port} in {patience:g} s")

@@ -17,7 +17,7 @@ LONGEST = 31  # bytes, with the header
 TOC, CONTROL, DATA = 0, 1, 2  # channels of LOG
 ITEM, INFO = 2, 3  # commands of a table of contents
 RESET, CREATE, APPEND, START = 5, 6, 7, 3  # commands of LOG's CONTROL
-LISTED = 9  # largest number of variables in one CREATE or APPEND
+VARIABLES_PER_PACKET = 9  # largest number of variables in one CREATE or APPEND
 LOG_MS = 10  # [ms], unit of the period of START
 MANUAL, RELAX = 11, 0  # of SETPOINT's channels 0 and 1
 HL_STOP, GO_TO, TAKE_OFF, LAND, GO_TO_LINEAR = 3, 4, 7, 8, 12  # commands of HIGH_LEVEL
@@ -106,7 +106,7 @@ def arm(yes: bool, version: int) -> Packet:
 def new_block(number: int, variables: list[tuple[str, int]]) -> list[Packet]:
     """Return the command packets that create a log block from the types and numbers of its variables."""
     items = [struct.pack("<BH", LOG_TYPES[kind], item) for kind, item in variables]
-    parts = [b"".join(items[k : k + LISTED]) for k in range(0, len(items), LISTED)]
+    parts = [b"".join(items[k : k + VARIABLES_PER_PACKET]) for k in range(0, len(items), VARIABLES_PER_PACKET)]
     return [Packet(LOG, CONTROL, bytes([APPEND if k else CREATE, number]) + part) for k, part in enumerate(parts)]
 
 

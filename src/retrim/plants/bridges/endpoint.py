@@ -16,7 +16,7 @@ FORMS = {
     "tcp": "tcp:HOST:PORT, as tcp:127.0.0.1:5761",
     "serial": "serial:DEVICE:BAUD, as serial:/dev/ttyACM0:921600",
 }
-CLOSED_S = 1e-3  # [s] of a read after the other end has closed, since select then returns at once
+CLOSED_WAIT_S = 1e-3  # [s] of a read after the other end has closed, since select then returns at once
 NAP_S = 0.02  # [s], longest time between two calls of the periodic work
 
 
@@ -106,7 +106,7 @@ class TcpEndpoint:
         except OSError:
             return None
         if not data:
-            time.sleep(CLOSED_S)
+            time.sleep(CLOSED_WAIT_S)
         return (data, "line") if data else None
 
     def send(self, data: bytes, to: Any) -> None:
@@ -225,8 +225,8 @@ def pump(endpoint: Endpoint, until: float, chores: Callable[[float], None], take
     """
     while True:
         chores(time.monotonic())
-        while (come := endpoint.receive()) is not None:
-            take(*come)
+        while (packet := endpoint.receive()) is not None:
+            take(*packet)
         left = until - time.monotonic()
         if left <= 0.0:
             return

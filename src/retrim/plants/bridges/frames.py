@@ -12,19 +12,19 @@ BODY = np.array([1.0, -1.0, -1.0])
 """Sign of each axis in the conversion from FRD to FLU, and from FLU to FRD."""
 
 
-def turned_world(vector: np.ndarray) -> np.ndarray:
+def turn_world(vector: np.ndarray) -> np.ndarray:
     """Convert a world vector to the other frame: NED to ENU, or ENU to NED."""
     out: np.ndarray = WORLD @ vector
     return out
 
 
-def turned_body(vector: np.ndarray) -> np.ndarray:
+def turn_body(vector: np.ndarray) -> np.ndarray:
     """Convert a body vector to the other frame: FRD to FLU, or FLU to FRD."""
     out: np.ndarray = BODY * vector
     return out
 
 
-def turned_heading(yaw: float) -> float:
+def turn_heading(yaw: float) -> float:
     """Convert a heading to the other frame [rad]: clockwise from north, or counter-clockwise from east."""
     return float(np.pi / 2 - yaw)
 

@@ -15,9 +15,9 @@ from .polling import KeepOn
 ADDRESS = "udp:127.0.0.1:14540"  # that PX4 sends to on its own machine
 PX4 = 12  # MAV_AUTOPILOT
 STREAMS = {"ODOMETRY": 100.0, "ATTITUDE_TARGET": 25.0, "HIL_STATE_QUATERNION": 50.0}  # [Hz]
-UNUSED = ("HIGHRES_IMU", "ATTITUDE", "ALTITUDE", "VFR_HUD", "SERVO_OUTPUT_RAW", "HIL_ACTUATOR_CONTROLS")
+UNUSED_MESSAGES = ("HIGHRES_IMU", "ATTITUDE", "ALTITUDE", "VFR_HUD", "SERVO_OUTPUT_RAW", "HIL_ACTUATOR_CONTROLS")
 # [s], limits for the first message and for readiness; time after which arming is tried even if PX4 is not ready
-LISTENS_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0
+ANSWER_S, READY_S, UNREADY_S = 10.0, 40.0, 12.0
 
 
 class MavlinkPlant(OffboardPlant[MavlinkLink]):
@@ -48,16 +48,16 @@ class MavlinkPlant(OffboardPlant[MavlinkLink]):
                 endpoint.close()
                 raise
         link = self._link
-        if not self.until(lambda: link.system is not None, LISTENS_S, keep_on):
+        if not self.until(lambda: link.system is not None, ANSWER_S, keep_on):
             raise PlantError(
-                f"{self.address}: no autopilot was heard there in {LISTENS_S:g} s; "
+                f"{self.address}: no autopilot was heard there in {ANSWER_S:g} s; "
                 "is it on, and does it send to this address?"
             )
         if link.autopilot != PX4:
             raise PlantError(f"{self.address}: autopilot {link.autopilot} responds; only PX4 ({PX4}) is supported")
         for message, rate in STREAMS.items():
             link.stream(message, max(rate, 2.0 / self.dt) if message == "ODOMETRY" else rate)
-        for message in UNUSED:
+        for message in UNUSED_MESSAGES:
             link.stream(message, 1.0)
         began = time.monotonic()
         # With motion capture instead of GPS, PX4 does not report that it can be armed, although it can.

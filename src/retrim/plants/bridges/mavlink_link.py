@@ -27,9 +27,9 @@ WORLDS, BODIES = (LOCAL_NED, LOCAL_FRD), (BODY_FRD, BODY_NED)
 VISION, INT32, REAL32 = 2, 6, 9  # MAV_ESTIMATOR_TYPE, MAV_PARAM_TYPE
 RATES_ONLY = 128  # SET_ATTITUDE_TARGET: use thrust and body rates, ignore the attitude
 PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: ignore velocity, acceleration and yaw rate
-PAIRED_S = 0.025  # [s], largest time between a position and an attitude that are combined into a state
+PAIRING_S = 0.025  # [s], largest time between a position and an attitude that are combined into a state
 MOST_NOTES = 5
-SETTLED_S = 1.0  # [s] without ODOMETRY, after which other messages are used instead
+ODOMETRY_TIMEOUT_S = 1.0  # [s] without ODOMETRY, after which other messages are used instead
 
 
 class MavlinkLink:
@@ -102,7 +102,7 @@ class MavlinkLink:
             omega: Body rates in our frame [rad/s].
         """
         if self.system is not None:
-            rates = frames.turned_body(omega)
+            rates = frames.turn_body(omega)
             self._send(self._sender.set_attitude_target_encode(
                 0, *self.system, RATES_ONLY, [1.0, 0.0, 0.0, 0.0], *map(float, rates), float(thrust)
             ))  # fmt: skip
@@ -115,9 +115,9 @@ class MavlinkLink:
             yaw: Target heading in our convention [rad].
         """
         if self.system is not None:
-            place = [float(x) for x in frames.turned_world(p)]
+            place = [float(x) for x in frames.turn_world(p)]
             self._send(self._sender.set_position_target_local_ned_encode(
-                0, *self.system, LOCAL_NED, PLACE_AND_YAW, *place, 0, 0, 0, 0, 0, 0, frames.turned_heading(yaw), 0
+                0, *self.system, LOCAL_NED, PLACE_AND_YAW, *place, 0, 0, 0, 0, 0, 0, frames.turn_heading(yaw), 0
             ))  # fmt: skip
 
     def see(self, x: Reading) -> None:
@@ -126,9 +126,9 @@ class MavlinkLink:
         Args:
             x: The state; the time stamp is not sent, since the message is sent immediately.
         """
-        place = [float(each) for each in frames.turned_world(x.p)]
-        velocity = [float(each) for each in frames.turned_body(x.R.T @ x.v)]
-        rates = [float(each) for each in frames.turned_body(x.omega)]
+        place = [float(each) for each in frames.turn_world(x.p)]
+        velocity = [float(each) for each in frames.turn_body(x.R.T @ x.v)]
+        rates = [float(each) for each in frames.turn_body(x.omega)]
         unknown = [math.nan] * 21
         self._send(self._sender.odometry_encode(
             0, LOCAL_NED, BODY_FRD, *place, frames.quaternion_of(x.R).tolist(), *velocity, *rates, unknown, unknown,
@@ -234,9 +234,9 @@ class MavlinkLink:
     def _local_position(self, message: Any, now: float) -> None:
         """Combine position and attitude messages into a state if the autopilot does not send ODOMETRY."""
         attitude = self._attitude
-        if now - self._odometry_at < SETTLED_S or attitude is None:
+        if now - self._odometry_at < ODOMETRY_TIMEOUT_S or attitude is None:
             return
-        if abs(message.time_boot_ms - attitude.time_boot_ms) <= 1e3 * PAIRED_S:
+        if abs(message.time_boot_ms - attitude.time_boot_ms) <= 1e3 * PAIRING_S:
             q = np.array([attitude.q1, attitude.q2, attitude.q3, attitude.q4])
             rates = np.array([attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed])
             p, v = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
@@ -252,10 +252,10 @@ class MavlinkLink:
         R = frames.attitude_of(q)
         here = self._clock.here(remote)
         stamp = now if here is None else min(here, now)
-        if self.reading is not None and stamp < self.reading.stamp and now - stamp < SETTLED_S:
+        if self.reading is not None and stamp < self.reading.stamp and now - stamp < ODOMETRY_TIMEOUT_S:
             return  # it arrived out of order
-        velocity = R @ frames.turned_body(v) if in_body else frames.turned_world(v)
-        self.reading = Reading(stamp, frames.turned_world(p), R, velocity, frames.turned_body(rates))
+        velocity = R @ frames.turn_body(v) if in_body else frames.turn_world(v)
+        self.reading = Reading(stamp, frames.turn_world(p), R, velocity, frames.turn_body(rates))
 
     def _attitude_target(self, message: Any, now: float) -> None:
         if math.isfinite(message.thrust):
@@ -275,6 +275,6 @@ class MavlinkLink:
         per_degree = math.radians(1.0) * 6_371_000.0
         north, east = ((here[i] - self._origin[i]) * per_degree for i in (0, 1))
         p = np.array([east * math.cos(math.radians(self._origin[0])), north, here[2] - self._origin[2]])
-        v = frames.turned_world(1e-2 * np.array([message.vx, message.vy, message.vz]))
-        rates = frames.turned_body(np.array([message.rollspeed, message.pitchspeed, message.yawspeed]))
+        v = frames.turn_world(1e-2 * np.array([message.vx, message.vy, message.vz]))
+        rates = frames.turn_body(np.array([message.rollspeed, message.pitchspeed, message.yawspeed]))
         self.truth = Reading(now, p, frames.attitude_of(q), v, rates)

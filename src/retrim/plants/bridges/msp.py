@@ -15,7 +15,7 @@ MOTOR, RC, RC_TUNING, BOX_IDS, RC_DEADBAND, STATUS_EX, SET_RAW_RC = 104, 105, 11
 ARM, ANGLE, HORIZON, OVERRIDE = 0, 1, 2, 50  # permanent numbers of modes
 LONGEST = 255  # bytes of a payload
 REQUEST, ANSWER, REFUSAL = b"<", b">", b"!"
-ACTUAL = 3  # number of the rate curve
+ACTUAL_RATES = 3  # number of the rate curve
 STEP_FROM, STEP = 900, 25  # [us]: start and unit of a mode's range
 
 

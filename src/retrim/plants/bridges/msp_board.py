@@ -11,7 +11,7 @@ from ...physics.state import STANDARD_GRAVITY
 from ...physics.vehicle import Vehicle
 from . import msp
 
-NEEDED = {
+REQUIRED_ANSWERS = {
     msp.API_VERSION: "API_VERSION", msp.FC_VARIANT: "FC_VARIANT", msp.FC_VERSION: "FC_VERSION",
     msp.BOX_IDS: "BOXIDS", msp.MODE_RANGES: "MODE_RANGES", msp.RX_CONFIG: "RX_CONFIG", msp.RX_MAP: "RX_MAP",
     msp.RC_TUNING: "RC_TUNING", msp.RC_DEADBAND: "RC_DEADBAND", msp.ADVANCED_CONFIG: "ADVANCED_CONFIG",
@@ -27,7 +27,7 @@ TABLE = 201
 
 @dataclass(frozen=True)
 class Board:
-    """What a board has told about its settings."""
+    """What a board reports about its settings."""
 
     version: str
     """Firmware and its version."""
@@ -46,7 +46,7 @@ class Board:
 
     @classmethod
     def of(cls, answers: Mapping[int, bytes]) -> "Board":
-        """Read the answers to the requests in ``NEEDED``.
+        """Read the answers to the requests in ``REQUIRED_ANSWERS``.
 
         Raises:
             PlantError: The firmware is another one, or a setting makes the sticks ambiguous; the error names the
@@ -66,7 +66,7 @@ class Board:
         tuning, deadband = answers[msp.RC_TUNING], answers[msp.RC_DEADBAND]
         wrong = {
             f"rates_type is number {msp.byte_at(tuning, 22)}: set rates_type = ACTUAL":
-                msp.byte_at(tuning, 22) != msp.ACTUAL,
+                msp.byte_at(tuning, 22) != msp.ACTUAL_RATES,
             "the throttle has an expo: set thr_expo = 0": msp.byte_at(tuning, 7) != 0,
             "the throttle is limited: set throttle_limit_type = OFF": msp.byte_at(tuning, 14) != 0,
             "the sticks have a deadband: set deadband = 0, set yaw_deadband = 0":
@@ -89,8 +89,8 @@ class Board:
     @property
     def level_channel(self) -> msp.ModeRange | None:
         """Range of ANGLE mode on a channel of its own, by which the companion can level the vehicle; None without."""
-        taken = {each.channel for each in self.ranges if each.mode != msp.ANGLE}
-        return next((each for each in self.ranges if each.mode == msp.ANGLE and each.channel not in taken), None)
+        occupied = {each.channel for each in self.ranges if each.mode != msp.ANGLE}
+        return next((each for each in self.ranges if each.mode == msp.ANGLE and each.channel not in occupied), None)
 
     def fastest(self) -> np.ndarray:
         """Return the body rates at full stick [rad/s]."""

@@ -11,16 +11,16 @@ from ...ros2.backends import is_installed
 from ...ros2.node import Ros2Node
 from . import msp
 from .endpoint import Endpoint, pump
-from .msp_board import NEEDED, PITCH, ROLL, THROTTLE, YAW, Board
+from .msp_board import PITCH, REQUIRED_ANSWERS, ROLL, THROTTLE, YAW, Board
 from .polling import KeepOn, insisting, wait_until
 from .ros2_address import Ros2Address
 from .ros2_link import Ros2Link
 from .vehicle_state import Reading
 
-ANSWERS_S, AGAIN_S = 6.0, 0.3  # [s], limit for the answers about the settings; time between two requests
-ASK_EVERY_S = 0.05  # [s] between two requests, alternately for the board's modes and for its channels
-MOST_PENDING, ASK_AT_LEAST_S = 2, 0.25  # packets without an answer that postpone a request, and by how long [s]
-COUNTED = 50  # throttles and motor commands that are kept
+ANSWERS_S, REPEAT_S = 6.0, 0.3  # [s], limit for the answers about the settings; time between two requests
+REQUEST_PERIOD_S = 0.05  # [s] between two requests, alternately for the board's modes and for its channels
+MOST_PENDING, LONGEST_POSTPONEMENT_S = 2, 0.25  # packets without an answer that postpone a request, and by how long [s]
+HISTORY = 50  # throttles and motor commands that are kept
 ECHOES, ECHO_US = 25, 3  # last commands that an answer may echo, and the largest difference [us]
 
 
@@ -71,7 +71,7 @@ class MspLink:
         """Newest modes of the board."""
         self.channels: list[int] = []
         """Newest receiver channels, in the firmware's order of the sticks [us]."""
-        self.throttles: deque[float] = deque(maxlen=COUNTED)
+        self.throttles: deque[float] = deque(maxlen=HISTORY)
         """Throttles of the pilot, newest last; they are kept while the pilot flies."""
         self.last_answer = time.monotonic()
         """Time of the board's last answer, on the monotonic clock [s]."""
@@ -116,14 +116,16 @@ class MspLink:
         """
 
         def ask() -> None:
-            for code in NEEDED:
+            for code in REQUIRED_ANSWERS:
                 if code not in self.answers:
                     self.send(code)
 
-        is_known = insisting(ask, lambda: all(code in self.answers for code in NEEDED), AGAIN_S)
+        is_known = insisting(ask, lambda: all(code in self.answers for code in REQUIRED_ANSWERS), REPEAT_S)
         if not wait_until(is_known, ANSWERS_S, keep_on, self.pump):
-            missing = [name for code, name in NEEDED.items() if code not in self.answers]
-            who = "the board does not answer" if len(missing) == len(NEEDED) else "the board does not answer to"
+            missing = [name for code, name in REQUIRED_ANSWERS.items() if code not in self.answers]
+            who = (
+                "the board does not answer" if len(missing) == len(REQUIRED_ANSWERS) else "the board does not answer to"
+            )
             raise PlantError(f"{who} MSP requests ({', '.join(missing)}) within {ANSWERS_S:g} s; is MSP on this port?")
         self.board = Board.of(self.answers)
         return self.board
@@ -163,7 +165,7 @@ class MspLink:
         """Return whether the board's sticks are those of a recent command."""
         if self.board is None or len(self.channels) <= THROTTLE:
             return False
-        rows = [[sent[self.board.order[axis]] for axis in range(4)] for sent in self._commands]
+        rows = [[command[self.board.order[axis]] for axis in range(4)] for command in self._commands]
         sticks = np.array(self.channels[:4])
         return any(np.abs(sticks - row).max() <= ECHO_US for row in np.array(rows).reshape(-1, 4))
 
@@ -182,7 +184,7 @@ class MspLink:
         self.states.close()
 
     def _ask(self, now: float) -> None:
-        pause = ASK_EVERY_S if len(self._pending) < MOST_PENDING else ASK_AT_LEAST_S
+        pause = REQUEST_PERIOD_S if len(self._pending) < MOST_PENDING else LONGEST_POSTPONEMENT_S
         if self.board is not None and now - self._asked > pause:
             self._asked = now
             self.send(self._next)

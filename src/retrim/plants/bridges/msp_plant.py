@@ -18,7 +18,7 @@ from .endpoint import address_of, open_endpoint
 from .guardian import Guardian, Phase, SafeCommands
 from .msp_board import ThrustCurve
 from .msp_link import MspLink, StateLink, check_installed
-from .piloted_plant import GO_S, PilotedPlant
+from .piloted_plant import APPROACH_S, PilotedPlant
 from .polling import KeepOn
 from .ros2 import await_states, connect_link
 from .ros2_address import Ros2Address
@@ -32,11 +32,11 @@ ADDRESS = re.compile(
 )
 HOVER_S = 2.0  # [s] over which the pilot's throttle at hover is averaged
 ECHO_S = 0.6  # [s], limit for the board to follow our sticks
-EARLY = "the pilot: MSP OVERRIDE is on too early, and the board ignores the sticks; turn it off, then hover"
+EARLY_SWITCH = "the pilot: MSP OVERRIDE is on too early, and the board ignores the sticks; turn it off, then hover"
 MARK = 0.15  # [rad/s], yaw rate by which our sticks differ from those of a pilot who hovers
 LATE_S = 0.3  # [s], age of a command that the board has not answered
 SILENT_S = 0.5  # [s] without an answer of the board
-SINK = 0.93  # thrust while the guardian lets the vehicle sink, as a ratio to the hover
+SINK_THRUST = 0.93  # thrust while the guardian lets the vehicle sink, as a ratio to the hover
 SINK_S, OFF_S, REPEAT_S = 4.0, 2.0, 0.04  # [s]: durations of the guardian's phases, and time between two packets
 LOW_M = 0.35  # [m], height below which the motors may stop at the end
 OFF_REPEATS = 10
@@ -126,9 +126,9 @@ class MspPlant(PilotedPlant[MspLink]):
             self.until(lambda: False, HOVER_S, keep_on)
             if link.has_mode(msp.ARM) and not link.has_mode(msp.OVERRIDE):
                 self.curve.learn(list(link.throttles))
-            elif time.monotonic() - began > GO_S:
+            elif time.monotonic() - began > APPROACH_S:
                 raise PlantError(
-                    f"{self.address}: for {GO_S:g} s nobody has hovered at the start with MSP OVERRIDE off"
+                    f"{self.address}: for {APPROACH_S:g} s nobody has hovered at the start with MSP OVERRIDE off"
                 )
         x = self.reading()
         self._place = x.p.copy() if p is None else np.asarray(p, dtype=float)
@@ -140,8 +140,8 @@ class MspPlant(PilotedPlant[MspLink]):
             self._fly_to_place(hover)
             return link.has_mode(msp.OVERRIDE)
 
-        if not self.until(is_ours, GO_S, keep_on):
-            raise PlantError(f"{self.address}: MSP OVERRIDE was not switched on within {GO_S:g} s")
+        if not self.until(is_ours, APPROACH_S, keep_on):
+            raise PlantError(f"{self.address}: MSP OVERRIDE was not switched on within {APPROACH_S:g} s")
         self._engage()
         link.forget_commands()
 
@@ -163,7 +163,7 @@ class MspPlant(PilotedPlant[MspLink]):
         """The remedy if the switch is on too early."""
         link, curve = self._link, self._curve
         is_early = link is not None and link.has_mode(msp.OVERRIDE) and curve is not None and curve.hover is None
-        return EARLY if is_early else ""
+        return EARLY_SWITCH if is_early else ""
 
     @property
     def curve(self) -> ThrustCurve:
@@ -276,7 +276,7 @@ class MspPlant(PilotedPlant[MspLink]):
         assert board is not None
         sink, off = (
             msp.encode(msp.SET_RAW_RC, msp.sticks_payload(board.channels(throttle, np.zeros(3), level=True)))
-            for throttle in (self.curve.throttle(SINK * STANDARD_GRAVITY), 0.0)
+            for throttle in (self.curve.throttle(SINK_THRUST * STANDARD_GRAVITY), 0.0)
         )
         phases = (Phase((sink,), REPEAT_S, SINK_S), Phase((off,), REPEAT_S, OFF_S))
         self._guardian = Guardian(SafeCommands(phases), link.endpoint.fileno())

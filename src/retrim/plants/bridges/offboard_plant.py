@@ -17,11 +17,11 @@ from .vehicle_state import Reading, VehicleState
 
 OFFBOARD, LAND = (6, 0), (4, 6)  # main and sub mode
 SET_MODE, ARM_DISARM = 176, 400  # MAV_CMD
-SWITCH_S, ARM_S, GO_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
-ASK_AGAIN_S = 1.0  # [s]
+SWITCH_S, ARM_S, APPROACH_S, LANDING_S = 5.0, 8.0, 40.0, 40.0  # [s]
+REPEAT_S = 1.0  # [s]
 LOST_S = 2.0  # [s] of silence, after which the autopilot's failsafe has long taken over
 THRUST_S = 2.0  # [s] over which the thrust at hover is identified
-TELL_EVERY_S = 0.05  # [s] between two position setpoints
+SETPOINT_PERIOD_S = 0.05  # [s] between two position setpoints
 
 
 @runtime_checkable
@@ -99,9 +99,9 @@ class OffboardPlant(LinkedPlant[L], abc.ABC):
         self._ask(self._offboard, SET_MODE, (1.0, *map(float, OFFBOARD)), SWITCH_S, keep_on, "offboard mode")
         self._is_engaged = True
         self._ask(lambda: link.armed, ARM_DISARM, (1.0,), ARM_S, keep_on, "to be armed")
-        if not self.until(self.staying(self._place, self._tell), GO_S, keep_on):
+        if not self.until(self.staying(self._place, self._tell), APPROACH_S, keep_on):
             raise PlantError(
-                f"the autopilot is at {self.reading().p.round(2).tolist()} m after {GO_S:g} s, not at "
+                f"the autopilot is at {self.reading().p.round(2).tolist()} m after {APPROACH_S:g} s, not at "
                 f"{self._place.round(2).tolist()}{self._status_text()}"
             )
         link.thrusts.clear()
@@ -112,7 +112,7 @@ class OffboardPlant(LinkedPlant[L], abc.ABC):
         """Let PX4 hold the take-off position until an instant on the monotonic clock [s]."""
         while time.monotonic() < until:
             self._tell()
-            self.link.pump(min(until, time.monotonic() + TELL_EVERY_S))
+            self.link.pump(min(until, time.monotonic() + SETPOINT_PERIOD_S))
 
     def read(self) -> VehicleState:
         """Return the newest state that PX4 has sent."""
@@ -150,7 +150,7 @@ class OffboardPlant(LinkedPlant[L], abc.ABC):
                         link.command(SET_MODE, 1.0, *map(float, LAND))
 
                 over = lambda: not link.armed or time.monotonic() - link.last_message > LOST_S  # noqa: E731
-                wait_until(insisting(order, over, ASK_AGAIN_S), LANDING_S, lambda: True, link.pump)
+                wait_until(insisting(order, over, REPEAT_S), LANDING_S, lambda: True, link.pump)
         finally:
             self._is_engaged = False
             link.close()
@@ -160,7 +160,7 @@ class OffboardPlant(LinkedPlant[L], abc.ABC):
 
     def _tell(self) -> None:
         """Send the position setpoint periodically."""
-        if time.monotonic() - self._last_note >= TELL_EVERY_S:
+        if time.monotonic() - self._last_note >= SETPOINT_PERIOD_S:
             self._last_note = time.monotonic()
             self.link.fly_to(self._place, self._heading)
 
@@ -173,7 +173,7 @@ class OffboardPlant(LinkedPlant[L], abc.ABC):
             self._tell()
             return done()
 
-        asking = insisting(lambda: self.link.command(number, *parameters), is_obedient, ASK_AGAIN_S)
+        asking = insisting(lambda: self.link.command(number, *parameters), is_obedient, REPEAT_S)
         if not self.until(asking, patience, keep_on):
             raise PlantError(f"{self.address}: the autopilot refuses {what}{self._status_text()}")
 

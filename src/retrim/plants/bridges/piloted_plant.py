@@ -12,7 +12,7 @@ from .linked_plant import LinkedPlant, VehicleLink
 from .polling import KeepOn
 from .vehicle_state import VehicleState
 
-WAIT_S, GO_S = 10.0, 120.0  # [s], limits for the first state, and for the flight to the start
+WAIT_S, APPROACH_S = 10.0, 120.0  # [s], limits for the first state, and for the flight to the start
 LOST_S = 1.5  # [s] of silence; after 2 s the guard would stop the motors
 HEADING = math.radians(20.0)
 
@@ -64,11 +64,11 @@ class PilotedPlant(LinkedPlant[L]):
             away = 0.0 if yaw is None else heading_of(self.reading().R) - yaw
             return stays() and abs(math.remainder(away, math.tau)) < HEADING
 
-        if not self.until(ready, GO_S, keep_on):
+        if not self.until(ready, APPROACH_S, keep_on):
             x = self.reading()
             raise PlantError(
                 f"{self.address}: the vehicle was not flown to {place.round(2).tolist()} m"
-                f"{'' if yaw is None else f', heading {math.degrees(yaw):.0f} deg'}, in {GO_S:g} s; it is at "
+                f"{'' if yaw is None else f', heading {math.degrees(yaw):.0f} deg'}, in {APPROACH_S:g} s; it is at "
                 f"{x.p.round(2).tolist()} m, {math.degrees(heading_of(x.R)):.0f} deg"
             )
 

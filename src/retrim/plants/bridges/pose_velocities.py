@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 
 WINDOW_S = 0.06  # [s] of poses to which a parabola is fitted; shorter: more noise, longer: wrong for quick motions
-FEWEST, MOST = 3, 60  # poses of a fit
+LEAST_POSES, MOST_POSES = 3, 60  # poses of a fit
 PARABOLA_S = 0.025  # [s] of poses from which a parabola is fitted; before, a line
 SHORTEST_S = 1e-4  # [s] between two poses
 LONGEST_S = 0.5  # [s] between two poses, beyond which the series begins again
@@ -20,7 +20,7 @@ class PoseVelocities:
     """
 
     def __init__(self) -> None:
-        self._poses: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=MOST)
+        self._poses: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=MOST_POSES)
         self._last = np.zeros(3), np.zeros(3)
 
     def restart(self) -> None:
@@ -44,14 +44,14 @@ class PoseVelocities:
         if poses and t - poses[-1][0] < SHORTEST_S:
             return self._last
         poses.append((t, p, R))
-        while len(poses) > FEWEST and t - poses[0][0] > WINDOW_S:
+        while len(poses) > LEAST_POSES and t - poses[0][0] > WINDOW_S:
             poses.popleft()
         if len(poses) < 2:
             return self._last
         times = np.array([each[0] - t for each in poses])
         places = np.array([each[1] - p for each in poses])
         turns = Rotation.from_matrix(np.array([R.T @ each[2] for each in poses])).as_rotvec()
-        degree = 2 if len(poses) >= FEWEST and -times[0] > PARABOLA_S else 1
+        degree = 2 if len(poses) >= LEAST_POSES and -times[0] > PARABOLA_S else 1
         slope = np.linalg.pinv(np.vander(times, degree + 1, increasing=True))[1]
         self._last = slope @ places, slope @ turns
         return self._last

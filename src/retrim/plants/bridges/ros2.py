@@ -21,8 +21,8 @@ from .target_plant import TargetPlant
 
 WAIT_S, LISTENER_S = 10.0, 5.0  # [s], limits for the first state, and for listeners to the setpoints
 CROWD_S = 25.0  # [s] for which a killed node may still be listed
-SAME = "the same px4_msgs or mavros_msgs at both ends"
-LOOK_EVERY_S = 0.5  # [s] between two looks at the other nodes
+SAME_PACKAGES = "the same px4_msgs or mavros_msgs at both ends"
+DISCOVERY_PERIOD_S = 0.5  # [s] between two looks at the other nodes
 RATE_S, LOWEST_RATE = 1.2, 15.0  # [s], [Hz]: the guard refuses states that are older than 0.1 s
 ENOUGH_THRUSTS = 5
 PX4_STATE = "/fmu/out/vehicle_odometry"
@@ -58,23 +58,23 @@ def await_states(link: Ros2Link, until: Wait, keep_on: KeepOn) -> None:
     Raises:
         PlantError: No state comes, too few come, the setpoints have no listener, or a type differs.
     """
-    where, looked = f"ros2 ({link.node.backend})", 0.0
+    where, last_look = f"ros2 ({link.node.backend})", 0.0
 
     def is_clear() -> bool:
-        nonlocal looked
-        if time.monotonic() - looked > LOOK_EVERY_S:
+        nonlocal last_look
+        if time.monotonic() - last_look > DISCOVERY_PERIOD_S:
             for fault in (*link.faults(), *(note for note in link.notes if "this end has" in note)):
                 is_state = "PoseStamped" in fault and "Odometry" in fault
-                remedy = "pose=TOPIC for poses, odometry=TOPIC for odometry" if is_state else SAME
+                remedy = "pose=TOPIC for poses, odometry=TOPIC for odometry" if is_state else SAME_PACKAGES
                 raise PlantError(f"{where}: {fault}; use {remedy}")
-            looked = time.monotonic()
+            last_look = time.monotonic()
         return link.reading is not None
 
     if not until(is_clear, WAIT_S, keep_on):
         remarks = "".join(f"; ignored: {note}" for note in link.notes)
         remarks += f"; {advice(link.node.published_topics())}"
         raise PlantError(f"{where}: no state arrived on {' or '.join(link.states)} in {WAIT_S:g} s{remarks}")
-    looked = 0.0
+    last_look = 0.0
     until(lambda: is_clear() and not link.topics_without_listener(), LISTENER_S, keep_on)
     if (
         silent := link.topics_without_listener()

@@ -20,7 +20,7 @@ PACKAGE = "px4_msgs/msg"
 NED, FRD, BODY_FRD = 1, 2, 3  # frames of VehicleOdometry
 OFFBOARD, OTHER = (6, 0), (0, 0)  # main and sub mode, as in MAVLink
 PROTOCOL = 1  # of questions about formats
-ASK_S, ANSWER_S = 0.2, 1.5  # [s] between two questions about a format, and limit for the answer
+REQUEST_PERIOD_S, ANSWER_S = 0.2, 1.5  # [s] between two questions about a format, and limit for the answer
 TOPICS = {
     "vehicle_rates_setpoint": "VehicleRatesSetpoint",
     "offboard_control_mode": "OffboardControlMode",
@@ -67,7 +67,7 @@ class Px4Link(Ros2Link):
             thrust: Share of the motors' thrust, 0 to 1.
             omega: Body rates in our frame [rad/s].
         """
-        roll, pitch, yaw = map(float, frames.turned_body(omega))
+        roll, pitch, yaw = map(float, frames.turn_body(omega))
         self._choose(body_rate=True)
         self._send(
             "vehicle_rates_setpoint", roll=roll, pitch=pitch, yaw=yaw,
@@ -84,16 +84,18 @@ class Px4Link(Ros2Link):
         unknown = np.full(3, np.nan, np.float32)
         self._choose(position=True)
         self._send(
-            "trajectory_setpoint", position=frames.turned_world(p).astype(np.float32), velocity=unknown,
-            acceleration=unknown, jerk=unknown, yaw=math.remainder(frames.turned_heading(yaw), math.tau),
+            "trajectory_setpoint", position=frames.turn_world(p).astype(np.float32), velocity=unknown,
+            acceleration=unknown, jerk=unknown, yaw=math.remainder(frames.turn_heading(yaw), math.tau),
             yawspeed=math.nan,
         )  # fmt: skip
 
     def command(self, number: int, *parameters: float) -> None:
         """Publish VehicleCommand, to any system and component."""
         values = (*parameters, *([0.0] * (7 - len(parameters))))
-        named = {f"param{i}": float(value) for i, value in enumerate(values, 1)}
-        self._send("vehicle_command", command=number, source_system=1, source_component=1, from_external=True, **named)
+        values_by_name = {f"param{i}": float(value) for i, value in enumerate(values, 1)}
+        self._send(
+            "vehicle_command", command=number, source_system=1, source_component=1, from_external=True, **values_by_name
+        )
 
     def format_fault(self, keep_on: Any = lambda: True) -> str:
         """Ask PX4 for the formats of its inputs; return a sentence if one differs, and note it if PX4 does not answer.
@@ -103,10 +105,10 @@ class Px4Link(Ros2Link):
         """
         for topic, short in TOPICS.items():
             name, full = f"{PACKAGE}/{short}", f"/fmu/in/{topic}"
-            until, asked = time.monotonic() + ANSWER_S, -math.inf
+            until, last_request = time.monotonic() + ANSWER_S, -math.inf
             while full not in self._answers and time.monotonic() < until and keep_on():
-                if time.monotonic() - asked > ASK_S:
-                    asked = time.monotonic()
+                if time.monotonic() - last_request > REQUEST_PERIOD_S:
+                    last_request = time.monotonic()
                     text = np.frombuffer(full.encode().ljust(50, b"\0"), np.uint8)
                     self._send("message_format_request", protocol_version=PROTOCOL, topic_name=text)
                 self.pump(time.monotonic() + 0.01)
@@ -152,9 +154,9 @@ class Px4Link(Ros2Link):
             self.ignore("VehicleOdometry with values that are not finite, or without an attitude")
             return
         R = frames.attitude_of(q)
-        velocity = R @ frames.turned_body(v) if x.velocity_frame == BODY_FRD else frames.turned_world(v)
+        velocity = R @ frames.turn_body(v) if x.velocity_frame == BODY_FRD else frames.turn_world(v)
         stamp = 1e-6 * float(x.timestamp_sample or x.timestamp)
-        self.take(stamp, frames.turned_world(p), R, velocity, frames.turned_body(rates))
+        self.take(stamp, frames.turn_world(p), R, velocity, frames.turn_body(rates))
 
     def _take_mode(self, x: Any) -> None:
         self.mode = OFFBOARD if x.flag_control_offboard_enabled else OTHER

@@ -11,7 +11,7 @@ from .clock import StampClock
 from .pose_velocities import PoseVelocities
 from .vehicle_state import Reading
 
-FRESH_S = 0.5  # [s] without odometry, after which poses are used instead
+ODOMETRY_TIMEOUT_S = 0.5  # [s] without odometry, after which poses are used instead
 RATE_WINDOW_S = 1.0  # [s] over which the rate of states is counted
 MOST_NOTES = 5
 
@@ -67,7 +67,7 @@ class RosStates:
         result, now = pose_of(message.pose), time.monotonic()
         if result is None:
             self.ignore("a pose with values that are not finite, or without an attitude")
-        elif now - self._odometry_at >= FRESH_S:
+        elif now - self._odometry_at >= ODOMETRY_TIMEOUT_S:
             self.take(stamp, *result)
 
     def take(

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from ...errors import PlantError
 from .guardian import Guardian, Phase, SafeCommands
 
-EVERY_S, LASTS_S = 0.05, 0.5  # [s]: the targets may be few, because a stack that needs the guardian holds the last one
+PERIOD_S = 0.05  # [s] between two targets; they may be few, because a stack that needs the guardian holds the last one
+VALIDITY_S = 0.5  # [s]
 RATES_IGNORED = 7  # type_mask of an AttitudeTarget: ignore the body rates
 # Share of the thrust at hover if it was identified, and if it comes from the vehicle file: a level vehicle sinks.
-SINK, SINK_BY_FILE = 0.95, 0.9
+SINK_THRUST, SINK_THRUST_FROM_FILE = 0.95, 0.9
 END_S = 2.0  # [s], longest wait for the end of a process
 
 
@@ -61,7 +62,7 @@ class TargetGuardian:
         """
         assert self._node.stdin is not None
         self.release()
-        commands = SafeCommands((Phase((frame(target),), EVERY_S, LASTS_S),))
+        commands = SafeCommands((Phase((frame(target),), PERIOD_S, VALIDITY_S),))
         self._guardian = Guardian(commands, self._node.stdin.fileno())
 
     def feed(self) -> None:

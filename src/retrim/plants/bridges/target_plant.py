@@ -9,7 +9,7 @@ from ...physics.state import STANDARD_GRAVITY
 from .frames import heading_of
 from .piloted_plant import PilotedPlant, TargetLink
 from .polling import KeepOn
-from .target_guardian import SINK, SINK_BY_FILE, TargetGuardian
+from .target_guardian import SINK_THRUST, SINK_THRUST_FROM_FILE, TargetGuardian
 
 READY_S = 20.0  # [s], limit for the start of the guardian's node
 
@@ -42,7 +42,7 @@ class TargetPlant(PilotedPlant[L]):
         guardian = self._guardian = self._guardian or self.link.target_guardian()
         guardian.release()  # from an earlier start
         super().take_off(p, yaw, keep_on)
-        share = SINK if self._learn_thrust(keep_on) else SINK_BY_FILE
+        share = SINK_THRUST if self._learn_thrust(keep_on) else SINK_THRUST_FROM_FILE
         if not self.until(guardian.is_ready, READY_S, keep_on):
             raise PlantError(f"{self.address}: the node of the guardian has not started in {READY_S:g} s")
         thrust = min(1.0, share * STANDARD_GRAVITY / self.strongest)

@@ -15,7 +15,7 @@ from .frames import heading_of
 from .polling import KeepOn, wait_until
 from .vehicle_state import ExtraAcceleration, VehicleState
 
-THERE, STILL, STAY_S = 0.2, 0.25, 1.0  # [m], [m/s], [s]: limits for a vehicle that has arrived
+ARRIVAL_DISTANCE, ARRIVAL_SPEED, ARRIVAL_S = 0.2, 0.25, 1.0  # [m], [m/s], [s]: limits for a vehicle that has arrived
 
 
 class VehiclePlant(Plant, abc.ABC):
@@ -134,9 +134,9 @@ class VehiclePlant(Plant, abc.ABC):
             nonlocal since
             meanwhile()
             x = self.read()
-            there = np.abs(x.p - place).max() < THERE and np.abs(x.v).max() < STILL
+            there = np.abs(x.p - place).max() < ARRIVAL_DISTANCE and np.abs(x.v).max() < ARRIVAL_SPEED
             since = min(since, time.monotonic()) if there else math.inf
-            return time.monotonic() - since > STAY_S
+            return time.monotonic() - since > ARRIVAL_S
 
         return stays
 

@@ -9,7 +9,7 @@ from ...physics.state import STANDARD_GRAVITY
 LONGEST_S = 0.05  # [s], limit of a state's extrapolation; an older state is not useful
 
 SHORTEST_S, LONGEST_GAP_S = 4e-3, 0.2  # [s] between two states from which an acceleration is derived
-AVERAGED_S = 0.3  # [s]
+AVERAGING_S = 0.3  # [s]
 LARGEST = 10.0  # [m/s^2]
 
 
@@ -106,5 +106,5 @@ class ExtraAcceleration:
             return
         dt = stamp - last[0]
         nominal = c * x.R[:, 2] - np.array([0.0, 0.0, STANDARD_GRAVITY])
-        self.value = self.value + dt / (dt + AVERAGED_S) * ((x.v - last[1]) / dt - nominal - self.value)
+        self.value = self.value + dt / (dt + AVERAGING_S) * ((x.v - last[1]) / dt - nominal - self.value)
         self.value = np.clip(self.value, -LARGEST, LARGEST)
