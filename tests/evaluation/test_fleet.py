@@ -218,7 +218,7 @@ def test_progress_counts_finished_flights(fleet):
 
 
 def test_progress_of_lot_is_reported_in_flight(fleet, monkeypatch):
-    monkeypatch.setattr(gathering, "OFTEN", 0.001)
+    monkeypatch.setattr(gathering, "REPORT_PERIOD", 0.001)
     monkeypatch.setattr(batching, "lanes", lambda: 1)
     message = []
     part = [spec for spec in fleet.specs if spec.method == "full"][:2]

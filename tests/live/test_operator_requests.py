@@ -105,7 +105,7 @@ def test_other_method_continues_from_active_policy(requests):
 
 
 def test_settled_knobs_give_one_event(requests, monkeypatch):
-    monkeypatch.setattr(request_module, "SETTLED_S", 0.0)
+    monkeypatch.setattr(request_module, "KNOB_REST_S", 0.0)
     requests._supervisor.bus.publish("knobs", b"noise")
     assert requests.obey(status()) == []
     requests._supervisor.bus.publish("knobs", ManualDisturbance(load=0.05, push=(1.0, 0.0, 0.0)).pack())
@@ -116,9 +116,9 @@ def test_settled_knobs_give_one_event(requests, monkeypatch):
 def test_knobs_event_states_change_and_time(requests, monkeypatch):
     def turn(**knobs):
         requests._supervisor.bus.publish("knobs", ManualDisturbance(**knobs).pack())
-        monkeypatch.setattr(request_module, "SETTLED_S", 60.0)
+        monkeypatch.setattr(request_module, "KNOB_REST_S", 60.0)
         assert requests.obey(dataclasses.replace(status(), t=3.0)) == []
-        monkeypatch.setattr(request_module, "SETTLED_S", 0.0)
+        monkeypatch.setattr(request_module, "KNOB_REST_S", 0.0)
         return [tuple(event) for event in requests.obey(dataclasses.replace(status(), t=3.5))]
 
     push, kick = {"push": (1.0, 0.0, 0.0)}, {"kick": (8.0, 0.0, 0.0), "kicks": 1}

@@ -48,7 +48,7 @@ def test_remote_learners_receive_end_before_bridge_exits(tmp_path, controller, r
 
 
 def test_supervisor_does_not_wait_for_lost_remote_learners(tmp_path, controller, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(remote_learners, "PARTING", 1000.0)
+    monkeypatch.setattr(remote_learners, "PARTING_TIME", 1000.0)
     with Supervisor(make_spec(tmp_path, controller, learners=ADDRESS)) as flight:
         folder = flight.bus.folder
         flight.bus.publish("ground", pack_note("ground", base=controller.base, alive={"policy": True}))

@@ -295,7 +295,7 @@ def test_cost_table_by_its_command(tmp_path, monkeypatch):
     small = brief_preset()
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small)
     monkeypatch.setattr(effort, "DECISIONS", 3)
-    monkeypatch.setattr(effort, "RUNS", 2)
+    monkeypatch.setattr(effort, "TIMED_RUNS", 2)
     monkeypatch.setattr(efficiency_table, "BASELINES", {"indi": BASELINES["indi"]})
     monkeypatch.setattr(efficiency_table, "train_datt", lambda *_, **__: {})
     words = "--presets", "hover/fast", "--datt-steps", "1"

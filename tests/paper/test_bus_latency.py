@@ -41,7 +41,7 @@ class RecordingBus(Bus):
 
 @pytest.fixture
 def quick(monkeypatch):
-    for name, value in (("COUNT", 3), ("FIRST", 2), ("EVERY", 0.01), ("JOINED", 0.05)):
+    for name, value in (("COUNT", 3), ("FIRST", 2), ("PERIOD", 0.01), ("DISCOVERY_TIME", 0.05)):
         monkeypatch.setattr(latency, name, value)
 
 

@@ -97,7 +97,7 @@ def test_unsupported_scenario_is_refused_before_flight(scenario, text, policies)
 
 def test_flies_with_other_methods_by_its_command(tmp_path, monkeypatch, as_a_user):
     table = importlib.import_module("retrim_paper.tables.raptor")  # the package exports a function of that name
-    monkeypatch.setattr(table, "DISTURBED", {"none": "calm"})
+    monkeypatch.setattr(table, "DISTURBANCES", {"none": "calm"})
     words = "--methods", "raptor", "--vehicles", "kingfisher", "--seeds", "0", "--starts", "1"
     retrim("reproduce", "raptor", *words, "--seconds", "2", "--out", "t", cwd=tmp_path)
     rows = results(tmp_path / "t", "raptor.json")["rows"]

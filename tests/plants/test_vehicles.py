@@ -101,7 +101,7 @@ def test_missing_crazyflie_is_reported(monkeypatch):
 
 
 def test_missing_vehicle_is_reported(monkeypatch):
-    monkeypatch.setattr(mavlink, "LISTENS_S", 0.3)
+    monkeypatch.setattr(mavlink, "ANSWER_S", 0.3)
     with link(PORT + 1) as plant, pytest.raises(PlantError, match=r"no autopilot was heard there in 0\.3 s"):
         plant.connect()
 

@@ -116,7 +116,7 @@ def test_flight_at_rest_identifies_nothing():
 
 
 def test_short_flight_is_refused():
-    with pytest.raises(LogError, match="identification needs 8 s at least"):
+    with pytest.raises(LogError, match="identification needs at least 8 s"):
         identify_body(log_of(fly_body(5.0)))
 
 
