@@ -27,7 +27,7 @@ from retrim.export.checking import FLAGS
 from retrim.export.portable import portable_of
 from retrim.onboard.guard import Mode
 from retrim.onboard.recorder import read_log
-from retrim.plants.bridges.betaflight_firmware import TIED
+from retrim.plants.bridges.betaflight_firmware import RUN_WITH_PARENT
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "failures.md"
 PORT = 24610
@@ -438,7 +438,7 @@ def test_link_of_companion_computer_is_cut(companion):
 @check_rows(["link process killed", "all processes killed"], ["betaflight"], fly_by=())
 def test_simulated_board_ends_with_link_process():
     """A program replaces the board; the kernel kills it."""
-    words = f"[sys.executable, '-c', {TIED!r}, '/bin/sleep', '60']"
+    words = f"[sys.executable, '-c', {RUN_WITH_PARENT!r}, '/bin/sleep', '60']"
     code = f"import subprocess, sys, time; print(subprocess.Popen({words}).pid, flush=True); time.sleep(60)"
     link = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     board = Path(f"/proc/{int(link.stdout.readline())}")

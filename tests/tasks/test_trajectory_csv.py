@@ -390,7 +390,7 @@ def test_any_text_gives_points_or_one_error(content, tmp_path_factory):
 
 # ---- refusals
 
-EXPECTED = r"t \[s\], x, y, z \[m\] and, if wanted, yaw \[rad\]"
+EXPECTED = r"t \[s\], x, y, z \[m\] and, if desired, yaw \[rad\]"
 
 
 @pytest.mark.parametrize(

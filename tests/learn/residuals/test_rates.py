@@ -85,3 +85,13 @@ def test_hover_does_not_identify_lag(key):
     np.testing.assert_allclose(result.bias[0], 0.2, atol=0.01)
     ratio = result.tau / MODEL.tau_prior
     assert ((ratio > 0.5) & (ratio < 2.0)).all()
+
+
+@pytest.mark.parametrize("period", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("phase", [0.0, 1.5, 3.0])
+def test_swing_is_not_bias(key, period, phase):
+    """A vehicle swings, and the lag does not explain it: compensation of a bias that follows the swing increases it."""
+    rows = residual_targets(window_of(key, jnp.array(0.03), jnp.zeros(3)), PointMass(DT))
+    swing = jnp.sin(2.0 * jnp.pi * DT / period * jnp.arange(float(rows.omega.shape[0])) + phase)
+    rows = replace_fields(rows, omega=rows.omega + swing[:, None])
+    assert (jnp.abs(MODEL.fit(rows).bias) < 0.1).all()

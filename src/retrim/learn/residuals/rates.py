@@ -81,9 +81,30 @@ class RateModel(eqx.Module):
         misfit = _share(misfit, 2.0) + (jnp.log(taus[:, None] / self.tau_prior[None]) / self.tau_spread) ** 2
         share = jax.nn.softmax(-0.5 * misfit, axis=0)
         tau = jnp.exp(jnp.sum(share * jnp.log(taus)[:, None], axis=0))
-        deviation = jnp.sqrt((1.0 - shrunk) * self.bias_prior**2)
-        result = RateFit(shrunk * jnp.sum(share * mean, axis=0), deviation, tau)
-        return where(total > 0.0, result, self.init())
+        bias, deviation = self._bias(jnp.einsum("gi,gni->ni", share, errors), weight)
+        return where(total > 0.0, RateFit(bias, deviation, tau), self.init())
+
+    def _bias(
+        self, errors: Float[Array, "n 3"], weight: Float[Array, " n"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Return the posterior mean and deviation of a constant in the errors, whose noise is autoregressive.
+
+        A swing that the lag does not explain is not a bias, and its compensation would drive the swing. Its successive
+        errors are correlated, so n of them contain as much information as n (1 - rho) / (1 + rho) independent ones.
+        """
+        total = jnp.maximum(jnp.sum(weight), 1e-6)
+        mean = weight @ errors / total
+        centred = errors - mean[None]
+        power = _share(weight @ centred**2)
+        pairs = jnp.where(weight[:-1] > 0.0, weight[1:], 0.0)
+        rho = _share(pairs @ (centred[1:] * centred[:-1])) / jnp.maximum(power, 1e-12)
+        rho = (
+            rho + (1.0 + 3.0 * rho) * jnp.sum(weight**2) / total**2
+        )  # bias of a short window (Marriott and Pope, 1954)
+        rho = jnp.clip(rho, 0.0, 0.999)
+        variance = (self.noise**2 + power / total * (1.0 + rho) / (1.0 - rho)) / total
+        shrunk = self.bias_prior**2 / (self.bias_prior**2 + variance)
+        return shrunk * mean, jnp.sqrt((1.0 - shrunk) * self.bias_prior**2)
 
     def _follow(self, rows: Targets, tau: Float[Array, ""]) -> Float[Array, "n 3"]:
         """Return the mean rates of each tick if the vehicle followed the commands with a lag and without a bias."""
@@ -96,7 +117,7 @@ class RateModel(eqx.Module):
         return lax.scan(tick, Command(first.c, rows.omega[0]), rows.u)[1]
 
 
-def _share(each: Float[Array, "g 3"], times: float = 1.0) -> Float[Array, "g 3"]:
+def _share(each: Float[Array, "*g 3"], times: float = 1.0) -> Float[Array, "*g 3"]:
     """Return ``times`` the mean of roll and pitch for both axes, since they share one lag, and yaw unchanged."""
-    both = 0.5 * times * (each[:, 0] + each[:, 1])
-    return jnp.stack([both, both, each[:, 2]], axis=1)
+    both = 0.5 * times * (each[..., 0] + each[..., 1])
+    return jnp.stack([both, both, each[..., 2]], axis=-1)
