@@ -7,25 +7,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from retrim.config.methods import MethodEntry, MethodRequest, find_method
-from retrim.control.controller import AbstractController
+from retrim.control.wrapped_controller import WrappedController
 from retrim.physics.state import Command, State
 from retrim.runtime.pilot import ControllerPilot, Pilot
 
 
-class WrongThrust(AbstractController[Any]):
+class WrongThrust(WrappedController[Any]):
     """A controller that assumes ``factor`` times the thrust per command."""
 
-    inner: AbstractController[Any]
     factor: Float[Array, ""]
     """Ratio of the assumed thrust to the thrust that a command causes."""
 
-    def with_age(self, age: float | Float[Array, ""]) -> "WrongThrust":
-        """Return the same controller for measurements that are ``age`` seconds old."""
-        return WrongThrust(self.inner.with_age(age), self.factor)
-
-    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "WrongThrust":
-        """Return the same controller for a tick with inertial measurements."""
-        return WrongThrust(self.inner.with_inertial(omega, a), self.factor)
+    def _inner_memory(self, memory: Any) -> Any:
+        return memory
 
     def init(self, x: State) -> Any:
         """Return the memory of the inner controller."""

@@ -139,8 +139,8 @@ def test_frame_follows_estimated_disturbance(sonar_setup, key):
 def test_controller_refuses_observation_without_estimator(sonar_setup, key):
     with pytest.raises(ValueError, match="must have a state_estimator, got Sonar"):
         PoseFilteredController(
-            Sonar(sonar_setup.env.task.observation.state),
             BASELINES["geometric"].controller(baseline_request(sonar_setup)),
+            Sonar(sonar_setup.env.task.observation.state),
         )
     blind = PolicyController(Sonar(sonar_setup.env.task.observation.state), sonar_setup.new_policy(key))
     with pytest.raises(ValueError, match="must have a state_estimator, got Sonar"):

@@ -72,7 +72,7 @@ class MethodRequest:
         """
         observation = self.setup.flight_task.observation_in_flight
         if observation.state_estimator is not None:
-            return PoseFilteredController(observation, controller)
+            return PoseFilteredController(controller, observation)
         if not observation.measures_state:
             method = name or type(controller).__name__
             raise ConfigError(

@@ -11,8 +11,7 @@ from ..estimation.body_rates import BodyRates
 from ..physics.command_path import CommandPath
 from ..physics.path_family import Member
 from ..physics.state import Command, State
-from .condition import Condition
-from .controller import AbstractController
+from .wrapped_controller import WrappedController
 
 
 class TrackingState(eqx.Module):
@@ -22,13 +21,12 @@ class TrackingState(eqx.Module):
     inner: Any
 
 
-class ActuatorTracking(AbstractController[TrackingState]):
+class ActuatorTracking(WrappedController[TrackingState]):
     """Provides the inner controller with the present thrust and body rates.
 
     The command path predicts thrust and body rates. A gyroscope, or the measured attitudes, corrects the body rates.
     """
 
-    inner: AbstractController[Any]
     path: CommandPath
     """Known command path of the vehicle."""
     dt: float = eqx.field(static=True)
@@ -40,23 +38,15 @@ class ActuatorTracking(AbstractController[TrackingState]):
 
     def with_age(self, age: float | Float[Array, ""]) -> "ActuatorTracking":
         """Return the same controller for measurements that are ``age`` seconds old."""
-        return dataclasses.replace(self, inner=self.inner.with_age(age), age=jnp.array(age))
+        return dataclasses.replace(super().with_age(age), age=jnp.array(age))
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "ActuatorTracking":
         """Return the same controller for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega)
+        return dataclasses.replace(super().with_inertial(omega, a), omega=omega)
 
     def with_vehicle(self, member: Member) -> "ActuatorTracking":
         """Return the same controller for an identified vehicle."""
-        return dataclasses.replace(self, inner=self.inner.with_vehicle(member), path=member.path)
-
-    def condition(self, memory: TrackingState) -> Condition | None:
-        """Return the condition of the inner controller."""
-        return self.inner.condition(memory.inner)
-
-    def disturbance(self, memory: TrackingState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the disturbance that the inner controller expects."""
-        return self.inner.disturbance(memory.inner, x, u)
+        return dataclasses.replace(super().with_vehicle(member), path=member.path)
 
     def init(self, x: State) -> TrackingState:
         """Return the memory at the start of a flight."""

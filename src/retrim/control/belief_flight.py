@@ -22,6 +22,7 @@ from .condition import Cause, Condition, Stage
 from .controller import AbstractController
 from .excitation import Excitation
 from .vehicle_report import VehicleEstimate, VehicleReport
+from .wrapped_controller import WrappedController
 
 PACE = 2.0  # [1/s]: an unknown coordinate is known after half a second at the earliest
 GAIN_PACE = 1.0  # [1/s], largest rate of change of the thrust gain
@@ -39,10 +40,9 @@ class BeliefState(eqx.Module):
     caution: Caution
 
 
-class BeliefFlight(AbstractController[BeliefState]):
+class BeliefFlight(WrappedController[BeliefState]):
     """Flies a controller for a family of vehicles with a belief that slowly follows the identified vehicle."""
 
-    inner: AbstractController[Any]
     family: PathFamily
     prior: PathBelief
     """Belief at take-off."""
@@ -54,17 +54,9 @@ class BeliefFlight(AbstractController[BeliefState]):
     """Whether a self-induced oscillation makes the controller assume a slower vehicle. In a task with a reference, the
     tilt swings even without such an oscillation."""
 
-    def with_age(self, age: float | Float[Array, ""]) -> "BeliefFlight":
-        """Return the same controller for measurements that are ``age`` seconds old."""
-        return dataclasses.replace(self, inner=self.inner.with_age(age))
-
-    def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "BeliefFlight":
-        """Return the same controller for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a))
-
     def condition(self, memory: BeliefState) -> Condition | None:
         """Return the condition of the inner controller; if it has none, return that of the caution."""
-        inside = self.inner.condition(memory.inner)
+        inside = super().condition(memory)
         if inside is not None or not self.watches:
             return inside
         cautious = memory.caution.level > REPORT_LEVEL
@@ -75,7 +67,7 @@ class BeliefFlight(AbstractController[BeliefState]):
     def disturbance(self, memory: BeliefState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the disturbance that the inner controller expects, and the thrust that the thrust gain changes."""
         missing = (1.0 - 1.0 / memory.gain) * u.c * x.R[:, 2]
-        return missing + self.inner.disturbance(memory.inner, x, u)
+        return missing + super().disturbance(memory, x, u)
 
     def init(self, x: State) -> BeliefState:
         """Return the memory at the start of a flight."""

@@ -1,17 +1,14 @@
 """Add integral action on the position to an unchanged policy, as the baseline for learning in hover."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.actuator_response import ActuatorState
-from ..physics.path_family import Member
 from ..physics.state import Command, State
 from ..tasks.task import AbstractTask
-from .controller import AbstractController
+from .wrapped_controller import WrappedController
 
 
 class IntegralState(eqx.Module):
@@ -22,10 +19,9 @@ class IntegralState(eqx.Module):
     inner: Any
 
 
-class IntegralAction(AbstractController[IntegralState]):
+class IntegralAction(WrappedController[IntegralState]):
     """Passes the position p + gain * integral of (p - target) to a controller."""
 
-    inner: AbstractController[Any]
     task: AbstractTask
     """Task, which provides the target."""
     gain: Float[Array, ""]
@@ -44,18 +40,6 @@ class IntegralAction(AbstractController[IntegralState]):
         u, inner = self.inner(memory.inner, t, State(x.p + self.gain * integral, x.R, x.v))
         return u, IntegralState(integral, inner)
 
-    def disturbance(self, memory: IntegralState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the disturbance that the inner controller expects."""
-        return self.inner.disturbance(memory.inner, x, u)
-
     def accept(self, memory: IntegralState, u: Command) -> IntegralState:
         """Pass the accepted command to the inner controller."""
         return IntegralState(memory.integral, self.inner.accept(memory.inner, u))
-
-    def with_vehicle(self, member: Member) -> "IntegralAction":
-        """Return the same controller for an identified vehicle."""
-        return dataclasses.replace(self, inner=self.inner.with_vehicle(member))
-
-    def with_actuators(self, actuators: ActuatorState) -> "IntegralAction":
-        """Return the same controller for a tick in which thrust and body rates are known."""
-        return dataclasses.replace(self, inner=self.inner.with_actuators(actuators))

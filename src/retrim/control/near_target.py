@@ -6,14 +6,11 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..physics.actuator_response import ActuatorState
-from ..physics.dynamics import Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
-from ..physics.path_family import Member
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..physics.vehicle import Vehicle
 from ..tasks.task import AbstractTask
-from .controller import AbstractController
+from .wrapped_controller import WrappedController
 
 WEAK_REACH = 0.5  # [m], for a vehicle whose thrust is 1.8 times its weight; from 0.8 m, such vehicles fall
 REACH_PER_G = WEAK_REACH / math.sqrt(1.8**2 - 1.0)  # [m] per horizontal acceleration of 1 g that the vehicle can hold
@@ -34,18 +31,20 @@ def safe_reach(vehicle: Vehicle) -> Float[Array, ""]:
     return jnp.minimum(REACH_PER_G * level, LARGEST_REACH)
 
 
-class NearTarget(AbstractController[Any]):
+class NearTarget(WrappedController[Any]):
     """Limits the position that a controller receives to within ``reach`` of the target.
 
     A policy's commands grow with this distance. From far away, a policy may tilt so far that a weak vehicle falls. If
     measurements are late, it may oscillate and crash there, although it is stable near its target.
     """
 
-    inner: AbstractController[Any]
     task: AbstractTask
     """Task, which provides the target."""
     reach: Float[Array, ""]
     """Largest distance in the input, in the controller's coordinates [m]."""
+
+    def _inner_memory(self, memory: Any) -> Any:
+        return memory
 
     def init(self, x: State) -> Any:
         """Return the memory of the inner controller."""
@@ -63,23 +62,6 @@ class NearTarget(AbstractController[Any]):
     def accept(self, memory: Any, u: Command) -> Any:
         """Pass the accepted command to the inner controller."""
         return self.inner.accept(memory, u)
-
-    def with_vehicle(self, member: Member) -> "NearTarget":
-        """Return the same controller for an identified vehicle."""
-        return NearTarget(self.inner.with_vehicle(member), self.task, self.reach)
-
-    def with_actuators(self, actuators: ActuatorState) -> "NearTarget":
-        """Return the same controller for a tick in which thrust and body rates are known."""
-        return NearTarget(self.inner.with_actuators(actuators), self.task, self.reach)
-
-    @property
-    def previews_residual(self) -> bool:
-        """Whether the inner controller uses a learned residual ahead of time."""
-        return self.inner.previews_residual
-
-    def with_residual(self, residual: Residual) -> "NearTarget":
-        """Return the same controller with an expected disturbance."""
-        return NearTarget(self.inner.with_residual(residual), self.task, self.reach)
 
     def in_frame(self, frame: EffectiveGravityFrame) -> "NearTarget":
         """Return the same controller for states and commands in ``frame``."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from ..physics import so3
 from ..physics.state import STANDARD_GRAVITY, Command, State
 from ..tasks.observation import AbstractObservation
-from .controller import AbstractController
+from .wrapped_controller import WrappedController
 
 
 class PoseFilteredState(eqx.Module):
@@ -26,12 +26,11 @@ class PoseFilteredState(eqx.Module):
     last: Command
 
 
-class PoseFilteredController(AbstractController[PoseFilteredState]):
+class PoseFilteredController(WrappedController[PoseFilteredState]):
     """A controller that receives position, attitude and velocity from the state estimator of an observation."""
 
     observation: AbstractObservation[Any]
     """Observation with a state estimator."""
-    inner: AbstractController[Any]
     omega: Float[Array, "3"] | None = None
     """Measured body rates [rad/s]; None if they are not measured."""
     a: Float[Array, "3"] | None = None
@@ -45,17 +44,9 @@ class PoseFilteredController(AbstractController[PoseFilteredState]):
                 f"{type(self.observation).__name__}, which has none"
             )
 
-    def with_age(self, age: float | Float[Array, ""]) -> "PoseFilteredController":
-        """Return the same controller for frames that are ``age`` seconds old."""
-        return dataclasses.replace(self, inner=self.inner.with_age(age))
-
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "PoseFilteredController":
         """Return the same controller for a tick in which body rates and acceleration were measured."""
         return dataclasses.replace(self, omega=omega, a=a)
-
-    def disturbance(self, memory: PoseFilteredState, x: State, u: Command) -> Float[Array, "3"]:
-        """Return the disturbance that the inner controller expects."""
-        return self.inner.disturbance(memory.inner, x, u)
 
     def init(self, x: State) -> PoseFilteredState:
         """Return the memory at the start of a flight; the filter starts near the state, not exactly at it."""

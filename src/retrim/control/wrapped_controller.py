@@ -25,6 +25,9 @@ class WrappedController(AbstractController[M], Generic[M]):
     def _around(self: W, inner: AbstractController[Any]) -> W:
         return dataclasses.replace(self, inner=inner)
 
+    def _inner_memory(self, memory: Any) -> Any:
+        return memory.inner
+
     def with_age(self: W, age: float | Float[Array, ""]) -> W:
         """Return the same controller for measurements that are ``age`` seconds old."""
         return self._around(self.inner.with_age(age))
@@ -61,12 +64,12 @@ class WrappedController(AbstractController[M], Generic[M]):
 
     def condition(self, memory: Any) -> Condition | None:
         """Return the condition of the inner controller."""
-        return self.inner.condition(memory.inner)
+        return self.inner.condition(self._inner_memory(memory))
 
     def vehicle(self, memory: Any) -> VehicleReport | None:
         """Return the vehicle that the inner controller has identified."""
-        return self.inner.vehicle(memory.inner)
+        return self.inner.vehicle(self._inner_memory(memory))
 
     def disturbance(self, memory: Any, x: State, u: Command) -> Float[Array, "3"]:
         """Return the disturbance that the inner controller expects."""
-        return self.inner.disturbance(memory.inner, x, u)
+        return self.inner.disturbance(self._inner_memory(memory), x, u)
