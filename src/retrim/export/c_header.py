@@ -8,11 +8,11 @@ import re
 from itertools import pairwise
 from pathlib import Path
 
-from ..control.finite_controller import LARGEST
 from ..io.files import write_whole
 from .c_literals import array, bits, number
 from .c_selftest import self_test, test_vectors
 from .portable import Portable
+from .runner import LARGEST
 
 STEEPEST = 80.0  # largest exponent of the sigmoid: exp(89) is infinite in single precision, and -ffast-math mistakes it
 

@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 
-from ..control.finite_controller import LARGEST
 from .c_literals import array, bits
 from .portable import Portable
+from .runner import LARGEST
 
 TOLERANCE = 1e-5  # largest deviation of a computed command from the stored one, as a fraction of the command range
 INVALID = (math.nan, math.inf, -math.inf, LARGEST)  # the test puts each of them at each index

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ..control.finite_controller import LARGEST
 from ..errors import ConfigError
 from .c_header import name_of
 from .portable import Portable
-from .runner import Runner
+from .runner import LARGEST, Runner
 
 ROWS = 10_000
 STEPS = 2_000  # single observations that are used to measure the time of a step

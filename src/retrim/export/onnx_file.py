@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..control.finite_controller import LARGEST
 from ..errors import ConfigError
 from ..io.files import write_whole
 from .portable import Portable
+from .runner import LARGEST
 
 OPSET, IR = 17, 8  # old enough for all current runtimes
 

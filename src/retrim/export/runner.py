@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 TOLERANCE = 1e-5  # largest error at the test vectors in the file, as a fraction of the command range
-LARGEST = 2.0**20  # valid measurements are smaller than this number
+LARGEST = 2.0**20  # valid measurements are smaller, in SI units; networks overflow only far beyond this limit
 
 
 class Runner:
