@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 from ..errors import ConfigError
 from ..plants.measurement_faults import (
     AbstractMeasurementFault,
-    Biased,
     DriftingPosition,
     Frozen,
     Gaps,
@@ -17,8 +16,7 @@ from ..plants.measurement_faults import (
     Late,
     Repeated,
     ScaledVelocity,
-    SwappedMarkers,
-    VelocitySpikes,
+    WrongState,
 )
 from .registry import Registry
 from .sizes import name_and_size
@@ -74,28 +72,28 @@ def _along_x(size: float) -> Float[Array, "3"]:
     return jnp.array([size, 0.0, 0.0])
 
 
-def _spikes(size: float, every: int) -> VelocitySpikes:
-    return VelocitySpikes(_along_x(size), jnp.array(every))
+def _velocity_error(size: float, every: int) -> WrongState:
+    return WrongState(jnp.zeros(3), jnp.zeros(3), _along_x(size), jnp.array(every))
 
 
-def _swap_markers(angle: float) -> SwappedMarkers:
-    return SwappedMarkers(jnp.array([0.05, -0.03, 0.02]), jnp.array([0.0, 0.0, angle]), jnp.array(50))
+def _swap_markers(angle: float) -> WrongState:
+    return WrongState(jnp.array([0.05, -0.03, 0.02]), jnp.array([0.0, 0.0, angle]), jnp.zeros(3), jnp.array(50))
 
 
-def _make_bias(v: float, tilt: float) -> Biased:
-    return Biased(_along_x(v), _along_x(tilt))
+def _tilt(angle: float) -> WrongState:
+    return WrongState(jnp.zeros(3), _along_x(angle), jnp.zeros(3), jnp.array(1))
 
 
 FAULTS.register(NO_FAULT, _none)
-_register("velocity-spikes", partial(_spikes, every=25), 2.0, -20.0, 20.0, "m/s")
-_register("rare-spikes", partial(_spikes, every=150), 3.0, -20.0, 20.0, "m/s")
+_register("velocity-spikes", partial(_velocity_error, every=25), 2.0, -20.0, 20.0, "m/s")
+_register("rare-spikes", partial(_velocity_error, every=150), 3.0, -20.0, 20.0, "m/s")
 _register("swapped-markers", _swap_markers, 1.5, -3.2, 3.2, "rad")
 _register("late", lambda size: Late(round(size)), 3.0, 1.0, 25.0, "ticks")
 _register("frozen", lambda size: Frozen(jnp.array(200), round(size)), 15.0, 1.0, 100.0, "ticks")
 _register("repeated", lambda size: Repeated(jnp.array(size)), 0.2, 0.0, 0.95, "of all measurements")
 _register("scaled-velocity", lambda size: ScaledVelocity(jnp.array(size)), 0.5, 0.0, 3.0, "times the velocity")
-_register("velocity-bias", lambda size: _make_bias(size, 0.0), 0.1, -5.0, 5.0, "m/s")
-_register("attitude-bias", lambda size: _make_bias(0.0, size), 0.03, -0.5, 0.5, "rad")
+_register("velocity-bias", partial(_velocity_error, every=1), 0.1, -5.0, 5.0, "m/s")
+_register("attitude-bias", _tilt, 0.03, -0.5, 0.5, "rad")
 _register("drift", lambda size: DriftingPosition(_along_x(size), jnp.array(250.0)), 0.1, 0.0, 5.0, "m")
 _register("gaps", lambda size: Gaps(150, round(size)), 5.0, 1.0, 50.0, "ticks")
 _register("clock-jumps", lambda size: JumpingClock(100, size), 0.1, -2.0, 2.0, "s")

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from ..physics import so3
 from ..physics.state import State, where
@@ -49,36 +49,24 @@ class AbstractMeasurementFault(eqx.Module):
         return 0.0
 
 
-class VelocitySpikes(AbstractMeasurementFault):
-    """A single velocity is periodically wrong, as happens when a motion-capture system swaps two markers."""
-
-    v: Float[Array, "3"]
-    """Error in the world frame [m/s]."""
-    every: Int[Array, ""]
-    """Period [ticks]."""
-
-    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Add the error to the last velocity in each period of ``every`` ticks."""
-        x = _newest(past)
-        return State(x.p, x.R, x.v + jnp.where(_last_of(tick, self.every), self.v, 0.0).astype(x.v.dtype))
-
-
-class SwappedMarkers(AbstractMeasurementFault):
-    """A single pose is periodically rotated and shifted, as happens when a rigid body's markers are confused."""
+class WrongState(AbstractMeasurementFault):
+    """A single state is periodically wrong, as happens when a motion-capture system confuses the markers of a body."""
 
     p: Float[Array, "3"]
     """Shift in the world frame [m]."""
     rotation: Float[Array, "3"]
     """Rotation vector in the body frame [rad]."""
+    v: Float[Array, "3"]
+    """Velocity error in the world frame [m/s]."""
     every: Int[Array, ""]
-    """Period [ticks]."""
+    """Period [ticks]; with 1, every state is wrong."""
 
     def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Rotate and shift the last pose in each period of ``every`` ticks."""
+        """Add the errors to the last state in each period of ``every`` ticks."""
         x = _newest(past)
-        now = _last_of(tick, self.every).astype(x.p.dtype)
-        rotation = so3.mul(x.R, so3.exp(now * self.rotation.astype(x.p.dtype)))
-        return State(x.p + now * self.p.astype(x.p.dtype), rotation, x.v)
+        now = (tick % self.every == self.every - 1).astype(x.p.dtype)
+        p, rotation, v = (now * error.astype(x.p.dtype) for error in (self.p, self.rotation, self.v))
+        return State(x.p + p, so3.mul(x.R, so3.exp(rotation)), x.v + v)
 
 
 class Late(AbstractMeasurementFault):
@@ -146,20 +134,6 @@ class ScaledVelocity(AbstractMeasurementFault):
         return State(x.p, x.R, self.scale.astype(x.v.dtype) * x.v)
 
 
-class Biased(AbstractMeasurementFault):
-    """Velocity and attitude have constant errors."""
-
-    v: Float[Array, "3"]
-    """Velocity error in the world frame [m/s]."""
-    rotation: Float[Array, "3"]
-    """Rotation vector in the body frame [rad]."""
-
-    def __call__(self, past: State, tick: Int[Array, ""], key: Key[Array, ""]) -> State:
-        """Add the errors."""
-        x = _newest(past)
-        return State(x.p, so3.mul(x.R, so3.exp(self.rotation.astype(x.p.dtype))), x.v + self.v.astype(x.v.dtype))
-
-
 class DriftingPosition(AbstractMeasurementFault):
     """The position drifts back and forth, as a camera-based estimate does; the velocity does not contain the drift."""
 
@@ -213,7 +187,3 @@ class JumpingClock(AbstractMeasurementFault):
 
 def _newest(past: State) -> State:
     return jax.tree.map(lambda leaf: leaf[-1], past)  # type: ignore[no-any-return]
-
-
-def _last_of(tick: Int[Array, ""], every: Int[Array, ""]) -> Bool[Array, ""]:
-    return tick % every == every - 1
