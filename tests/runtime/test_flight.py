@@ -1,6 +1,5 @@
 """The flight loop: clock origins, missed ticks, limited commands, and observers."""
 
-import json
 import threading
 
 import jax
@@ -15,7 +14,7 @@ from retrim.config import Scenario
 from retrim.control import AbstractController, Policy, PolicyController
 from retrim.physics import Command, State, small
 from retrim.plants import Plant
-from retrim.runtime import ControllerPilot, Event, FlightStopped, FunctionPilot, JsonlObserver, Pilot, fly
+from retrim.runtime import ControllerPilot, Event, FlightStopped, FunctionPilot, Pilot, fly
 
 START = State.at(jnp.array([0.3, -0.2, 1.5]))
 HOVER = FunctionPilot(lambda measurement: Command.hover())
@@ -223,19 +222,6 @@ def test_observers_receive_all_measurements_and_events():
     assert log.events == (event,)
     assert [type(message) for message in witness.calls] == [type(message) for message in second.calls]
     assert witness.calls.index(event) == 3  # in the tick of the event, before its measurement
-
-
-def test_events_as_lines_of_json(tmp_path):
-    observer = JsonlObserver(tmp_path / "events.jsonl", method="full")
-    fly(OddPlant(), PilotWithEvent(), START, ticks=5, observers=[observer])
-    observer.close()
-    (line,) = (tmp_path / "events.jsonl").read_text().splitlines()
-    assert json.loads(line) == {
-        "event": "skipped",
-        "method": "full",
-        "t": 0.04,
-        "note": "policy learner still busy",
-    }
 
 
 def test_stop_token_ends_flight_and_stops_plant():

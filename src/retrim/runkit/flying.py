@@ -18,7 +18,7 @@ from ..plants.plant import Plant
 from ..plants.sim import SimPlant
 from ..progress import no_progress
 from ..runtime.adaptive import AdaptivePilot
-from ..runtime.events import Event, Observer
+from ..runtime.events import Event
 from ..runtime.flight import Log, States, fly
 from ..runtime.pilot import Pilot
 from ..runtime.together import can_fly_together, fly_together
@@ -49,7 +49,6 @@ def fly_one(
     *,
     latency: Latency = "fixed",
     state: LearnerState | None = None,
-    observers: tuple[Observer, ...] = (),
     stop: Any = None,
 ) -> Flight:
     """Fly one flight.
@@ -62,7 +61,6 @@ def fly_one(
         seconds: Length of the flight [s].
         latency: How learning is charged to flight time.
         state: Learner state from an earlier flight, to resume from.
-        observers: Observers of the flight.
         stop: A ``threading.Event`` that aborts the flight.
 
     Raises:
@@ -77,9 +75,8 @@ def fly_one(
         return bool(_terminated(task, np.float64(t), x))
 
     log = fly(
-        plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, observers=observers, stop=stop,
-        progress=no_progress,
-    )  # fmt: skip
+        plant, pilot, x0, ticks=round(seconds / preset.dt), terminated=terminated, stop=stop, progress=no_progress
+    )
     return score_flight(setup, spec, log, learner_state_of(pilot))
 
 

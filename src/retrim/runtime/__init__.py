@@ -4,7 +4,6 @@ from .adaptive import AdaptivePilot as AdaptivePilot
 from .adaptive import ScheduledLearner as ScheduledLearner
 from .batch import batch_flight as batch_flight
 from .events import Event as Event
-from .events import JsonlObserver as JsonlObserver
 from .events import Observer as Observer
 from .events import stage_events as stage_events
 from .flight import FlightStopped as FlightStopped

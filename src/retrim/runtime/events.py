@@ -1,7 +1,5 @@
 """Events and observers of a flight."""
 
-import json
-from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -73,23 +71,3 @@ class Observer(Protocol):
     def event(self, event: Event) -> None:
         """Receive each event."""
         ...
-
-
-class JsonlObserver:
-    """Writes each event immediately, as one line of JSON."""
-
-    def __init__(self, path: Path, **about: object) -> None:
-        """Open ``path`` for appending; each line contains the fields of ``about``."""
-        self._file, self._about = path.open("a"), about
-
-    def measurement(self, measurement: Measurement, u: Command) -> None:
-        """Ignore the measurement."""
-
-    def event(self, event: Event) -> None:
-        """Write one line."""
-        self._file.write(json.dumps({"event": event.kind, **self._about, "t": event.t, "note": event.note}) + "\n")
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
