@@ -11,7 +11,6 @@ from fake_dataflash import HEAD, body_messages, dataflash, flight_messages, form
 from fake_log import G, fly_once
 from retrim.errors import LogError, RetrimError
 from retrim.io.logs import BodyLog, FlightLog, read_flight_log, read_log, read_map
-from retrim.io.logs.dataflash_file import parameters_of
 from retrim.replay import rows_of
 
 FLIGHT = fly_once(6.0, dt=0.01)
@@ -44,7 +43,7 @@ def test_flight_with_positions(tmp_path):
     assert_is_flight(log)
     assert min(log.agreement.values()) > 0.95
     hover = float(next(note for note in log.notes if "hover at" in note).split()[-1])
-    assert hover == pytest.approx(parameters_of(path)["MOT_THST_HOVER"], rel=0.1)
+    assert hover == pytest.approx(0.35, rel=0.1)
 
 
 def test_numbers_equal_pymavlink(tmp_path):

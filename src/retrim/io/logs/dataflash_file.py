@@ -106,19 +106,6 @@ def read_dataflash(
     return result, notes
 
 
-def parameters_of(path: Path) -> dict[str, float]:
-    """Return the last value of each parameter in a log."""
-    raw = path.read_bytes()
-    data, contents = np.frombuffer(raw, np.uint8), _scan(path, raw)
-    message = contents.layouts.get("PARM")
-    if message is None or not {"Name", "Value"} <= set(message.dtype.names or ()):
-        return {}
-    rows = _rows(data, message, contents.offsets["PARM"])
-    return {
-        name.decode("latin-1"): float(value) for name, value in zip(rows["Name"], rows["Value"], strict=True) if name
-    }
-
-
 def _scan(path: Path, raw: bytes) -> Contents:
     """Return where the messages of a file are."""
     layouts, at, total, skipped = dict[str, Message](), 0, 0, 0
