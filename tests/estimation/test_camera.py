@@ -1,6 +1,7 @@
 """The camera: the double-sphere model, its inverse, its borders, and its viewing direction."""
 
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -21,8 +22,19 @@ def camera():
 
 
 project = eqx.filter_jit(lambda camera, P: jax.vmap(camera.project)(P))
-bearing = eqx.filter_jit(lambda camera, pixels: jax.vmap(camera.bearing)(pixels))
 slope = eqx.filter_jit(lambda camera, P: jax.vmap(jax.jacobian(lambda q: camera.project(q).pixel))(P))
+
+
+@eqx.filter_jit
+@partial(jax.vmap, in_axes=(None, 0))
+def bearing(camera, pixel):
+    """Return the unit direction in camera coordinates that appears at a pixel, by the published inverse."""
+    m = ((pixel + 1.0) * camera.size / 2.0 - camera.centre) / camera.focal
+    r2 = jnp.sum(m**2)
+    inside = 1.0 - (2.0 * camera.alpha - 1.0) * r2
+    mz = (1.0 - camera.alpha**2 * r2) / (camera.alpha * jnp.sqrt(inside) + 1.0 - camera.alpha)
+    stretch = (mz * camera.xi + jnp.sqrt(mz**2 + (1.0 - camera.xi**2) * r2)) / (mz**2 + r2)
+    return stretch * jnp.append(m, mz) - jnp.array([0.0, 0.0, 1.0]) * camera.xi
 
 
 def test_projection_near_axis_is_pinhole(camera):

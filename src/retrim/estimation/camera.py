@@ -59,15 +59,6 @@ class Camera(eqx.Module):
         holds = (P[2] > -w2 * d1) & (P[2] > 0.0) & (D_MIN * d1 < D)
         return Projection(pixel, holds & jnp.all(jnp.abs(pixel) <= 1.0))
 
-    def bearing(self, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Return the unit direction in camera coordinates that appears at ``pixel`` (normalised)."""
-        m = ((pixel + 1.0) * self.size / 2.0 - self.centre) / self.focal
-        r2 = jnp.sum(m**2)
-        inside = jnp.maximum(1.0 - (2.0 * self.alpha - 1.0) * r2, 1e-6)
-        mz = (1.0 - self.alpha**2 * r2) / (self.alpha * jnp.sqrt(inside) + 1.0 - self.alpha)
-        stretch = (mz * self.xi + jnp.sqrt(mz**2 + (1.0 - self.xi**2) * r2)) / (mz**2 + r2)
-        return stretch * jnp.append(m, mz) - jnp.array([0.0, 0.0, 1.0], dtype=m.dtype) * self.xi
-
 
 def in_camera(x: State, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """Map world points [m] to the coordinates of a camera at the body's origin."""
