@@ -1,6 +1,7 @@
 """PX4's simulation, and changes of its parameters in flight."""
 
 import os
+import struct
 import time
 from pathlib import Path
 
@@ -13,6 +14,7 @@ PX4 = os.environ.get("RETRIM_PX4", "")
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SIH, X500 = str(EXAMPLES / "px4_sih.toml"), str(EXAMPLES / "x500.toml")
 ADDRESS = "mavlink:udp:127.0.0.1:14540"
+INT32, REAL32 = 6, 9  # MAV_PARAM_TYPE
 
 
 def wait_until(log, when, flight):
@@ -33,5 +35,12 @@ class Changes:
             self.link.pump(time.monotonic() + 0.1)
         for name, value in parameters.items():
             for _ in range(3):
-                self.link.set_parameter(name, value)
+                self._set(name, value)
                 self.link.pump(time.monotonic() + 0.02)
+
+    def _set(self, name, value):
+        """Send PARAM_SET; an integer is sent as its bit pattern, following the PX4 convention."""
+        if self.link.system is not None:
+            real = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
+            kind = INT32 if isinstance(value, int) else REAL32
+            self.link._send(self.link._sender.param_set_encode(*self.link.system, name.encode(), real, kind))

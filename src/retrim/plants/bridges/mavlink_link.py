@@ -4,7 +4,6 @@ This module does not decide when to arm or which controller flies; :mod:`.mavlin
 """
 
 import math
-import struct
 import time
 from collections import deque
 from collections.abc import Callable
@@ -24,7 +23,7 @@ ARMED = 0x80  # bit of HEARTBEAT.base_mode
 ONBOARD_COMPUTER, INVALID = 18, 8  # MAV_TYPE, MAV_AUTOPILOT
 LOCAL_NED, LOCAL_FRD, BODY_FRD, BODY_NED = 1, 20, 12, 8
 WORLDS, BODIES = (LOCAL_NED, LOCAL_FRD), (BODY_FRD, BODY_NED)
-VISION, INT32, REAL32 = 2, 6, 9  # MAV_ESTIMATOR_TYPE, MAV_PARAM_TYPE
+VISION = 2  # MAV_ESTIMATOR_TYPE
 RATES_ONLY = 128  # SET_ATTITUDE_TARGET: use thrust and body rates, ignore the attitude
 PLACE_AND_YAW = 0x9F8  # SET_POSITION_TARGET_LOCAL_NED: ignore velocity, acceleration and yaw rate
 PAIRING_S = 0.025  # [s], largest time between a position and an attitude that are combined into a state
@@ -134,13 +133,6 @@ class MavlinkLink:
             0, LOCAL_NED, BODY_FRD, *place, frames.quaternion_of(x.R).tolist(), *velocity, *rates, unknown, unknown,
             0, VISION, 100,
         ))  # fmt: skip
-
-    def set_parameter(self, name: str, value: float | int) -> None:
-        """Send PARAM_SET; an integer is sent as its bit pattern, following the PX4 convention."""
-        if self.system is not None:
-            real = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
-            kind = INT32 if isinstance(value, int) else REAL32
-            self._send(self._sender.param_set_encode(*self.system, name.encode(), real, kind))
 
     def close(self) -> None:
         """Close the port."""
