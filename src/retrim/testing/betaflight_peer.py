@@ -112,9 +112,9 @@ class BetaflightPeer:
         if self._publish is not None and self._kind is not None:
             self._publish(self._kind.encode(self._message(x.p, x.R, x.v, x.omega)))
 
-    def fly_by_hand(self, seconds: float, seed: int = 0) -> None:
+    def fly_by_hand(self, seconds: float) -> None:
         """Fly with random rates and thrusts around a place, as a pilot excites a vehicle for a log."""
-        rng, turn, push = np.random.default_rng(seed), np.zeros(3), 0.0
+        rng, turn, push = np.random.default_rng(0), np.zeros(3), 0.0
         turn_decay, push_decay = math.exp(-DT / TURN_S), math.exp(-DT / PUSH_S)
         began = due = time.monotonic()
         while due - began < seconds:

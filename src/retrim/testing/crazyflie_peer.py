@@ -32,19 +32,18 @@ UNKNOWN_ENTRY = 2  # error code for an unknown block or variable
 class CrazyfliePeer:
     """A simulated Crazyflie; :meth:`step` advances the simulation by 0.01 s."""
 
-    def __init__(self, scenario: Scenario, *, port: int = 19850, seed: int = 0) -> None:
+    def __init__(self, scenario: Scenario, *, port: int = 19850) -> None:
         """Build a vehicle on the ground at the origin, with the nose along x.
 
         Args:
             scenario: Plant, vehicle and disturbance.
             port: Local port on which the peer listens.
-            seed: Seed of the disturbance.
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", port))
         self._socket.setblocking(False)
         self._client: tuple[str, int] | None = None
-        self.vehicle = PeerVehicle(scenario, heading=0.0, seed=seed)
+        self.vehicle = PeerVehicle(scenario, heading=0.0)
         self._began = time.monotonic()
         self.armed = self.locked = self.cut = False
         """Whether the vehicle is armed, whether its supervisor has locked it, and whether the link is cut both ways."""

@@ -28,13 +28,12 @@ QUADROTOR, PX4, ACTIVE = 2, 12, 4
 class MavlinkPeer:
     """An autopilot and its vehicle; :meth:`step` advances both by 0.01 s."""
 
-    def __init__(self, scenario: Scenario, *, port: int = 14540, seed: int = 0) -> None:
+    def __init__(self, scenario: Scenario, *, port: int = 14540) -> None:
         """Build a vehicle on the ground at the origin, with the nose to the north.
 
         Args:
             scenario: Plant, vehicle and disturbance.
             port: Local port to which the peer sends.
-            seed: Seed of the disturbance.
         """
         self._dialect: Any = import_extra("pymavlink.dialects.v20.common", "mavlink", package="pymavlink")
         self._out = self._dialect.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -42,7 +41,7 @@ class MavlinkPeer:
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
         self._to = ("127.0.0.1", port)
-        self.vehicle = PeerVehicle(scenario, heading=math.pi / 2, seed=seed)
+        self.vehicle = PeerVehicle(scenario, heading=math.pi / 2)
         self.mode, self.armed = HOLD, False
         self.cut = False
         """Whether the link is cut in both directions."""

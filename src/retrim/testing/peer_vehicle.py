@@ -34,16 +34,15 @@ def port(text: str) -> int:
 class PeerVehicle:
     """A vehicle that stands on the ground at the origin until it lifts off; :meth:`step` advances time by 0.01 s."""
 
-    def __init__(self, scenario: Scenario, *, heading: float, seed: int = 0) -> None:
+    def __init__(self, scenario: Scenario, *, heading: float) -> None:
         """Build a vehicle.
 
         Args:
             scenario: Plant, vehicle and disturbance.
             heading: Heading of the nose, counter-clockwise from east [rad].
-            seed: Seed of the disturbance.
         """
         vehicle = scenario.make_vehicle("small")
-        self._plant = scenario.make("small", dt=DT, seed=seed)
+        self._plant = scenario.make("small", dt=DT, seed=0)
         self.x, self.omega = _standing(0.0, 0.0, heading), np.zeros(3)
         """State [p, R, v] and body rates."""
         self.flies = False

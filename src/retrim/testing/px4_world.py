@@ -62,13 +62,12 @@ def thrust_factor(vehicle: Vehicle) -> float:
 class Px4World:
     """A vehicle on the floor or in flight, which PX4 senses and whose motors it commands."""
 
-    def __init__(self, vehicle: Vehicle, disturbance: Disturbance, *, seed: int = 0) -> None:
+    def __init__(self, vehicle: Vehicle, disturbance: Disturbance) -> None:
         """Compile the vehicle, and open the port to which PX4 connects.
 
         Args:
             vehicle: The vehicle.
             disturbance: External effects, as a function of the time since :meth:`disturb` [s] and the state.
-            seed: Seed of the noise of the sensors.
 
         Raises:
             PlantError: The port is in use, or pymavlink is not installed.
@@ -80,7 +79,7 @@ class Px4World:
         self._disturbed_advance = compile_step(model, disturbance, substeps=STEP_MS, floor=True)
         self._s = place_at_rest(model, State.at(jnp.zeros(3)))
         self._output = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(6), REST])
-        self._motors, self._rng = np.zeros(4), np.random.default_rng(seed)
+        self._motors, self._rng = np.zeros(4), np.random.default_rng(0)
         self._steps, self._t, self._due = 0, 0.0, time.monotonic()
         self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
