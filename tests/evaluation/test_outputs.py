@@ -15,6 +15,7 @@ from retrim.evaluation.metrics import failed_record, notes, summary
 from retrim.io.logs.viewers import can_record
 from retrim.io.policies import load_learner_state, load_policy
 from retrim.runkit import FlightSpec, Run, outputs
+from retrim.runkit.outlet import Outlet
 
 SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full") for start in (0, 1)]
 
@@ -82,7 +83,7 @@ def test_learner_state_of_first_complete_flight_is_saved(setup, tmp_path):
         flights[0],
         *(dataclasses.replace(f, learner_state=s) for f, s in zip(flights[1:], states, strict=False)),
     ]
-    outputs.write_flights(flights, setup.preset, tmp_path)
+    Outlet(tmp_path).write_flights(flights, setup.preset)
     policy, preset = load_policy(tmp_path / "adapted.safetensors")
     assert preset == setup.preset
     for one, other in zip(weights(policy), weights(states[1].policy.policy), strict=True):
@@ -95,7 +96,7 @@ def test_learner_state_of_first_complete_flight_is_saved(setup, tmp_path):
         assert len(list((tmp_path / "logs").glob("*.mcap"))) == 4
     low = dataclasses.replace(flights[2], learner_state=make_learner_state(setup, 0, low_rank=True))
     assert isinstance(low.learner_state.policy.policy, LoraPolicy)
-    outputs.write_flights([low], setup.preset, tmp_path)
+    Outlet(tmp_path).write_flights([low], setup.preset)
     assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [
         "delta.safetensors",
         "learner_state.safetensors",
@@ -103,7 +104,7 @@ def test_learner_state_of_first_complete_flight_is_saved(setup, tmp_path):
     assert [path.name for path in (tmp_path / "logs").glob("*.npz")] == [
         "full_seed4_start1.npz"
     ]  # no files of earlier runs
-    outputs.write_flights(flights[:1], setup.preset, tmp_path)
+    Outlet(tmp_path).write_flights(flights[:1], setup.preset)
     assert not list(tmp_path.glob("*.safetensors"))
     assert (tmp_path / "events.jsonl").read_text() == ""
 

@@ -51,14 +51,6 @@ def write_trained_policy(
     return path
 
 
-def write_flights(flights: Sequence[Flight], preset: Preset, folder: Path) -> None:
-    """Write the events, logs and learned parameters of flights; remove those of earlier flights."""
-    clear_outputs(folder)
-    write_events(flights, folder)
-    write_logs(flights, folder)
-    write_learner_state(flights, preset, folder)
-
-
 def clear_outputs(folder: Path) -> None:
     """Remove the flight files of an earlier command from a folder, before new ones are written."""
     for name in ("learner_state.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl"):
