@@ -38,11 +38,6 @@ class RosStates:
         now = time.monotonic()
         return len([t for t in self._arrivals if now - t < RATE_WINDOW_S]) / RATE_WINDOW_S
 
-    @property
-    def clock_jumps(self) -> int:
-        """Number of times that the sender's clock was set."""
-        return self._clock.jumps
-
     def ignore(self, what: str = "") -> None:
         """Count a message that cannot be used, and note its kind once."""
         self.ignored += 1
