@@ -7,19 +7,13 @@ from ..errors import MessageError
 from .bus import Bus, Message
 
 
-class InProcessBus(Bus):
-    """A bus that keeps its messages in a dictionary with a lock."""
+class MemoryBus(Bus):
+    """A bus that keeps the last message of each topic in a dictionary with a lock."""
 
     def __init__(self, capacities: Mapping[str, int]) -> None:
         """Build a bus; ``capacities`` holds the maximum message length of each topic [bytes]."""
         self._capacities, self._lock = dict(capacities), threading.Lock()
         self._last = dict.fromkeys(capacities, Message(0, b""))
-
-    def publish(self, topic: str, data: bytes) -> None:
-        """Replace the last message of ``topic``."""
-        check_fits(topic, data, self._capacities)
-        with self._lock:
-            self._last[topic] = Message(self._last[topic].version + 1, bytes(data))
 
     def latest(self, topic: str, after: int = 0) -> Message | None:
         """Return the last message of ``topic`` if it is newer than ``after``."""
@@ -27,6 +21,16 @@ class InProcessBus(Bus):
         with self._lock:
             result = self._last[topic]
         return result if result.version > after else None
+
+
+class InProcessBus(MemoryBus):
+    """A bus of threads that share memory."""
+
+    def publish(self, topic: str, data: bytes) -> None:
+        """Replace the last message of ``topic``."""
+        check_fits(topic, data, self._capacities)
+        with self._lock:
+            self._last[topic] = Message(self._last[topic].version + 1, bytes(data))
 
     def close(self) -> None:
         """Do nothing."""

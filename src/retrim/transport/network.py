@@ -12,8 +12,8 @@ import struct
 import threading
 from collections.abc import Mapping
 
-from .bus import Bus, Message
-from .in_process import check_fits, check_topic
+from .bus import Message
+from .in_process import MemoryBus, check_fits
 from .session import HEAD as SEAL
 from .session import MARK, MISSING_KEY, Session
 
@@ -25,7 +25,7 @@ DISTRUST = 5.0  # time in which an end with the key must be received after a mes
 FAREWELL = 0.3  # time for a message to leave the machine before a bus is closed [s]
 
 
-class NetworkBus(Bus):
+class NetworkBus(MemoryBus):
     """A bus whose members exchange all messages."""
 
     def __init__(self, capacities: Mapping[str, int], session: Session | None = None) -> None:
@@ -35,13 +35,12 @@ class NetworkBus(Bus):
             capacities: Maximum length of a message, by topic [bytes].
             session: Signs messages and decides which are accepted; None to accept all.
         """
+        super().__init__(capacities)
         self._refusals, self._fault, self._talk = 0, "", session
         self._answering: threading.Thread | None = None
         self._over = False
-        self._capacities, self._lock = dict(capacities), threading.Lock()
         # Held from the choice of a message until it is sent: a repeated message must not overtake a newer one.
         self._sending = threading.Lock()
-        self._last = dict.fromkeys(capacities, Message(0, b""))
         self._versions = dict.fromkeys(capacities, (0, 0))  # writer and its version
         self._me = secrets.randbits(63) + 1
 
@@ -67,13 +66,6 @@ class NetworkBus(Bus):
                 message = Message(self._last[topic].version + 1, bytes(data))
                 self._last[topic], self._versions[topic] = message, (self._me, message.version)
             self._transmit(topic, message)
-
-    def latest(self, topic: str, after: int = 0) -> Message | None:
-        """Return the last message of ``topic`` if it is newer than ``after``."""
-        check_topic(topic, self._capacities)
-        with self._lock:
-            result = self._last[topic]
-        return result if result.version > after else None
 
     def _receive(self, topic: str, frame: bytes) -> None:
         """Receive a message from the network, in any thread."""
