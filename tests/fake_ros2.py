@@ -51,7 +51,7 @@ class FakeNode(Ros2Node):
 
     def _add(self, topic, kind, qos, *, publishes):
         self.qos[topic] = qos
-        self.network.ends[topic].append((self, Endpoint(kind.name, kind.hash, publishes, qos.reliable)))
+        self.network.ends[topic].append((self, Endpoint(kind.name, kind.hash, publishes)))
 
 
 class RemoteNode:

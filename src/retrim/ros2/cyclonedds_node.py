@@ -96,8 +96,7 @@ class CycloneNode(Ros2Node):
                 text = sample.qos[policies.Userdata].data if policies.Userdata in sample.qos else b""
                 fields = text.decode("ascii", "replace").split(";")
                 type_hash = next((each[len(HASH_KEY) :] for each in fields if each.startswith(HASH_KEY)), "")
-                reliable = policies.Reliability in sample.qos and "Reliable" in repr(sample.qos[policies.Reliability])
-                result.append(Endpoint(ros_name(sample.type_name), type_hash, publishes, reliable))
+                result.append(Endpoint(ros_name(sample.type_name), type_hash, publishes))
         return result
 
     def published_topics(self) -> Mapping[str, str]:

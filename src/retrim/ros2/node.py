@@ -44,8 +44,6 @@ class Endpoint(NamedTuple):
     """Hash of the type; empty if the node does not report it, as with micro-XRCE-DDS and with releases before Iron."""
     publishes: bool
     """Whether it publishes."""
-    reliable: bool | None = None
-    """Whether it offers or requests reliable transmission; None if this is not known."""
 
 
 class Ros2Node(abc.ABC):

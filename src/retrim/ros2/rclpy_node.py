@@ -108,8 +108,7 @@ class RclpyNode(Ros2Node):
                 type_hash = (
                     type_hash if type_hash.startswith(HASH_PREFIX) and type_hash.strip("0") != HASH_PREFIX else NO_HASH
                 )
-                reliable = info.qos_profile.reliability == self._qos_module.ReliabilityPolicy.RELIABLE
-                result.append((Endpoint(info.topic_type, type_hash, publishes, reliable), info.node_name))
+                result.append((Endpoint(info.topic_type, type_hash, publishes), info.node_name))
         return result
 
     def _check_installed(self, topic: str, kind: MessageType) -> None:

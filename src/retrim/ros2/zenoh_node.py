@@ -104,8 +104,7 @@ class ZenohNode(Ros2Node):
         for parts in self._announcements():
             if parts[9] == _mangle(topic):
                 type_hash = "" if parts[11] == NO_HASH else parts[11]
-                reliable = not parts[12].startswith(BEST_EFFORT)
-                result.append(Endpoint(ros_name(parts[10]), type_hash, parts[5] == "MP", reliable))
+                result.append(Endpoint(ros_name(parts[10]), type_hash, parts[5] == "MP"))
         return result
 
     def published_topics(self) -> Mapping[str, str]:

@@ -83,8 +83,6 @@ class Status(NamedTuple):
 
     modes: frozenset[int]
     """Permanent numbers of the active modes."""
-    arming_faults: int
-    """Reasons against arming, as bits."""
 
     @classmethod
     def of(cls, payload: bytes, boxes: tuple[int, ...]) -> "Status":
@@ -97,8 +95,8 @@ class Status(NamedTuple):
         flags = int.from_bytes(_part(payload, 6, 4), "little")
         more = _part(payload, 15, 1)[0] & 0x0F
         flags |= int.from_bytes(_part(payload, 16, more), "little") << 32
-        faults = int.from_bytes(_part(payload, 17 + more, 4), "little")
-        return cls(frozenset(number for bit, number in enumerate(boxes) if flags >> bit & 1), faults)
+        _part(payload, 17 + more, 4)  # a complete answer ends with the reasons against arming
+        return cls(frozenset(number for bit, number in enumerate(boxes) if flags >> bit & 1))
 
 
 class ModeRange(NamedTuple):

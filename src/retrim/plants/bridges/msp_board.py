@@ -29,8 +29,6 @@ TABLE = 201
 class Board:
     """What a board reports about its settings."""
 
-    version: str
-    """Firmware and its version."""
     boxes: tuple[int, ...]
     """Permanent numbers of the modes, in the order of the flags."""
     ranges: tuple[msp.ModeRange, ...]
@@ -60,7 +58,6 @@ class Board:
     @classmethod
     def _of(cls, answers: Mapping[int, bytes]) -> "Board":
         variant = answers[msp.FC_VARIANT][:4].decode("ascii", "replace")
-        number = ".".join(str(each) for each in answers[msp.FC_VERSION][:3])
         if variant != "BTFL":
             raise PlantError(f"the board's firmware is {variant!r}, and the link is for Betaflight (BTFL)")
         tuning, deadband = answers[msp.RC_TUNING], answers[msp.RC_DEADBAND]
@@ -81,7 +78,7 @@ class Board:
                 "of the pilot, then save"
             )
         return cls(
-            f"{variant} {number}", boxes, tuple(msp.mode_ranges(answers[msp.MODE_RANGES])),
+            boxes, tuple(msp.mode_ranges(answers[msp.MODE_RANGES])),
             _order(answers[msp.RX_MAP]), msp.word_at(answers[msp.RX_CONFIG], 5),
             1e-4 * msp.word_at(answers[msp.ADVANCED_CONFIG], 6), _rates(tuning),
         )  # fmt: skip
