@@ -9,7 +9,6 @@ from retrim.ros2.definitions import DEFINITIONS, release_of
 from retrim.ros2.message_type import (
     message_type,
     px4_hash,
-    release_by_px4_hash,
     title_by_hash,
     title_by_px4_hash,
 )
@@ -76,8 +75,6 @@ def test_release_is_recognised_from_other_end():
     assert title_by_hash(COMMAND, "RIHS01_" + 64 * "0") == "an unknown version (RIHS01_00000000...)"
     assert title_by_px4_hash(COMMAND, px4_hash(COMMAND, "1.15")) == "px4_msgs 1.15 or later"
     assert title_by_px4_hash(COMMAND, 5) == "an unknown version (hash 0x00000005)"
-    assert release_by_px4_hash(COMMAND, px4_hash(COMMAND, "1.14")) == "1.14"
-    assert release_by_px4_hash(COMMAND, 5) is None
 
 
 def test_message_of_other_release_is_refused_with_both_names():

@@ -120,11 +120,6 @@ def title_by_px4_hash(name: str, value: int) -> str:
     return f"an unknown version (hash {value:#010x})"
 
 
-def release_by_px4_hash(name: str, value: int) -> str | None:
-    """Return the first release whose message has a hash of PX4; None if it is unknown."""
-    return next((form for form in DEFINITIONS[name] if px4_hash(name, form) == value), None)
-
-
 def _title_by_size(name: str, size: int) -> str:
     for form in DEFINITIONS.get(name, {}):
         if (expected := message_type(name, form).size) is not None and 0 <= size - expected < WORD:
