@@ -76,14 +76,9 @@ def star(radius: float = 1.0, period: float = 6.0, ramp: float = RAMP) -> Refere
     return Reference.of(path, seconds=ramp + period, lap=ramp)
 
 
-def lissajous(period: float = 5.5, ramp: float = RAMP) -> Reference:
-    """Return a horizontal 2 m x 1 m figure-8 from (0, 0, 1), the size used in RAPTOR's flights (5.5 s, 10 s).
-
-    Args:
-        period: Duration of a lap [s].
-        ramp: Duration of the smooth start [s].
-    """
-    return figure8(2.0, 1.0, period, ramp)
+def lissajous() -> Reference:
+    """Return a horizontal 2 m x 1 m figure-8 of 5.5 s from (0, 0, 1), as in RAPTOR's flights."""
+    return figure8(2.0, 1.0, 5.5)
 
 
 def circle_at(speed: float) -> Reference:
