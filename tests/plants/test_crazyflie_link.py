@@ -81,7 +81,7 @@ def test_time_jump_is_accepted_only_after_silence(wire, link):
 
 
 def test_status_is_read(wire, link):
-    says(wire, link, STATUSES, 1000, crtp.status_values(crtp.Status(30_000.0, crtp.ARMED | crtp.CAN_FLY, 3.9)))
+    says(wire, link, STATUSES, 1000, crtp._STATUS.pack(30_000.0, crtp.ARMED | crtp.CAN_FLY, 3.9))
     assert link.status.info & crtp.ARMED
     assert list(link.thrusts) == [30_000.0]
 
@@ -90,7 +90,7 @@ def test_2000_damaged_packets_are_refused(wire, link):
     """The packets are random, truncated, from other senders, or logs of the right length with random content."""
     rng = np.random.default_rng(0)
     says(wire, link, STATES, 5_000_000, state())
-    says(wire, link, STATUSES, 5_000_000, crtp.status_values(crtp.Status(1.0, 0, 3.9)))
+    says(wire, link, STATUSES, 5_000_000, crtp._STATUS.pack(1.0, 0, 3.9))
     good = Packet(crtp.LOG, crtp.DATA, bytes([STATES]) + (5_000_010).to_bytes(3, "little") + state((9.0, 9.0, 9.0)))
     before, reply = link.reading, link.last_message
     for k in range(2000):

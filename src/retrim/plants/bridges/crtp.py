@@ -172,11 +172,6 @@ def status_of(values: bytes) -> Status:
     return result
 
 
-def status_values(status: Status) -> bytes:
-    """Return a STATUS_LOG block; the inverse of :func:`status_of`."""
-    return _STATUS.pack(*status)
-
-
 def attitude_of(word: int) -> np.ndarray:
     """Return an attitude, body to world, from 32 bits: the largest element's index, and the other signs and magnitudes.
 
