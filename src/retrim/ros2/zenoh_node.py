@@ -44,23 +44,7 @@ class ZenohNode(Ros2Node):
         except ImportError as error:
             raise ConfigError("ROS 2 by zenoh needs zenoh: pip install eclipse-zenoh") from error
         self._zenoh: Any = zenoh
-        config = zenoh.Config()
-        for name, value in {
-            "mode": "peer",
-            "scouting/multicast/enabled": False,
-            "timestamping/enabled": True,
-            "listen/endpoints": [f"tcp/{address}"] if listen else [],
-            "connect/endpoints": [] if listen else [f"tcp/{address}"],
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
-        }.items():
-            config.insert_json5(name, json.dumps(value))
-        try:
-            self._session: Any = zenoh.open(config)
-        except zenoh.ZError as error:
-            reason = str(error).splitlines()[0].split(" at ")[0]
-            raise ConfigError(f"zenoh: cannot open a session at {address!r} ({reason})") from error
+        self._session = open_session(f"tcp/{address}", listen, f"open a session at {address!r}")
         self._domain, self._count = domain_id() if domain is None else domain, 0
         self._me = str(self._session.zid())
         self._lock = threading.Lock()
@@ -141,6 +125,38 @@ class ZenohNode(Ros2Node):
         profile = f"{reliability}:{durability}:,{qos.depth}:,:,:,,"
         identity = self._identity(what, self._count)
         return self._token(f"{identity}/{_mangle(topic)}/{kind.dds_name}/{kind.hash}/{profile}")
+
+
+def open_session(endpoint: str, listen: bool, action: str) -> Any:
+    """Open a session of zenoh without a broker or discovery: one end listens, and the others connect.
+
+    Args:
+        endpoint: Endpoint, for example ``tcp/192.168.1.5:7447``.
+        listen: Whether to wait at the endpoint for others; otherwise, the session connects without a time limit.
+        action: Action in the error message.
+
+    Raises:
+        ConfigError: The endpoint cannot be used.
+    """
+    import zenoh
+
+    config = zenoh.Config()
+    for name, value in {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "timestamping/enabled": True,  # required by the history for late subscribers
+        "listen/endpoints": [endpoint] if listen else [],
+        "connect/endpoints": [] if listen else [endpoint],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        # With these times, a returning peer is reconnected quickly.
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    }.items():
+        config.insert_json5(name, json.dumps(value))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise ConfigError(f"zenoh: cannot {action} ({str(error).splitlines()[0].split(' at ')[0]})") from error
 
 
 def _mangle(topic: str) -> str:

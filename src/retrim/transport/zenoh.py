@@ -4,11 +4,11 @@ The peers use neither a broker nor discovery: one end listens, and the others co
 ``zenoh``.
 """
 
-import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ..errors import ConfigError
+from ..ros2.zenoh_node import open_session
 from .network import NetworkBus
 from .session import Session
 
@@ -50,24 +50,7 @@ class ZenohBus(NetworkBus):
             raise ConfigError("a bus by zenoh needs zenoh: pip install eclipse-zenoh") from error
         ext: Any = _ext
         super().__init__(capacities, session)
-        config = zenoh.Config()
-        for name, value in {
-            "mode": "peer",
-            "scouting/multicast/enabled": False,
-            "timestamping/enabled": True,  # required by the history for late subscribers
-            "listen/endpoints": [endpoint] if listen else [],
-            "connect/endpoints": [] if listen else [endpoint],
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            # With these times, a returning peer is reconnected quickly.
-            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
-        }.items():
-            config.insert_json5(name, json.dumps(value))
-        try:
-            self._session: Any = zenoh.open(config)
-        except zenoh.ZError as error:
-            reason = str(error).splitlines()[0].split(" at ")[0]
-            raise ConfigError(f"zenoh: cannot join at {endpoint!r} ({reason})") from error
+        self._session = open_session(endpoint, listen, f"join at {endpoint!r}")
         cache = ext.CacheConfig(BUFFER)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=BUFFER)
         # Messages are not dropped if the network is slow, because some topics carry only a single message.
