@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import LogError
-from .series import Clock, Series, first_of, missing_field, sign_of
+from .series import Clock, Series, find_fields, missing_field, sign_of
 
 
 def read_csv(
@@ -36,12 +36,7 @@ def series_of_rows(
         raise LogError(f'{path}: a CSV file needs a table [time] in the map, as field = "t" and unit = "s"')
     header, lines = _split_header(path, rows)
     places = {"": [_place(path, time.field, header)]}
-    for what, fields in request.items():
-        try:
-            places[what] = [first_of(name, lambda each: _place(path, each, header)) for name in fields]
-        except LogError:
-            if what not in optional:
-                raise
+    places.update(find_fields(request, lambda each: _place(path, each, header), optional))
     notes = list[str]()
     if lines and len(lines[-1][1]) < len(header):
         notes.append(f"line {lines[-1][0]}, the last, is torn, and is left out")

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import LogError
 from .flights import Span, choose_flight
-from .series import Clock, Series, first_of, missing_field, sign_of
+from .series import Clock, Series, find_fields, missing_field, sign_of
 
 MARK = b"\xa3\x95"
 FORMAT, FORMAT_LENGTH = 128, 89  # type and length of the message that describes other messages
@@ -72,13 +72,7 @@ def read_dataflash(
     raw = path.read_bytes()
     data, contents = np.frombuffer(raw, np.uint8), _scan(path, raw)
     names = {name: message for name, message in contents.layouts.items() if len(contents.offsets[name])}
-    fields_of = dict[str, list[tuple[str, int, str]]]()
-    for what, fields in request.items():
-        try:
-            fields_of[what] = [first_of(each, lambda one: _find(path, one, names)) for each in fields]
-        except LogError:
-            if what not in optional:
-                raise
+    fields_of = dict(find_fields(request, lambda each: _find(path, each, names), optional))
     spans = _flights(data, contents)
     k, notes = choose_flight(path, [Span(*(MICROSECOND * t for t in each[2:])) for each in spans], flight)
     first, last = spans[k][:2]

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...errors import LogError
 from .npz_members import NpzMembers
-from .series import Clock, Series, first_of, missing_field, sign_of
+from .series import Clock, Series, find_fields, missing_field, sign_of
 
 
 def read_npz(
@@ -19,16 +19,11 @@ def read_npz(
     arrays = NpzMembers(path)
     t = _flat(path, time.field, arrays)[:, 0] * time.scale
     result = dict[str, Series]()
-    for what, fields in request.items():
-        try:
-            columns = [sign_of(name) * first_of(name, lambda each: _flat(path, each, arrays)) for name in fields]
-        except LogError:
-            if what not in optional:
-                raise
-            continue
-        for name, column in zip(fields, columns, strict=True):
+    for what, parts in find_fields(request, lambda each: _flat(path, each, arrays), optional):
+        for name, column in zip(request[what], parts, strict=True):
             if len(column) != len(t):
                 raise LogError(f"{path}: {name!r} has {len(column)} samples, but {time.field!r} has {len(t)}")
+        columns = [sign_of(name) * column for name, column in zip(request[what], parts, strict=True)]
         result[what] = Series(t, np.concatenate(columns, axis=1))
     return result, []
 

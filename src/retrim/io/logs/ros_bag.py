@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import LogError
 from .message_times import on_one_time, stamp_of
-from .series import Clock, Series, first_of, missing_field, sign_of
+from .series import Clock, Series, find_fields, missing_field, sign_of
 
 NANOSECOND = 1e-9
 ORDER = ("x", "y", "z", "w")
@@ -83,15 +83,10 @@ def _places(
 ) -> dict[str, list[Place]]:
     """Return the locations of each quantity's fields."""
     places = dict[str, list[Place]]()
-    for what, fields in request.items():
-        try:
-            places[what] = [first_of(name, lambda each: _place(path, each, topics)) for name in fields]
-        except LogError:
-            if what not in optional:
-                raise
-            continue
-        if len({place.topic for place in places[what]}) > 1:
-            raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(fields)}")
+    for what, parts in find_fields(request, lambda each: _place(path, each, topics), optional):
+        if len({place.topic for place in parts}) > 1:
+            raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(request[what])}")
+        places[what] = parts
     return places
 
 

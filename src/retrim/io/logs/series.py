@@ -1,6 +1,6 @@
 """Defines a log's columns with their recorded times, and the interface for readers."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -76,6 +76,24 @@ def first_of(name: str, look: Callable[[str], T]) -> T:
         except LogError as error:
             errors.append(error)
     raise errors[0]
+
+
+def find_fields(
+    request: Mapping[str, Sequence[str]], look: Callable[[str], T], optional: Collection[str]
+) -> Iterator[tuple[str, list[T]]]:
+    """Yield each quantity with the results of ``look`` for its fields; omit optional quantities with a missing field.
+
+    Raises:
+        LogError: A field of another quantity is missing.
+    """
+    for what, names in request.items():
+        try:
+            fields = [first_of(name, look) for name in names]
+        except LogError:
+            if what not in optional:
+                raise
+        else:
+            yield what, fields
 
 
 def sign_of(name: str) -> float:

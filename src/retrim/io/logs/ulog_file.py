@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import LogError
-from .series import Clock, Series, first_of, missing_field, sign_of
+from .series import Clock, Series, find_fields, missing_field, sign_of
 
 MICROSECOND = 1e-6
 
@@ -37,19 +37,13 @@ def read_ulog(
         dropout_s = sum(each.duration for each in log.dropouts) / 1000.0
         notes.append(f"the logger dropped out {len(log.dropouts)} times, for {dropout_s:.2f} s in all")
     result = dict[str, Series]()
-    for what, fields in request.items():
-        try:
-            parts = [first_of(name, lambda each: _field(path, each, topics)) for name in fields]
-        except LogError:
-            if what not in optional:
-                raise
-            continue
+    for what, parts in find_fields(request, lambda each: _field(path, each, topics), optional):
         if len({id(topic) for topic, _ in parts}) > 1:
-            raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(fields)}")
+            raise LogError(f"{path}: the fields of {what} come from several topics: {', '.join(request[what])}")
         topic = parts[0][0]
         columns = [
             sign_of(name) * topic.data[key].astype(float)
-            for name, (_, keys) in zip(fields, parts, strict=True)
+            for name, (_, keys) in zip(request[what], parts, strict=True)
             for key in keys
         ]
         result[what] = Series(_times(path, topic, time), np.stack(columns, axis=1))
