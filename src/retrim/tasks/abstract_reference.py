@@ -31,6 +31,12 @@ class Point(NamedTuple):
     heading_rate: Float[Array, ""]
     """Heading rate [rad/s]."""
 
+    @classmethod
+    def of(cls, p: Array, v: Array, a: Array, jerk: Array, heading: Array, heading_rate: Array) -> "Point":
+        """Return the point with the command that a point mass needs; the arguments are the fields of these names."""
+        thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
+        return cls(p, v, flat_command(thrust, jerk, heading, heading_rate), heading, a, jerk, heading_rate)
+
 
 class AbstractReference(eqx.Module):
     """A trajectory to track."""
@@ -96,10 +102,8 @@ class TurnedReference(AbstractReference):
     def __call__(self, t: Float[Array, ""]) -> Point:
         """Return the rotated and scaled reference at ``t``; headings are about the frame's vertical."""
         here, vector = self.reference(t), self.frame.vector
-        a, jerk = vector(here.a), vector(here.jerk)
-        thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
-        u = flat_command(thrust, jerk, here.heading, here.heading_rate)
-        return Point(vector(here.p), vector(here.v), u, here.heading, a, jerk, here.heading_rate)
+        p, v, a, jerk = (vector(field) for field in (here.p, here.v, here.a, here.jerk))
+        return Point.of(p, v, a, jerk, here.heading, here.heading_rate)
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
         """Return the cross-track error, measured in the frame [m]."""

@@ -14,9 +14,8 @@ from ..errors import FrameError
 from ..physics.actuator_response import ActuatorState
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import PathBelief
-from ..physics.state import STANDARD_GRAVITY, Command, State
+from ..physics.state import Command, State
 from .abstract_reference import Point
-from .flatness import flat_command
 from .hover import AbstractHover
 from .observation import AbstractObservation
 from .task import AbstractTask, Start
@@ -112,8 +111,7 @@ class MovingGoal(AbstractTask):
 
         a, jerk = jax.jvp(acceleration, (t,), (one,))
         none = jnp.zeros_like(t)
-        thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
-        return Point(self.target(t), velocity(t), flat_command(thrust, jerk, none, none), none, a, jerk, none)
+        return Point.of(self.target(t), velocity(t), a, jerk, none, none)
 
     def reset(self, key: Key[Array, ""]) -> Start:
         """Draw a time, and a start of the hover task relative to the goal at that time."""

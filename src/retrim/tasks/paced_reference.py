@@ -9,9 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics.effective_gravity import EffectiveGravityFrame
-from ..physics.state import STANDARD_GRAVITY
 from .abstract_reference import AbstractReference, Point, TurnedReference
-from .flatness import flat_command
 from .reference import Reference
 from .shifted_reference import ShiftedReference
 
@@ -110,10 +108,7 @@ def at_pace(here: Point, pace: Float[Array, ""], change: Float[Array, ""]) -> Po
     v = pace * here.v
     a = pace * pace * here.a + change * here.v
     jerk = pace * pace * pace * here.jerk + 3.0 * pace * change * here.a
-    heading_rate = pace * here.heading_rate
-    thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
-    u = flat_command(thrust, jerk, here.heading, heading_rate)
-    return Point(here.p, v, u, here.heading, a, jerk, heading_rate)
+    return Point.of(here.p, v, a, jerk, here.heading, pace * here.heading_rate)
 
 
 def set_clock(tree: Any, clock: Clock) -> Any:

@@ -9,9 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..physics.effective_gravity import EffectiveGravityFrame
-from ..physics.state import STANDARD_GRAVITY
 from .abstract_reference import AbstractReference, Point, TurnedReference
-from .flatness import flat_command
 from .reference import Reference
 
 HARMONICS = 10
@@ -44,10 +42,7 @@ class ShiftedReference(AbstractReference):
         here = self.reference(t)
         own = (here.p, here.v, here.a, here.jerk)
         p, v, a, jerk = (part + self.shift @ basis(self.lap, t, order) for order, part in enumerate(own))
-        thrust = a + jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=a.dtype)
-        return Point(
-            p, v, flat_command(thrust, jerk, here.heading, here.heading_rate), here.heading, a, jerk, here.heading_rate
-        )
+        return Point.of(p, v, a, jerk, here.heading, here.heading_rate)
 
     def distance(self, p: Float[Array, "3"]) -> Float[Array, ""]:
         """Return the cross-track error with respect to the path without the shift [m]."""

@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..physics.effective_gravity import EffectiveGravityFrame
-from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import Vehicle
 from .abstract_reference import AbstractReference, Point, TurnedReference
 from .feasibility import beyond_limits
-from .flatness import FULL_TURN, flat_command
+from .flatness import FULL_TURN
 from .reference import Reference
 
 LEAD_TIME = 1.0  # [s], duration of the old reference in the table of a transition
@@ -126,16 +125,7 @@ def _mix(
         moving_a = before.a + s * a + 2.0 * s1 * v + s2 * p
         jerk = before.jerk + s * (after.jerk - before.jerk) + 3.0 * s1 * a + 3.0 * s2 * v + s3 * p
         heading, heading_rate = before.heading + s * turn, before.heading_rate + s * rate + s1 * turn
-        up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype=moving_a.dtype)
-        point = Point(
-            before.p + s * p,
-            before.v + s * v + s1 * p,
-            flat_command(moving_a + up, jerk, heading, heading_rate),
-            heading,
-            moving_a,
-            jerk,
-            heading_rate,
-        )
+        point = Point.of(before.p + s * p, before.v + s * v + s1 * p, moving_a, jerk, heading, heading_rate)
         return jnp.concatenate([leaf.reshape(-1) for leaf in point])
 
     return jax.vmap(row)(times, first, last)
