@@ -78,10 +78,6 @@ class BetaflightPlant(VehiclePlant):
         world.tell(self._throttle(STANDARD_GRAVITY), np.zeros(3))
         self.until(lambda: False, SPIN_UP_S, keep_on)
 
-    def hold(self, until: float) -> None:
-        """Leave the vehicle on the stand."""
-        self.wait(until)
-
     def read(self) -> VehicleState:
         """Return the vehicle's state."""
         world = self._running()

@@ -111,10 +111,6 @@ class CrazyfliePlant(LinkedPlant[CrazyflieLink]):
         self.thrust.learn(link.thrusts)
         self._guardian = link.guard(landing_orders(self._floor, float(place[2]) - self._floor))
 
-    def hold(self, until: float) -> None:
-        """Hold the take-off position using the Crazyflie's commander."""
-        self.link.pump(until)
-
     def read(self) -> VehicleState:
         """Return the newest logged state."""
         link = self.link

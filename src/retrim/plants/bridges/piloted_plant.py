@@ -72,10 +72,6 @@ class PilotedPlant(LinkedPlant[L]):
                 f"{x.p.round(2).tolist()} m, {math.degrees(heading_of(x.R)):.0f} deg"
             )
 
-    def hold(self, until: float) -> None:
-        """Let the other pilot hold the vehicle's position."""
-        self.wait(until)
-
     def read(self) -> VehicleState:
         """Return the newest state."""
         now, link = time.monotonic(), self.link

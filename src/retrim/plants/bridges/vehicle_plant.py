@@ -85,9 +85,9 @@ class VehiclePlant(Plant, abc.ABC):
             PlantError: The link is lost, or another pilot has taken over.
         """
 
-    @abc.abstractmethod
     def hold(self, until: float) -> None:
-        """Let the autopilot hold the take-off position until an instant on the monotonic clock [s]."""
+        """Let the autopilot or pilot hold the take-off position until an instant on the monotonic clock [s]."""
+        self.wait(until)
 
     @abc.abstractmethod
     def transmit(self, u: np.ndarray) -> np.ndarray:
