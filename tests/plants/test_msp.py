@@ -271,7 +271,7 @@ def make(monkeypatch):
         monkeypatch.setattr(msp_plant, "HOVER_S", 0.8)
         limit = np.array([30.0, 10.0, 10.0, 4.0])
         low = np.array([0.0, *-limit[1:]])
-        plant = MspPlant("tcp:127.0.0.1:1,pose=/p", 0.02, low, limit, 40.0, vehicle())
+        plant = MspPlant("tcp:127.0.0.1:1,pose=/p", 0.02, low, limit, vehicle())
         open_boards.append((plant, board))
         return plant, board, states
 

@@ -76,9 +76,7 @@ class MspPlant(PilotedPlant[MspLink]):
     this process ends or is silent.
     """
 
-    def __init__(
-        self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float, vehicle: Vehicle
-    ) -> None:
+    def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, vehicle: Vehicle) -> None:
         """Build a plant; it opens the port when it connects.
 
         Args:
@@ -86,14 +84,13 @@ class MspPlant(PilotedPlant[MspLink]):
             dt: Control period [s].
             low: Smallest command [c, omega].
             high: Largest command [c, omega].
-            strongest: Total thrust per mass at full throttle [m/s^2].
             vehicle: Vehicle whose motors determine the shape of the thrust curve.
 
         Raises:
             ConfigError: The address is invalid.
         """
         self._where, self._vehicle = msp_address_of(address), vehicle
-        super().__init__(f"msp:{address}", dt, low, high, strongest)
+        super().__init__(f"msp:{address}", dt, low, high)
         fence = np.full(3, 1e3)
         self._limits = Limits(-fence, fence, low, high)
         self._curve: ThrustCurve | None = None
@@ -284,9 +281,7 @@ class MspPlant(PilotedPlant[MspLink]):
 
 
 def _make(request: PlantRequest) -> MspPlant:
-    vehicle = request.vehicle
-    strongest = float(vehicle.thrust_max / vehicle.mass)
-    return MspPlant(request.address, request.dt, *request.limits, strongest, vehicle)
+    return MspPlant(request.address, request.dt, *request.limits, request.vehicle)
 
 
 entry = PlantEntry(

@@ -35,24 +35,8 @@ class PilotedPlant(LinkedPlant[L]):
     """A vehicle that is handed over.
 
     The other pilot (mavros, or a flight stack's pilot) takes off, flies the vehicle to the start, and follows our
-    targets while they are published. The other pilot takes back control when the targets stop. Thrust per mass is
-    converted to a share of the motors' thrust using the vehicle's mass and largest thrust; adaptation compensates for
-    errors in these values.
+    targets while they are published. The other pilot takes back control when the targets stop.
     """
-
-    def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
-        """Build a plant.
-
-        Args:
-            address: Address of the vehicle, for error messages.
-            dt: Control period [s].
-            low: Smallest command [c, omega].
-            high: Largest command [c, omega].
-            strongest: Total thrust per mass with all motors at full throttle [m/s^2].
-        """
-        super().__init__(address, dt, low, high)
-        self.strongest = strongest
-        """Total thrust per mass at full throttle [m/s^2]."""
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Wait until another pilot has flown the vehicle to the start and the vehicle stays there."""
@@ -78,12 +62,6 @@ class PilotedPlant(LinkedPlant[L]):
         if now - link.last_message > LOST_S:
             raise PlantError(f"no state has come for {LOST_S:g} s; the other pilot has control again")
         return self.reading().at(now)
-
-    def transmit(self, u: np.ndarray) -> np.ndarray:
-        """Publish a target."""
-        thrust = float(np.clip(u[0] / self.strongest, 0.0, 1.0))
-        self.link.fly_rates(thrust, u[1:])
-        return np.concatenate([[thrust * self.strongest], u[1:]])
 
     def wait(self, until: float) -> None:
         """Wait; messages are received in other threads."""

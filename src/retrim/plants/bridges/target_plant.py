@@ -31,11 +31,28 @@ L = TypeVar("L", bound=GuardedLink)
 class TargetPlant(PilotedPlant[L]):
     """A vehicle behind ROS.
 
+    Thrust per mass is converted to a share of the motors' thrust using the vehicle's mass and largest thrust;
+    adaptation compensates for errors in these values.
+
     Some stacks hold the last target for ever. A guardian therefore publishes a level one when the link ends or is
     silent, and at the end of a flight.
     """
 
     _guardian: TargetGuardian | None = None
+
+    def __init__(self, address: str, dt: float, low: np.ndarray, high: np.ndarray, strongest: float) -> None:
+        """Build a plant.
+
+        Args:
+            address: Address of the vehicle, for error messages.
+            dt: Control period [s].
+            low: Smallest command [c, omega].
+            high: Largest command [c, omega].
+            strongest: Total thrust per mass with all motors at full throttle [m/s^2].
+        """
+        super().__init__(address, dt, low, high)
+        self.strongest = strongest
+        """Total thrust per mass at full throttle [m/s^2]."""
 
     def take_off(self, p: np.ndarray | None, yaw: float | None, keep_on: KeepOn = lambda: True) -> None:
         """Wait until another pilot has flown the vehicle to the start, and start the guardian there."""
@@ -50,10 +67,11 @@ class TargetPlant(PilotedPlant[L]):
 
     def transmit(self, u: np.ndarray) -> np.ndarray:
         """Publish a target."""
-        result = super().transmit(u)
+        thrust = float(np.clip(u[0] / self.strongest, 0.0, 1.0))
+        self.link.fly_rates(thrust, u[1:])
         if self._guardian is not None:
             self._guardian.feed()
-        return result
+        return np.concatenate([[thrust * self.strongest], u[1:]])
 
     def land(self) -> None:
         """Stop publishing, so the other pilot takes back control; the last target is a level one."""
