@@ -13,10 +13,10 @@ import pytest
 from jax import random
 
 from helpers import tiny_preset
+from odd_plant import OddPlant
 from retrim.adapt import PolicyUpdate, Rejection, ResidualUpdate, ResidualWorker, Skip
-from retrim.config import Scenario, Setup, changed
+from retrim.config import Setup, changed
 from retrim.physics import Command
-from retrim.plants import Plant
 from retrim.runtime import AdaptivePilot, Learner, LockstepLearner, ScheduledLearner, fly, lockstep
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
@@ -55,40 +55,16 @@ def reschedule(setup, **adapt):
     return dataclasses.replace(setup, preset=changed(setup.preset, adapt=adapt))
 
 
-class OddPlant(Plant):
-    """The simple plant with a shifted clock, with limited commands, or with three ticks in one step at ``stalls``."""
-
-    def __init__(self, disturbance="large", *, clock=0.0, limit=None, stalls=(), sensors="ideal"):
-        self._inner = Scenario(disturbance, "simple", sensors=sensors).make()
-        self._clock, self._limit, self._stalls, self._steps = clock, limit, stalls, 0
-        self.dt = self._inner.dt
-
-    def reset(self, x0):
-        self._steps = 0
-        return self._shown(self._inner.reset(x0))
-
-    def step(self, u):
-        u = u if self._limit is None else self._limit(u)
-        for _ in range(3 if self._steps in self._stalls else 1):
-            measurement, _ = self._inner.step(u)
-        self._steps += 1
-        return self._shown(measurement), u
-
-    def stop(self):
-        self._inner.stop()
-
-    def _shown(self, measurement):
-        return measurement._replace(t=self._clock + measurement.t)
-
-
 def flight(setup, policy, seconds, plant=None, **options):
     pilot = setup.adaptive_pilot(policy, random.key(3), **options)
-    log = fly(plant or OddPlant(), pilot, setup.flight_starts(1)[0], ticks=round(seconds / setup.preset.dt))
+    log = fly(plant or OddPlant("large"), pilot, setup.flight_starts(1)[0], ticks=round(seconds / setup.preset.dt))
     return log, pilot
 
 
 def plain_flight(setup, policy, seconds):
-    return fly(OddPlant(), setup.pilot(policy), setup.flight_starts(1)[0], ticks=round(seconds / setup.preset.dt))
+    return fly(
+        OddPlant("large"), setup.pilot(policy), setup.flight_starts(1)[0], ticks=round(seconds / setup.preset.dt)
+    )
 
 
 def times(log, *kinds):
@@ -149,7 +125,7 @@ def test_updates_are_applied_in_order_and_sent_to_all_learners(trained_policy):
     one = QueueLearner([(8, updates[0]), (8, updates[1]), (8, updates[2]), (15, updates[4])])
     other = QueueLearner([(8, updates[3])])
     pilot = queue_pilot(setup, policy, one, other)
-    log = fly(OddPlant(), pilot, setup.flight_starts(1)[0], ticks=20)
+    log = fly(OddPlant("large"), pilot, setup.flight_starts(1)[0], ticks=20)
     assert [id(u) for u in one.updates] == [id(u) for u in updates]
     assert [id(u) for u in other.updates] == [id(u) for u in updates]
     assert [e.kind for e in log.events] == ["residual", "policy", "rejected", "policy", "skipped"]
@@ -161,7 +137,7 @@ def test_updates_are_applied_in_order_and_sent_to_all_learners(trained_policy):
     np.testing.assert_array_equal(log.u[:9], plain.u[:9])
     assert not np.array_equal(log.u[9], plain.u[9])
     controller = setup.pilot(second.policy)
-    with OddPlant() as plant:
+    with OddPlant("large") as plant:
         measurement = plant.reset(setup.flight_starts(1)[0])
         controller.reset(measurement)
         for k in range(9):
@@ -177,7 +153,7 @@ def test_learners_receive_windows_on_schedule_and_are_reset(trained_policy):
     one, other = QueueLearner(), QueueLearner()
     pilot = queue_pilot(setup, policy, one, other)
     for flights in (1, 2):
-        log = fly(OddPlant(clock=37.0 * flights), pilot, setup.flight_starts(1)[0], ticks=18)
+        log = fly(OddPlant("large", clock=37.0 * flights), pilot, setup.flight_starts(1)[0], ticks=18)
         assert (one.resets, other.resets) == (flights, flights)
         assert [tick for tick, _ in one.windows] == [5, 10, 15] * flights
         tick, window = one.windows[-2]
@@ -198,13 +174,13 @@ def test_immediate_answer_is_published_in_same_tick(trained_policy):
             super().submit(window, tick)
             self._answers.append((tick, Skip(float(window.t[-1]), "policy")))
 
-    log = fly(OddPlant(), queue_pilot(setup, policy, BusyLearner()), setup.flight_starts(1)[0], ticks=12)
+    log = fly(OddPlant("large"), queue_pilot(setup, policy, BusyLearner()), setup.flight_starts(1)[0], ticks=12)
     np.testing.assert_allclose(times(log, "skipped"), [0.1, 0.2])
 
 
 def test_pilot_without_learners_flies_policy(trained_policy):
     setup, policy = trained_policy
-    log = fly(OddPlant(), queue_pilot(setup, policy), setup.flight_starts(1)[0], ticks=20)
+    log = fly(OddPlant("large"), queue_pilot(setup, policy), setup.flight_starts(1)[0], ticks=20)
     np.testing.assert_array_equal(log.u, plain_flight(setup, policy, 0.4).u)
     assert log.events == ()
 
@@ -214,7 +190,7 @@ def test_windows_have_measured_states_and_accepted_commands(trained_policy):
     setup, policy = trained_policy
     learner = QueueLearner()
     limit = lambda u: Command(jnp.clip(u.c, 9.6, 9.9), jnp.clip(u.omega, -0.05, 0.05))  # noqa: E731
-    plant = OddPlant(limit=limit, sensors="rough")
+    plant = OddPlant("large", limit=limit, sensors="rough")
     log = fly(plant, queue_pilot(setup, policy, learner), setup.flight_starts(1)[0], ticks=16)
     tick, window = learner.windows[-1]
     expected = log.window(12, end=tick + 1)
@@ -259,7 +235,7 @@ def test_commands_are_those_of_old_policy_until_swap(trained_policy, sample_flig
 
 def test_flight_is_independent_of_clock_origin(trained_policy, sample_flight):
     here, _ = sample_flight
-    there, _ = flight(*trained_policy, 3.2, OddPlant(clock=1.7e9))
+    there, _ = flight(*trained_policy, 3.2, OddPlant("large", clock=1.7e9))
     assert there.t[0] == 0.0
     np.testing.assert_allclose(there.t, here.t, atol=1e-6)
     np.testing.assert_array_equal(there.u, here.u)
@@ -289,10 +265,10 @@ def test_many_cycles_need_one_compilation(trained_policy):
     """New weights, optimiser states, windows and keys need no new compilation."""
     setup, policy = trained_policy
     pilot = setup.adaptive_pilot(policy, random.key(3))
-    fly(OddPlant(), pilot, setup.flight_starts(1)[0], ticks=60)
+    fly(OddPlant("large"), pilot, setup.flight_starts(1)[0], ticks=60)
     program = len(TRACES)
     assert program > 0
-    log = fly(OddPlant(), pilot, setup.flight_starts(1)[0], ticks=250)
+    log = fly(OddPlant("large"), pilot, setup.flight_starts(1)[0], ticks=250)
     assert len(times(log, "policy", "rejected")) >= 4
     assert len(TRACES) == program
 
@@ -331,11 +307,11 @@ def test_second_flight_keeps_learner_state_and_clears_window(trained_policy):
     log, pilot = flight(setup, policy, 1.5)
     learner_state = pilot.state
     assert times(log, "policy", "residual")
-    again = fly(OddPlant(), pilot, setup.flight_starts(1)[0], ticks=10)
+    again = fly(OddPlant("large"), pilot, setup.flight_starts(1)[0], ticks=10)
     assert again.events == ()
     jax.tree.map(np.testing.assert_array_equal, pilot.state, learner_state)
     # The adapted policy is active from the first tick on.
-    fresh = fly(OddPlant(), setup.pilot(learner_state.policy.policy), setup.flight_starts(1)[0], ticks=10)
+    fresh = fly(OddPlant("large"), setup.pilot(learner_state.policy.policy), setup.flight_starts(1)[0], ticks=10)
     np.testing.assert_array_equal(again.u, fresh.u)
 
 
@@ -344,8 +320,8 @@ def test_flight_continues_from_learner_state(trained_policy):
     _, pilot = flight(setup, policy, 1.5)
     resumed_pilot = setup.adaptive_pilot(policy, random.key(3), state=pilot.state)
     jax.tree.map(np.testing.assert_array_equal, resumed_pilot.state, pilot.state)
-    log = fly(OddPlant(), resumed_pilot, setup.flight_starts(1)[0], ticks=10)
-    fresh = fly(OddPlant(), setup.pilot(pilot.state.policy.policy), setup.flight_starts(1)[0], ticks=10)
+    log = fly(OddPlant("large"), resumed_pilot, setup.flight_starts(1)[0], ticks=10)
+    fresh = fly(OddPlant("large"), setup.pilot(pilot.state.policy.policy), setup.flight_starts(1)[0], ticks=10)
     np.testing.assert_array_equal(log.u, fresh.u)
 
 
@@ -370,7 +346,7 @@ def test_missed_ticks_keep_schedule_and_do_not_bias_fit(trained_policy):
         worker = RecordingWorker(setup.learner, state)
         learner = LockstepLearner(worker, 0.1, 0.02)
         pilot = AdaptivePilot(setup.controller, state, [ScheduledLearner(learner, 0.6)], dt=0.02, window=100)
-        log = fly(OddPlant(stalls=stalls), pilot, setup.flight_starts(1)[0], ticks=160)
+        log = fly(OddPlant("large", stalls=stalls), pilot, setup.flight_starts(1)[0], ticks=160)
         assert log.missed_ticks == 2 * sum(s < len(log.t) - 1 for s in stalls)
         return log, [update.rms_error for update in worker.updates]
 
