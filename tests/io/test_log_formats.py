@@ -1,13 +1,13 @@
 """The same flight from every format: bags of ROS 1 and 2, MCAP, NPZ, and a ULog written byte by byte."""
 
 import contextlib
-import struct
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fake_log import G, fly_once, turned_frames
+from fake_bytes import px4_topics, ulog
+from fake_log import G, fly_once
 from retrim.errors import LogError, RetrimError
 from retrim.io.logs import read_flight_log, read_map
 from retrim.io.logs.recording import Recording, write_mcap, write_npz
@@ -159,40 +159,18 @@ def read_map_with(folder, position):
     return read_map(folder / "other.toml")
 
 
-def ulog(flight):
-    """Return a ULog in PX4's form: NED, forward-right-down, each topic at its own rate."""
-    ned = turned_frames(flight)
-    q = np.roll(Rotation.from_matrix(ned.R).as_quat(), 1, axis=1)
-    thrust = -0.5 * flight.c / G[2]
-    topics = [
-        ("vehicle_local_position", "uint64_t timestamp_sample;float x;float y;float z;float vx;float vy;float vz",
-         np.concatenate([ned.p, ned.v], axis=1), 1),
-        ("vehicle_attitude", "uint64_t timestamp_sample;float[4] q", q, 1),
-        ("vehicle_rates_setpoint", "float roll;float pitch;float yaw;float[3] thrust_body",
-         np.concatenate([ned.omega, 0 * ned.p[:, :2], thrust[:, None]], axis=1), 1),
-        ("vehicle_angular_velocity", "uint64_t timestamp_sample;float[3] xyz", ned.omega, 1),
-    ]  # fmt: skip
-
-    def message(kind, data):
-        return struct.pack("<HB", len(data), ord(kind)) + data
-
-    out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
-    out += [message("F", f"{name}:uint64_t timestamp;{fields};".encode()) for name, fields, _, _ in topics]
-    out += [message("A", struct.pack("<BH", 0, i) + name.encode()) for i, (name, _, _, _) in enumerate(topics)]
-    for k, t in enumerate(flight.t):
-        stamp = round(1e6 * (t + 3.0))
-        for i, (_, fields, values, _) in enumerate(topics):
-            head = struct.pack("<HQ", i, stamp + 700) + struct.pack("<Q", stamp) * ("timestamp_sample" in fields)
-            if i == 2:
-                head = struct.pack("<HQ", i, stamp)
-            out.append(message("D", head + values[k].astype("<f4").tobytes()))
-    return b"".join(out)
+def px4_ulog(flight):
+    """Return a ULog of PX4, whose states have sample times and arrive 0.7 ms later."""
+    topics, stamps = px4_topics(flight)
+    states = topics.keys() - {"vehicle_rates_setpoint"}
+    topics |= {name: {"timestamp_sample": ("uint64_t", stamps), **topics[name]} for name in states}
+    return ulog(topics, {name: stamps + 700 * (name in states) for name in topics})
 
 
 def test_px4_ulog(tmp_path):
     pytest.importorskip("pyulog")
     path = tmp_path / "flight.ulg"
-    path.write_bytes(ulog(FLIGHT))
+    path.write_bytes(px4_ulog(FLIGHT))
     log = read_flight_log(path)
     assert_agrees(log, 1e-2)
     np.testing.assert_allclose(log.rates, FLIGHT.omega, atol=1e-5)
@@ -201,7 +179,7 @@ def test_px4_ulog(tmp_path):
 
 def test_damaged_ulog_gives_flight_or_one_line(tmp_path):
     pytest.importorskip("pyulog")
-    whole, rng = ulog(FLIGHT), np.random.default_rng(0)
+    whole, rng = px4_ulog(FLIGHT), np.random.default_rng(0)
     path = tmp_path / "flight.ulg"
     for k in range(25):
         data = bytearray(whole[: int(rng.integers(20, len(whole)))])
