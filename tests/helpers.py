@@ -134,6 +134,18 @@ def at(reference, times):
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(times)], *result)
 
 
+def check_slope(cost, inputs, key, *, h, rel):
+    """Compare the gradient of a compiled function with differences in random directions, and return the gradient."""
+    slope = jax.grad(cost)(inputs)
+    leaves, shape = jax.tree.flatten(inputs)
+    for k in random.split(key, 4):
+        way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
+        ahead, behind = (cost(shape.unflatten([a + s * d for a, d in zip(leaves, way, strict=True)])) for s in (h, -h))
+        expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), way, strict=True))
+        np.testing.assert_allclose((ahead - behind) / (2.0 * h), expected, rtol=rel, atol=1e-8)
+    return slope
+
+
 def stack_trees(trees):
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *trees)
 

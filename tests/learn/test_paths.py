@@ -8,7 +8,7 @@ import optax
 import pytest
 from jax import random
 
-from helpers import first_order, hover_env, hover_task, random_command, stack_trees
+from helpers import check_slope, first_order, hover_env, hover_task, random_command, stack_trees
 from retrim.control import Policy
 from retrim.learn import Env, PolicyState, rollout
 from retrim.learn.bptt import bptt
@@ -107,16 +107,7 @@ def test_path_gradient_equals_finite_differences(key):
     env = hover_env(LaggedModel(PointMass(DT), first_order(0.03)), horizon=10)
     policy, start = policy_of(key), env.task.reset(key)
     cost = jax.jit(lambda path: jnp.sum(rollout(env.with_path(path), policy, start).reward))
-    path = PATHS[2]
-    slope = jax.grad(cost)(path)
-    leaves, shape = jax.tree.flatten(path)
-    for k in random.split(key, 3):
-        way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
-        way = shape.unflatten([0.01 * each for each in way])
-        h = 1e-4
-        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, path, way)) for s in (h, -h))
-        expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
-        assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-4)
+    check_slope(cost, PATHS[2], key, h=1e-6, rel=1e-4)
 
 
 @pytest.mark.parametrize("wrap", [lambda model: model, lambda model: Hybrid(model, lambda x, u: STILL)])

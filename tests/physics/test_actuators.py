@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import GOAL, first_order, random_command, random_state, replace_fields, residual_targets, stack_trees
+from helpers import (
+    GOAL,
+    check_slope,
+    first_order,
+    random_command,
+    random_state,
+    replace_fields,
+    residual_targets,
+    stack_trees,
+)
 from retrim.learn import Window
 from retrim.physics import ActuatorState, Command, Hybrid, LaggedModel, PointMass, State, StraightThrough, f_a, so3
 from retrim.physics.actuators import LagState
@@ -121,16 +130,7 @@ def test_gradients_equal_finite_differences(key):
             s = model.step(s, jax.tree.map(lambda leaf, k=k: leaf[k], us), STILL)
         return jnp.sum(weights * s.inner.vector())
 
-    mixture = jax.jit(mixture)
-    slope = jax.grad(mixture)(start)
-    leaves, shape = jax.tree.flatten(start)
-    for k in random.split(kd, 4):
-        way = shape.unflatten([random.normal(kk, l.shape) for kk, l in zip(random.split(k, 6), leaves, strict=True)])
-        way = (way[0], way[1], 0.01 * way[2])
-        h = 1e-6
-        ahead, behind = (mixture(jax.tree.map(lambda a, d, s=s: a + s * d, start, way)) for s in (h, -h))
-        expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
-        assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-5)
+    slope = check_slope(jax.jit(mixture), start, kd, h=1e-6, rel=1e-5)
     assert float(jnp.abs(slope[2])) > 1e-3  # tau has an effect
 
 

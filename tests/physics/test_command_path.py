@@ -11,7 +11,7 @@ import pytest
 from jax import lax, random
 from scipy.linalg import expm
 
-from helpers import random_command, stack_trees
+from helpers import check_slope, random_command, stack_trees
 from retrim.physics import ActuatorResponse, ActuatorState, Command, CommandPath, CommandQueue
 from retrim.physics.command_path import queue_length, whole_steps
 
@@ -222,15 +222,7 @@ def test_gradients_equal_finite_differences(kappa, key):
     response = ActuatorResponse.of(0.05, jnp.array([0.03, 0.06, 0.2]), inverse_damping=kappa, thrust_gain=1.1)
     arguments = (CommandPath.of(0.033, response), commands(key, 8), random_command(random.key(5)))
     cost = jax.jit(lambda arguments: mixture(*arguments, jnp.array([0.7])))
-    slope = jax.grad(cost)(arguments)
-    leaves, shape = jax.tree.flatten(arguments)
-    for k in random.split(key, 5):
-        way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
-        way = shape.unflatten([0.02 * each for each in way])
-        h = 1e-5
-        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, arguments, way)) for s in (h, -h))
-        expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
-        assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-5, abs=1e-8)
+    slope = check_slope(cost, arguments, key, h=2e-7, rel=1e-5)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
     assert abs(float(slope[0].delay)) > 1e-3
     assert float(jnp.abs(slope[0].response.inverse_damping).min()) > 1e-6

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax, random
 
-from helpers import random_command, stack_trees
+from helpers import check_slope, random_command, stack_trees
 from retrim import testing
 from retrim.config import Scenario, VehicleSpec
 from retrim.learn.stacking import stack
@@ -183,16 +183,7 @@ def test_gradients_equal_finite_differences():
         x, rates = fly(dataclasses.replace(simulation, delay=delay, model=vehicle), us)
         return jnp.sum(x.p[-1] + 0.3 * x.v[-1] + 0.1 * rates[-1]) + jnp.sum(x.R[-1, 2])
 
-    cost = jax.jit(cost)
-    slope = jax.grad(cost)(arguments)
-    leaves, shape = jax.tree.flatten(arguments)
-    for k in random.split(random.key(3), 4):
-        way = [random.normal(kk, leaf.shape) for kk, leaf in zip(random.split(k, len(leaves)), leaves, strict=True)]
-        way = shape.unflatten([0.01 * each for each in way])
-        h = 1e-3
-        ahead, behind = (cost(jax.tree.map(lambda a, d, s=s: a + s * d, arguments, way)) for s in (h, -h))
-        expected = sum(float(jnp.sum(a * b)) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
-        assert expected == pytest.approx(float((ahead - behind) / (2.0 * h)), rel=1e-4)
+    slope = check_slope(jax.jit(cost), arguments, random.key(3), h=1e-5, rel=1e-4)
     assert abs(float(slope[0])) > 1e-3
 
 
