@@ -21,6 +21,8 @@ from retrim.transport.shared_memory import SharedMemoryBus
 
 DT = 0.02
 HOME = np.array([0.0, 0.0, 1.0])
+PAGE_TOPICS = ("sample", "status", "setpoint", "fallback", "knobs", "wish", "followed", "ended", "world",
+               "learner.residual", "learner.policy", "ready.page", "refusals.page")  # fmt: skip
 
 
 def level(p=HOME, *, x=0.0) -> np.ndarray:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from live_processes import DT, HOME, level
+from live_processes import DT, HOME, PAGE_TOPICS, level
 from retrim.errors import ConfigError
 from retrim.live.operator.manual_disturbance import ManualDisturbance
 from retrim.live.operator.page import PagePlan, _Page, free_port
@@ -24,21 +24,6 @@ from retrim.physics import so3
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.shared_memory import SharedMemoryBus
 
-SMALL = (
-    "sample",
-    "status",
-    "setpoint",
-    "fallback",
-    "knobs",
-    "wish",
-    "followed",
-    "ended",
-    "world",
-    "learner.residual",
-    "learner.policy",
-    "ready.page",
-    "refusals.page",
-)
 BROWSER = shutil.which("chromium")
 DRAWING = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
            "--disable-background-networking", "--disable-component-update", "--no-first-run")  # fmt: skip
@@ -68,7 +53,7 @@ def test_quaternion_equals_rotation_matrix(vector):
 def flight(tmp_path):
     """Return a bus and the address of a page."""
     pytest.importorskip("viser")
-    bus = SharedMemoryBus.create(dict.fromkeys(SMALL, 65536))
+    bus = SharedMemoryBus.create(dict.fromkeys(PAGE_TOPICS, 65536))
     port = free_port("127.0.0.1", 18080)
     paths = {"circle": HOME[None] + np.eye(3), "figure8": HOME[None] - np.eye(3)}
     spec = PageSpec("127.0.0.1", port, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19, paths)
@@ -95,7 +80,7 @@ def hover(bus, seconds, until=lambda: False):
 
 def test_page_shows_present_source_of_commands(monkeypatch):
     pytest.importorskip("viser")
-    bus, texts = InProcessBus(dict.fromkeys(SMALL, 65536)), []
+    bus, texts = InProcessBus(dict.fromkeys(PAGE_TOPICS, 65536)), []
     page = _Page(PageSpec("", 0, "hover", HOME[None].repeat(2, 0), (), 0.06, 0.19), bus, MagicMock())
     monkeypatch.setattr(page._panel, "show", texts.append)
     bus.publish("status", pack_note("status", mode="policy", error=0.0, missed=0))

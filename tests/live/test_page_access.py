@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from live_processes import HOME
+from live_processes import HOME, PAGE_TOPICS
 from retrim.errors import ConfigError, PlantError
 from retrim.live.operator.page import PagePlan, free_port
 from retrim.live.operator.page_access import only_for, page_url, refusal
@@ -17,8 +17,6 @@ from retrim.live.spec import PageSpec
 from retrim.onboard.launch import launch
 from retrim.transport.shared_memory import SharedMemoryBus
 
-TOPICS = ("sample", "status", "setpoint", "fallback", "knobs", "wish", "followed", "ended", "world",
-          "learner.residual", "learner.policy", "ready.page", "refusals.page")  # fmt: skip
 WITHIN = 60.0  # [s]
 
 
@@ -26,7 +24,7 @@ WITHIN = 60.0  # [s]
 def page(tmp_path_factory):
     """Return the port, the token and the protocol of a page that listens."""
     viser = pytest.importorskip("viser")
-    bus = SharedMemoryBus.create(dict.fromkeys(TOPICS, 65536))
+    bus = SharedMemoryBus.create(dict.fromkeys(PAGE_TOPICS, 65536))
     spec = PageSpec("127.0.0.1", free_port("127.0.0.1", 18280), "hover", HOME[None].repeat(2, 0), (), 0.06, 0.19)
     log = tmp_path_factory.mktemp("page") / "page.log"
     process = launch("retrim.live.operator.page:show", PagePlan(bus.folder, spec, os.getpid()), log)

@@ -10,7 +10,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from live_processes import HOME, level
+from live_processes import HOME, PAGE_TOPICS, level
 from retrim.live.operator.manual_disturbance import ManualDisturbance
 from retrim.live.operator.page import _Page, free_port
 from retrim.live.operator.page_input import take_values_only
@@ -21,8 +21,6 @@ from retrim.onboard.note_fields import FIELDS
 from retrim.transport.in_process import InProcessBus
 from retrim.transport.message import pack_arrays
 
-TOPICS = ("sample", "status", "setpoint", "fallback", "knobs", "wish", "followed", "ended", "world",
-          "learner.residual", "learner.policy", "ready.page", "refusals.page")  # fmt: skip
 PATHS = {"circle": HOME[None] + np.eye(3), "figure8": HOME[None] - np.eye(3)}
 SPEC = PageSpec("127.0.0.1", 18380, "hover", HOME[None].repeat(2, 0), ("full", "lora"), 0.06, 0.19, PATHS)
 ODD = (None, True, -1, 2**70, 1e308, float("nan"), "x", "<b>{x}</b>\x1b[2J", [], [1], [[None]], [float("inf")] * 3, {},
@@ -52,7 +50,7 @@ def server():
 
 @pytest.fixture
 def bus():
-    return InProcessBus(dict.fromkeys(TOPICS, 65536))
+    return InProcessBus(dict.fromkeys(PAGE_TOPICS, 65536))
 
 
 def send(server, handle, **updates):
@@ -114,7 +112,7 @@ def test_browser_cannot_remove_land_button(server, bus, updates):
     assert "land" not in last_note(bus, "wish")
 
 
-@pytest.mark.parametrize("topic", [topic for topic in TOPICS if topic not in ("sample", "setpoint", "fallback")])
+@pytest.mark.parametrize("topic", [topic for topic in PAGE_TOPICS if topic not in ("sample", "setpoint", "fallback")])
 def test_page_and_restarted_page_survive_any_note(bus, topic):
     pytest.importorskip("viser")
     kind = topic.partition(".")[0]
@@ -125,7 +123,7 @@ def test_page_and_restarted_page_survive_any_note(bus, topic):
         hostile += [pack_note(name, **dict.fromkeys(FIELDS[kind], 1) | {field: ODD[-1]})]
     sample = Sample(1, 0.0, 0.0, 0.0, level(), level(), np.array([9.81, 0.0, 0.0, 0.0]))
     good = {name: [0.0, 0.0, 1.0] for name in ("disturbance", "estimate", "target")}
-    before, watch = _Page(SPEC, bus, MagicMock()), RefusedNotes(bus, TOPICS)
+    before, watch = _Page(SPEC, bus, MagicMock()), RefusedNotes(bus, PAGE_TOPICS)
     bus.publish("status", pack_note("status", mode="policy", error=0.0, missed=0, **good))
     for tick, data in enumerate(hostile):
         bus.publish(topic, data)
