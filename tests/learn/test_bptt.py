@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from helpers import GOAL, draw_starts, hover_env, hover_task, random_starts, replace_fields
 from retrim import learn
-from retrim.control import Policy
+from retrim.control import LoraPolicy, Policy
 from retrim.learn import Env, PolicyState, pretrain
 from retrim.learn.residuals import EnsembleResidual
 from retrim.physics import Hybrid, LinearDragQuadrotor, PointMass, State, StraightThrough, small
@@ -157,9 +157,11 @@ def test_terminated_roll_outs_are_frozen_with_worst_reward_and_finite_gradient(k
 
 
 @pytest.mark.usefixtures("optax_promotion")
-def test_nonfinite_gradient_changes_nothing(key):
+@pytest.mark.parametrize("low_rank", [False, True])
+def test_nonfinite_gradient_changes_nothing(low_rank, key):
     env, policy, optimiser = shared_env(), random_policy(key), optax.adam(1e-2)
-    state = PolicyState(policy, jax.jit(optimiser.init)(policy.layers))
+    policy = LoraPolicy.of(policy, key=key, ranks=(3, 4, 1)) if low_rank else policy
+    state = PolicyState(policy, jax.jit(optimiser.init)(policy.params))
     x0 = random_starts(env.task, key, 1, 2)
     bad = eqx.tree_at(lambda s: s.x.v, x0, x0.x.v.at[0, 0, 0].set(jnp.nan))
     after, losses = bptt(state, env, bad, optimiser=optimiser)
