@@ -8,6 +8,7 @@ import pytest
 from jax import lax, random
 
 from helpers import GOAL, first_order, random_command, replace_fields, stack_trees
+from keypoint_steps import small_commands
 from retrim.estimation import Camera, PoseFilter
 from retrim.estimation.camera import in_camera
 from retrim.physics import Command, LaggedModel, PointMass, State, so3
@@ -47,10 +48,6 @@ def correct(estimate, pixels, visible):
 
 def hover_commands(n):
     return [Command.hover()] * n
-
-
-def small_commands(key, n):
-    return [Command(9.81 + 0.5 * random.normal(k, ()), 0.3 * random.normal(k, (3,))) for k in random.split(key, n)]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -8,6 +8,7 @@ import pytest
 from jax import random
 
 from helpers import GOAL, replace_fields
+from keypoint_steps import begin, near_state, pixels_of, rotation, see, small_commands, step
 from retrim.control import Policy, PolicyController
 from retrim.learn import Env, rollout
 from retrim.learn.encoder import pretrain_encoder
@@ -28,11 +29,6 @@ def keypoints(**options):
     return Keypoints.of(jnp.array(GOAL), small().omega_max, **({"whitened": False} | options))
 
 
-def near_state():
-    """Return a state with all points visible for a while."""
-    return State(jnp.array([0.05, -0.1, 1.1]), jnp.eye(3), jnp.array([0.1, 0.2, -0.05]))
-
-
 @pytest.fixture(scope="module")
 def plain():
     return keypoints()
@@ -43,11 +39,8 @@ def white():
     return keypoints(whitened=True)
 
 
-look = eqx.filter_jit(lambda o, x: o.pixels(x))
-
-
 def test_published_projections_at_goal(plain):
-    pixels, visible = look(plain, State.at(jnp.array(GOAL)))
+    pixels, visible = pixels_of(plain, State.at(jnp.array(GOAL)))
     np.testing.assert_allclose(pixels, PUBLISHED, atol=6e-4)
     assert visible.all()
 
@@ -55,12 +48,8 @@ def test_published_projections_at_goal(plain):
 # ---- keypoints
 
 
-begin = eqx.filter_jit(lambda o, x: o.init(x))
-step = eqx.filter_jit(lambda x, u: PointMass(0.02).step(x, u, jnp.zeros(3)))
-see = eqx.filter_jit(lambda o, memory, x, last: o(memory, jnp.array(0.0), x, last))
 history = eqx.filter_jit(lambda o, x, omega: o.history(x, omega))
 stack = eqx.filter_jit(lambda o, frames: o.stacked(frames))
-rotation = jax.jit(so3.exp)
 
 
 def observe_motion(observation, x, us):
@@ -73,13 +62,6 @@ def observe_motion(observation, x, us):
     return np.array(display), memory, x
 
 
-def small_commands(key, n):
-    draws = jax.jit(jax.vmap(lambda k: (random.normal(k, ()), random.normal(k, (3,)))))(random.split(key, n))
-    return [
-        Command(jnp.asarray(9.81 + 0.5 * c), jnp.asarray(0.3 * w)) for c, w in zip(*map(np.asarray, draws), strict=True)
-    ]
-
-
 def test_wrong_shape_is_refused(plain):
     jax.make_jaxpr(lambda x: plain(plain.init(x), jnp.array(0.0), x, Command.hover()))(near_state())
 
@@ -89,7 +71,7 @@ def test_observation_layout(plain, key):
     display, _, _ = observe_motion(plain, near_state(), us)
     assert display.shape == (6, plain.size) == (6, 89)
     assert plain.size == 89
-    pixels, _ = look(plain, near_state())
+    pixels, _ = pixels_of(plain, near_state())
     np.testing.assert_allclose(np.clip(display[0, :14], -5, 5), np.reshape(pixels, 14), atol=1e-9)  # newest first
     np.testing.assert_allclose(display[3, 14:28], display[0, :14], atol=1e-12)  # one frame later than 60 ms ago
     np.testing.assert_array_equal(display[:, 70:77], 1.0)
@@ -111,7 +93,7 @@ def test_equal_starts_have_equal_observations(key):
 
 def test_observation_is_projection_plus_stated_noise(plain):
     """In pixels: 1280 by 720 across an image that is 2 wide and high."""
-    exact = np.asarray(look(plain, near_state())[0])
+    exact = np.asarray(pixels_of(plain, near_state())[0])
     noisy = keypoints(noise=3.0)
     starts = jax.vmap(lambda k: State(near_state().p, near_state().R, 0.1 * random.normal(k, (3,))))(
         random.split(random.key(4), 600)
@@ -153,7 +135,7 @@ def test_initial_history_is_steady_motion(plain):
     omega, x = jnp.array([0.5, -0.3, 0.8]), near_state()
     frames = []
     for _ in range(13):
-        frames.append(np.asarray(look(plain, x)[0]).reshape(14))
+        frames.append(np.asarray(pixels_of(plain, x)[0]).reshape(14))
         last = x
         x = move(x, omega)
     np.testing.assert_allclose(history(plain, last, omega), frames, atol=1e-10)
@@ -218,7 +200,7 @@ def test_frames_are_60_ms_apart_at_every_rate(dt, depth, stride, plain):
             near_state(),
             p=jnp.asarray(np.asarray(near_state().p) - 0.06 * i * np.asarray(near_state().v)),
         )
-        np.testing.assert_allclose(display, np.reshape(look(plain, then)[0], 14), atol=1e-12)
+        np.testing.assert_allclose(display, np.reshape(pixels_of(plain, then)[0], 14), atol=1e-12)
     # This also holds for the first observation of a flight.
     _, memory = see(observation, begin(observation, near_state()), near_state(), Command.hover())
     np.testing.assert_allclose(memory.frames, frames, atol=1e-12)

@@ -5,20 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import random
 
 from helpers import GOAL, replace_fields, stack_trees
-from retrim.physics import Command, PointMass, State, small, so3
+from keypoint_steps import begin, near_state, pixels_of, rotation, see, small_commands, step
+from retrim.physics import Command, State, small, so3
 from retrim.physics.effective_gravity import EffectiveGravityFrame
 from retrim.tasks import Keypoints, L2Hover, OccludedKeypoints
 from retrim.tasks.view import ViewHover
 
 SURE = 1e-12 * np.eye(12)
-begin = eqx.filter_jit(lambda o, x: o.init(x))
-step = eqx.filter_jit(lambda x, u: PointMass(0.02).step(x, u, jnp.zeros(3)))
-rotation = jax.jit(so3.exp)
-see = eqx.filter_jit(lambda o, memory, x, last: o(memory, jnp.array(0.0), x, last))
-pixels_of = eqx.filter_jit(lambda o, x: o.pixels(x))
 
 
 def full(noise=0.0):
@@ -27,11 +22,6 @@ def full(noise=0.0):
 
 def observe(noise=0.0, dropout=0.0, **options):
     return OccludedKeypoints(full(noise), jnp.array(dropout), **options)
-
-
-def near_state():
-    """Return a state with all points visible for a while."""
-    return State(jnp.array([0.05, -0.1, 1.1]), jnp.eye(3), jnp.array([0.1, 0.2, -0.05]))
 
 
 def partly_visible_state():
@@ -45,13 +35,6 @@ def exact_memory(observation, x):
     ago = 0.02 * np.arange(12.0, -1.0, -1.0)
     poses = stack_trees([replace_fields(x, p=jnp.asarray(np.asarray(x.p) - s * np.asarray(x.v))) for s in ago])
     return memory._replace(pose=replace_fields(memory.pose, x=x, P=jnp.asarray(SURE)), poses=poses)
-
-
-def small_commands(key, n):
-    draws = jax.jit(jax.vmap(lambda k: (random.normal(k, ()), random.normal(k, (3,)))))(random.split(key, n))
-    return [
-        Command(jnp.asarray(9.81 + 0.5 * c), jnp.asarray(0.3 * w)) for c, w in zip(*map(np.asarray, draws), strict=True)
-    ]
 
 
 def test_observation_without_occlusion_equals_training(key):
