@@ -9,7 +9,16 @@ from jax import random
 from helpers import tiny_preset
 from retrim import CheckpointError, ConfigError, Setup, load_learner_state, load_policy, save_learner_state, save_policy
 from retrim.config import changed, load, overlaid
+from retrim.config.disturbances import DISTURBANCES
+from retrim.config.faults import FAULTS
+from retrim.config.methods import METHODS
+from retrim.config.networks import NETWORKS
+from retrim.config.plants import PLANTS
+from retrim.config.residuals import RESIDUALS
+from retrim.config.sensors import SENSORS
+from retrim.config.tasks import TASKS
 from retrim.config.trust import check_trust, python_names
+from retrim.config.vehicles import VEHICLES
 from retrim.evaluation.sweep import read_sweep
 from retrim.io.logs import read_map
 
@@ -39,6 +48,8 @@ def mine(tmp_path, monkeypatch):
         ("my.csv:twice", ("my.csv:twice",)),
         ({"track": {"reference": "a:b"}, "options": {"url": "http://x"}}, ("a:b",)),
         ([("a:b",), {"x": ["c:d"]}], ("a:b", "c:d")),
+        ({"references": ["my.csv:once"], "track": {"reference": "my.CSV:laps"}}, ()),
+        ({"methods": ["my.csv:once"], "adapt": {"residual": "my.CSV:laps"}}, ("my.csv:once", "my.CSV:laps")),
     ],
 )
 def test_name_with_colon_is_python_unless_it_is_a_file_suffix(values, names):
@@ -49,6 +60,11 @@ def test_names_of_preset_are_its_imports():
     preset = changed(load("track/retrim"), vehicle="a:b", adapt={"residual": "c:d"}, track={"reference": "circle+e:f"})
     assert set(python_names(preset)) == {"a:b", "c:d", "e:f"}
     assert python_names(changed(load("hover/retrim"), task="g:h", options={"i": "j:k"})) == ("g:h",)
+
+
+def test_names_of_preset_include_files_that_are_no_reference():
+    preset = changed(load("track/retrim"), vehicle="a.csv:once", adapt={"learner": "b.csv:laps"})
+    assert set(python_names(changed(preset, track={"reference": "c.csv:laps"}))) == {"a.csv:once", "b.csv:laps"}
 
 
 def test_refusal_is_one_line_with_remedy():
@@ -120,3 +136,12 @@ def test_log_map_fields_are_looked_up_in_log_only(mine, tmp_path):
     )
     assert read_map(tmp_path / "m.toml").position.fields == (f"{mine}:p",)
     assert mine not in sys.modules
+
+
+def test_name_of_trajectory_file_imports_nothing(mine, tmp_path):
+    """An import of ``x.csv`` runs ``x``, also if it then fails."""
+    for registry in (DISTURBANCES, FAULTS, METHODS, NETWORKS, PLANTS, RESIDUALS, SENSORS, TASKS, VEHICLES):
+        for suffix in ("csv:once", "csv:laps", "CSV:once"):
+            with pytest.raises(ConfigError, match="no "):
+                registry.find(f"{mine}.{suffix}")
+    assert not (tmp_path / "mark").exists()

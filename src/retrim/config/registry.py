@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ..errors import ConfigError, excerpt
+from .trust import CSV_FILE
 from .validation import suggestion
 
 T = TypeVar("T")
@@ -119,7 +120,9 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def _import(self, name: str) -> Any:
         module, _, attribute = name.partition(":")
-        if not (all(part.isidentifier() for part in module.split(".")) and attribute.isidentifier()):
+        is_python_name = all(part.isidentifier() for part in module.split(".")) and attribute.isidentifier()
+        # Files from strangers may name a trajectory file, so such a name must not import a module of the same name.
+        if not is_python_name or CSV_FILE.fullmatch(name):
             known = suggestion(module, tuple(self))
             raise ConfigError(f"no {self._kind} {excerpt(name)}; {known}; a Python name has the form module:name")
         here = str(Path.cwd())

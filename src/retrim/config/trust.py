@@ -17,6 +17,7 @@ from ..errors import ConfigError, excerpt
 
 CSV_FILE = re.compile(r"[^:]*\.csv(:(laps|once))?", re.IGNORECASE)
 """Name of a trajectory file. Its colon precedes a choice between laps and one pass, not a Python name."""
+REFERENCE_KEYS = ("reference", "references")
 FREE_TABLE = "options"
 """Table of a custom task, in which this package does not look up names."""
 
@@ -49,18 +50,19 @@ def check_trust(values: Any, trust: Collection[str], *, source: str) -> None:
             )
 
 
-def _names(values: Any) -> Iterator[str]:
+def _names(values: Any, is_reference: bool = True) -> Iterator[str]:
+    """Yield the Python names; only a reference may be a trajectory file."""
     if isinstance(values, str):
         parts = (part.partition("=")[0] for part in values.split("+"))
-        yield from (part for part in parts if ":" in part and not CSV_FILE.fullmatch(part))
+        yield from (part for part in parts if ":" in part and not (is_reference and CSV_FILE.fullmatch(part)))
     elif isinstance(values, Mapping):
         for key, value in values.items():
             if key != FREE_TABLE:
-                yield from _names(value)
+                yield from _names(value, key in REFERENCE_KEYS)
     elif isinstance(values, list | tuple):
         for value in values:
-            yield from _names(value)
+            yield from _names(value, is_reference)
     elif dataclasses.is_dataclass(values) and not isinstance(values, type):
         for field in dataclasses.fields(values):
             if field.name != FREE_TABLE:
-                yield from _names(getattr(values, field.name))
+                yield from _names(getattr(values, field.name), field.name in REFERENCE_KEYS)
