@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from functools import partial
 
 import jax
@@ -16,6 +17,7 @@ from retrim.io.logs.viewers import can_record
 from retrim.io.policies import load_learner_state, load_policy
 from retrim.runkit import FlightSpec, Run, outputs
 from retrim.runkit.outlet import Outlet
+from retrim.runkit.outputs import clear_outputs
 
 SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full") for start in (0, 1)]
 
@@ -146,3 +148,22 @@ def test_failed_job_is_counted_and_not_scored():
     assert (row["n"], row["crashes"], row["failures"], row["mean"]) == (2, 0, ["OSError: gone"] * 2, None)
     assert (row["disturbance"], row["plant"], row["metric"]) == ("none", "bem", "steady_error_m")
     assert "reference" not in row  # a hover flight has none
+
+
+def test_files_of_user_and_inputs_remain(tmp_path):
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    mine = [tmp_path / "flight.ulg", logs / "outdoor.mcap", logs / "field.npz", tmp_path / "delta.safetensors"]
+    own = [logs / "base_seed0_start1.npz", logs / "a.b_seed0_start1.mcap", tmp_path / "adapted.safetensors"]
+    for path in (*mine, *own):
+        path.write_bytes(b"x")
+    clear_outputs(tmp_path, [mine[-1].resolve()])
+    assert all(path.exists() for path in mine)
+    assert not any(path.exists() for path in own)
+
+
+def test_runs_of_the_same_second_have_separate_folders(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    first = Run("fly").folder
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    assert Run("fly").folder != first

@@ -86,7 +86,7 @@ def fly(
         methods: tuple[str, ...] = ("base",) if adapt in ("none", "base") else ("base", adapt)
         fleet = Fleet(preset, {seed: weights}, [scenario], methods=methods, starts=starts, seconds=seconds,
                       latency=latency, state=state)  # fmt: skip
-        run = report_start(Run("fly", out, stop=stop))
+        run = report_start(Run("fly", out, stop=stop, inputs=(policy, resume, delta)))
         _warn(setup, scenario)
         return _fly(fleet, scenario, run, save_vehicle, memory)
 
@@ -102,7 +102,7 @@ def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, 
     if not flights:
         console.print("interrupted before the first flight was over; nothing was saved")
         return INTERRUPTED
-    result, preset, outlet = rows(flights), setup.preset, Outlet(run.folder)
+    result, preset, outlet = rows(flights), setup.preset, Outlet(run.folder, run.inputs)
     with interrupts_only_set(run.stop):
         outlet.write_flights(flights, preset)
         pictures = outlet.write("the picture", lambda folder: picture(flights, setup, scenario, folder)) or []

@@ -106,7 +106,7 @@ def live(
         address = page_address(page_host, page_port, is_explicit=page, say=RichReporter().say) if shows_page else None
         ground = learners_at(learners, RichReporter().say, key)
         setup = live_setup(base, scenario.reference, "base" if adapt == "none" else adapt)
-        run = report_start(Run("live", out, stop=stop))
+        run = report_start(Run("live", out, stop=stop, inputs=(policy, resume)))
         if weights is None:
             weights, losses = train(Setup.from_preset(base), seed, reporter=RichReporter(), stop=stop)
             if run.interrupted:

@@ -1,5 +1,6 @@
 """Fly a live flight, from the warm-up to the output files."""
 
+import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import replace
@@ -31,10 +32,14 @@ from .events import LiveEvents
 from .operator.page_access import page_url
 from .operator.requests import OperatorRequests
 from .report import collect_learner_state, complaints, flight_of, histograms, missing, results
+from .roles import ROLES
 from .session import LiveRequest, live_spec
 from .status import Status
 from .supervisor import Supervisor
 
+OUTPUTS = ("flight.csv", "flight.npz", "flight.mcap", "flight.rrd", "results.json")
+START = re.compile(r"start(-\d+)?\.safetensors")
+"""Name of an initial state of the learners."""
 Display = Callable[[LiveEvents], AbstractContextManager[Callable[[Status, list[Event]], None]]]
 """Function that takes all events so far and returns a context manager. The context manager yields a function, which is
 called with the status and the new events."""
@@ -76,16 +81,16 @@ def fly_live(
         PlantError: The flight could not begin, or did not write a log.
     """
     run.folder.mkdir(parents=True, exist_ok=True)
-    events, outlet = LiveEvents(), Outlet(run.folder)
-    for old in run.folder.glob("*.log"):
-        old.unlink()
+    events, outlet = LiveEvents(), Outlet(run.folder, run.inputs)
+    for role in ROLES:
+        (run.folder / f"{role}.log").unlink(missing_ok=True)
     # The display closes last, since a blocked terminal would delay everything else.
-    with EarlierOutputs(run.folder, ("flight.*", "results.json")) as earlier, ExitStack() as screen:
+    with EarlierOutputs(run.folder, OUTPUTS) as earlier, ExitStack() as screen:
         with Supervisor(replace(live_spec(request), spare=outlet.spare)) as supervisor:
             if not _warm_up(supervisor, run, reporter):
                 return None
             earlier.discard()
-            clear_outputs(run.folder)
+            clear_outputs(run.folder, run.inputs)
             page = supervisor.spec.page
             if request.page is not None and page is not None and supervisor.page_port is not None:
                 on_page(page_url(request.page[0], supervisor.page_port, page.token))
@@ -128,7 +133,8 @@ def _write(
         ended=status.end_reason, scheduling=refusals, histograms_ms=histograms(rows),
     )  # fmt: skip
     for start in run.folder.glob("start*.safetensors"):  # initial states, which the learned state contains
-        start.unlink(missing_ok=True)
+        if START.fullmatch(start.name) and start.resolve() not in run.inputs:
+            start.unlink(missing_ok=True)
     paths = [*recording_path, *([] if path is None else [path]), log, *complaints(run.folder)]
     return LiveFlight(flight, result, paths, request, status.end_reason == "landed", outlet)
 

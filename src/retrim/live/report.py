@@ -23,6 +23,7 @@ from ..transport.bus import Bus
 from .events import LiveEvents
 from .processes.plant import CRASHED
 from .processes.published_updates import active_learner_state
+from .roles import ROLES
 from .session import LiveRequest
 from .status import Status
 
@@ -173,7 +174,7 @@ def collect_learner_state(bus: Bus, status: Status, start: Path, trust: Collecti
 
 def complaints(folder: Path) -> list[Path]:
     """Return the files with the processes' standard output and error; remove empty files."""
-    result = sorted(folder.glob("*.log"))
+    result = [path for role in sorted(ROLES) if (path := folder / f"{role}.log").exists()]
     for path in result:
         if not path.stat().st_size:
             path.unlink()

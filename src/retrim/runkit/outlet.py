@@ -4,7 +4,7 @@ import contextlib
 import copy
 import secrets
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,9 +32,14 @@ def spare_folders(folder: Path) -> tuple[Path, ...]:
 class Outlet:
     """Writes each file into its run's folder, or into a temporary folder if that fails."""
 
-    def __init__(self, folder: Path) -> None:
-        """Create the outlet for a run's folder."""
-        self.folder, self.spare = folder, spare_folders(folder)
+    def __init__(self, folder: Path, inputs: Collection[Path] = ()) -> None:
+        """Create the outlet for a run's folder.
+
+        Args:
+            folder: Folder of the run.
+            inputs: Files that the run reads; they are replaced, but not removed.
+        """
+        self.folder, self.spare, self._inputs = folder, spare_folders(folder), inputs
         self.faults: list[str] = []
         """One line for each file that was written to a different folder or could not be written."""
 
@@ -78,7 +83,7 @@ class Outlet:
     def write_flights(self, flights: Sequence[Flight], preset: Preset) -> None:
         """Write the learned parameters, events and logs of flights; remove those of earlier flights."""
         with contextlib.suppress(OSError):
-            clear_outputs(self.folder)
+            clear_outputs(self.folder, self._inputs)
         self.write("the learner state", partial(write_learner_state, flights, preset))
         self.write("events.jsonl", partial(write_events, flights))
         self.write("the logs", partial(write_logs, flights))

@@ -1,7 +1,8 @@
 """Writes the output files of a run: a trained policy, and the flights' events, logs and learned parameters."""
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from ..io.policies import save_learner_state, save_policy
 from .flights import Flight
 from .interrupts import interrupts_only_set
 from .run import Run
+
+LOG = re.compile(r".+_seed\d+_start\d+\.(npz|mcap)")
+"""Name of a flight's log; see :func:`write_logs`."""
 
 
 def write_trained_policy(
@@ -51,13 +55,18 @@ def write_trained_policy(
     return path
 
 
-def clear_outputs(folder: Path) -> None:
-    """Remove the flight files of an earlier command from a folder, before new ones are written."""
-    for name in ("learner_state.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl"):
-        (folder / name).unlink(missing_ok=True)
-    for log in (folder / "logs").glob("*"):
-        if log.suffix in (".npz", ".mcap"):
-            log.unlink()
+def clear_outputs(folder: Path, inputs: Collection[Path] = ()) -> None:
+    """Remove the flight files of an earlier command from a folder, before new ones are written.
+
+    Args:
+        folder: Folder of the run. Files of the user in this folder have other names and remain.
+        inputs: Files that the present command reads. They remain until a new file replaces them.
+    """
+    names = ("learner_state.safetensors", "adapted.safetensors", "delta.safetensors", "events.jsonl")
+    logs = (log for log in (folder / "logs").glob("*") if LOG.fullmatch(log.name))
+    for path in (*(folder / name for name in names), *logs):
+        if path.resolve() not in inputs:
+            path.unlink(missing_ok=True)
 
 
 def write_events(flights: Sequence[Flight], folder: Path) -> None:

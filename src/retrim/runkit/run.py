@@ -2,9 +2,10 @@
 
 import contextlib
 import json
+import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from datetime import datetime
 from pathlib import Path
@@ -37,6 +38,7 @@ class Run:
         remark: str = "",
         policy_folder: Path | None = None,
         executor: Executor | None = None,
+        inputs: Iterable[Path | None] = (),
     ) -> None:
         """Choose the folder and check that it can be written.
 
@@ -47,11 +49,14 @@ class Run:
             remark: Remark in the documents on how they were made.
             policy_folder: Folder for trained networks, which several runs may share; by default the run's own folder.
             executor: Executor with other processes for training and flights; by default this process does both.
+            inputs: Files that the command reads, which must not be removed from the folder.
 
         Raises:
             ConfigError: The folder cannot be written.
         """
-        self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}"
+        # Two commands may begin within the same second.
+        self.folder = out or Path("runs") / f"{command}-{datetime.now():%Y%m%d-%H%M%S}-{os.getpid()}"
+        self.inputs = tuple(path.resolve() for path in inputs if path is not None)
         self.remark = remark
         self.policy_folder = policy_folder or self.folder
         self.executor, self.failed = executor, False
