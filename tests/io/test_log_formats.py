@@ -191,6 +191,19 @@ def test_damaged_ulog_gives_flight_or_one_line(tmp_path):
             assert np.isfinite(log.p[log.valid]).all()
 
 
+def test_ulog_whose_last_message_is_incomplete_is_read_to_its_end(tmp_path):
+    """A parser that steps back from the end by the stated size of an incomplete message would never end."""
+    pytest.importorskip("pyulog")
+    path, whole = tmp_path / "flight.ulg", px4_ulog(FLIGHT)
+    head, unknown = whole[:16] + bytes(30_000), b"\x64\0\0" + bytes(20)
+    for data in (head + unknown, head + b"\xff\xff\0" + bytes(20), whole[:16] + unknown, whole[:16] + b"\xff\xffA"):
+        path.write_bytes(data)
+        with pytest.raises(LogError, match="flight.ulg: (cannot be read as ULog|this ULog holds no topic)"):
+            read_flight_log(path)
+    path.write_bytes(whole + b"\xff\xff\0" + bytes(20))
+    assert_agrees(read_flight_log(path), 1e-2)
+
+
 @pytest.mark.parametrize("kind", ["mcap", "npz"])
 def test_damaged_recording_gives_flight_or_one_line(recording, kind, tmp_path):
     pytest.importorskip("rosbags")

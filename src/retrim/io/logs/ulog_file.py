@@ -20,6 +20,21 @@ from .series import Clock, Series, find_fields, missing_field, sign_of
 MICROSECOND = 1e-6
 
 
+class MessageFile(io.BufferedReader):
+    """A file whose position behind an incomplete message is the end that the message states.
+
+    From a damaged message, the parser seeks back by the stated size. At the end of a file, where less than this was
+    read, it would otherwise arrive before the message, and read the same bytes for ever.
+    """
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read bytes, and move on by ``size`` even if the file has fewer."""
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            self.seek(size - len(data), io.SEEK_CUR)
+        return data
+
+
 def read_ulog(
     path: Path, request: Mapping[str, Sequence[str]], time: Clock | None, optional: Collection[str] = ()
 ) -> tuple[dict[str, Series], list[str]]:
@@ -63,12 +78,13 @@ def _parse(path: Path) -> Any:
     from pyulog import ULog
 
     try:
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # the parser prints its findings
+        with MessageFile(io.FileIO(path)) as file, contextlib.redirect_stdout(io.StringIO()):  # the parser prints its findings
             log = ULog(file)
     except Exception as error:  # the parser raises various errors for bytes that are not a ULog
         raise LogError(f"{path}: cannot be read as ULog ({type(error).__name__}: {error})") from error
     if not log.data_list:
-        raise LogError(f"{path}: this ULog holds no topic")
+        damaged = "cannot be read as ULog: it is damaged, and has no whole sample of a topic"
+        raise LogError(f"{path}: {damaged if log.file_corruption else 'this ULog holds no topic'}")
     return log
 
 
