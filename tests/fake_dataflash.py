@@ -9,7 +9,8 @@ from fake_log import FRD_OF_FLU, G, turned_frames
 
 HEAD = b"\xa3\x95"
 TYPES = {"B": "B", "b": "b", "h": "h", "H": "H", "i": "i", "I": "I", "q": "q", "Q": "Q", "f": "f", "d": "d", "c": "h",
-         "C": "H", "e": "i", "E": "I", "L": "i", "M": "B", "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
+         "C": "H", "e": "i", "E": "I", "L": "i", "M": "B", "n": "4s", "N": "16s", "Z": "64s",
+         "a": "64s"}  # fmt: skip
 KINDS = {
     "PARM": (64, "QNf", "TimeUS,Name,Value"),
     "EV": (65, "QB", "TimeUS,Id"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fake_body_flight import BodyFlight, Truth, fly_body
-from fake_dataflash import HEAD, body_messages, dataflash, flight_messages, formats, message, sorted_messages
+from fake_dataflash import HEAD, body_messages, dataflash, describe, flight_messages, formats, message, sorted_messages
 from fake_log import G, fly_once
 from retrim.errors import LogError, RetrimError
 from retrim.io.logs import BodyLog, FlightLog, read_flight_log, read_log, read_map
@@ -145,7 +145,7 @@ def slow():
 REFUSED = {
     "empty": (lambda: b"", "it is empty"),
     "garbage": (lambda: bytes(range(256)) * 40, "no message describes the others"),
-    "descriptions only": (formats, "no field"),
+    "descriptions only": (formats, "no field 'XKF1'; the log has none"),
     "short": (lambda: dataflash(flight_messages(fly_once(0.5, dt=0.01))), "at least 1 s are needed"),
     "no rates": (
         lambda: dataflash(flight_messages(FLIGHT, without=("RATE", "XKF1")), without=("RATE", "XKF1")),
@@ -165,6 +165,30 @@ def test_unreadable_log_is_refused_with_one_line(kind, tmp_path):
         read_log(write(tmp_path, make()))
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 1500
+
+
+def describe_twice(name, *layouts):
+    """Return descriptions of one name, of the types 100 and on, and a message of the last type."""
+    parts = [describe(name, 100 + k, codes, labels) for k, (codes, labels) in enumerate(layouts)]
+    return b"".join(parts) + HEAD + struct.pack("<BQ", 99 + len(layouts), 9_000_000)
+
+
+@pytest.mark.parametrize(
+    ("extra", "skipped"),
+    [
+        (describe_twice("ABCD", ("QZ", "TimeUS,A"), ("Q", "TimeUS")), 11),
+        (describe_twice("ABCD", ("Q", "TimeUS"), ("Q", "TimeUS")), 0),
+        (describe_twice("ABCD", ("Z", "TimeUS")) + bytes(56), 67),
+        (describe_twice("ABCD", ("a", "TimeUS")) + bytes(56), 67),
+    ],
+    ids=["other layout of a name", "same layout again", "text as time", "array as time"],
+)
+def test_description_that_cannot_be_used_is_left_out(extra, skipped, tmp_path):
+    """The flight is read as without it, and the bytes of its messages are reported."""
+    log = read_log(write(tmp_path, LOG + extra))
+    assert_is_flight(log)
+    notes = [note for note in log.notes if "belong to no message" in note]
+    assert notes == [f"{skipped} bytes of the file belong to no message, and are left out"] * bool(skipped)
 
 
 def test_damaged_bytes_give_flight_or_one_line(tmp_path):

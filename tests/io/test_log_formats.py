@@ -42,6 +42,17 @@ def test_retrim_mcap_recording(recording, tmp_path):
     assert_agrees(read_flight_log(tmp_path / "flight.mcap"))
 
 
+@pytest.mark.parametrize(
+    ("times", "text"), [(np.zeros((N, 0)), "not an array of numbers over time"), (np.zeros((N, 2)), "holds 2 numbers")]
+)
+def test_times_of_npz_log_are_one_column(recording, times, text, tmp_path):
+    write_npz(tmp_path / "flight.npz", recording)
+    with np.load(tmp_path / "flight.npz") as arrays:
+        np.savez(tmp_path / "other.npz", **(dict(arrays) | {"t": times}))
+    with pytest.raises(LogError, match=f"other.npz: 't' .*{text}"):
+        read_flight_log(tmp_path / "other.npz")
+
+
 @pytest.mark.parametrize("write", [write_npz, write_mcap])
 @pytest.mark.parametrize(
     ("ms", "ages"), [(20, (15,)), (20, (25,)), (20, (30,)), (10, (15,)), (10, (25,)), (10, (30,)), (10, (15, 25)),
@@ -198,7 +209,7 @@ def test_ulog_whose_last_message_is_incomplete_is_read_to_its_end(tmp_path):
     head, unknown = whole[:16] + bytes(30_000), b"\x64\0\0" + bytes(20)
     for data in (head + unknown, head + b"\xff\xff\0" + bytes(20), whole[:16] + unknown, whole[:16] + b"\xff\xffA"):
         path.write_bytes(data)
-        with pytest.raises(LogError, match="flight.ulg: (cannot be read as ULog|this ULog holds no topic)"):
+        with pytest.raises(LogError, match=r"flight.ulg: (cannot be read as ULog|this ULog holds no topic)"):
             read_flight_log(path)
     path.write_bytes(whole + b"\xff\xff\0" + bytes(20))
     assert_agrees(read_flight_log(path), 1e-2)

@@ -327,8 +327,12 @@ DAMAGED_FILES = {
     "a short line": (lambda text: cut_line(text, 7, "0.1,0,0"), "line 8: 3 cells, but the header has 15"),
     "a duplicate column": (lambda text: text.replace("px,py", "px,px"), "two columns are named 'px'"),
     "an open list": (lambda text: cut_line(text, 3, "0.1,[1" + ",0" * 13), "is not a number"),
+    "a huge integer in a list": (
+        lambda text: cut_line(text, 7, f"0.1,[{10**400}]" + ",0" * 13), "line 8, column 'px': .* is not a number"
+    ),
+    "only a torn line": (lambda text: text.splitlines()[0] + "\n0.1,0,0", "a header and no whole sample"),
     "blanks only": (lambda text: "\n \n\n", "."),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", DAMAGED_FILES)

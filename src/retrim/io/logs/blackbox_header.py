@@ -9,6 +9,7 @@ from ...errors import LogError
 BEGIN = b"H Product:Blackbox"
 LONGEST = 64 * 1024  # largest size of a header [bytes]
 FIELDS = 256  # largest number of fields in a frame
+LARGEST = 2.0**32  # no setting of a board is larger
 HEADER_MARK = b"H "
 ENCODINGS = (0, 1, 3, 6, 7, 8, 9)
 PREDICTORS = range(12)
@@ -37,12 +38,16 @@ class BlackboxHeader:
     """Offset of the first frame."""
 
     def numbers(self, name: str, default: tuple[float, ...]) -> tuple[float, ...]:
-        """Return a setting's numbers, which commas separate, or ``default`` if it is absent or not as long."""
+        """Return a setting's numbers, which commas separate, or ``default``.
+
+        The default applies if the setting is absent or not as long, or if a number is not finite or exceeds 32 bits.
+        """
         try:
             result = tuple(float(part) for part in self.values.get(name, "").split(","))
         except ValueError:
             return default
-        return result if len(result) == len(default) else default
+        fits = len(result) == len(default) and all(abs(number) <= LARGEST for number in result)
+        return result if fits else default
 
     def interval(self) -> tuple[int, int]:
         """Return how many of how many loop iterations are logged."""

@@ -41,6 +41,8 @@ def series_of_rows(
     if lines and len(lines[-1][1]) < len(header):
         notes.append(f"line {lines[-1][0]}, the last, is torn, and is left out")
         lines.pop()
+        if not lines:
+            raise LogError(f"{path}: it has a header and no whole sample")
     columns: dict[int, list[list[float]]] = {
         place: [] for parts_of_place in places.values() for place, _ in parts_of_place
     }
@@ -125,7 +127,7 @@ def _numbers(cell: str, where: str) -> list[float]:
         return [np.nan]
     try:
         return [float(x) for x in np.ravel(json.loads(text))] if text.startswith("[") else [float(text)]
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise LogError(f"{where}: {text[:40]!r} is not a number") from error
 
 

@@ -113,10 +113,11 @@ def _scan(path: Path, raw: bytes) -> Contents:
             at = after if after >= 0 else len(raw)
             continue
         if kind == FORMAT:
-            if (described := _describe(raw[at + 3 : at + FORMAT_LENGTH])) is not None:
+            described = _describe(raw[at + 3 : at + FORMAT_LENGTH])
+            if described is not None and layouts.get(described[2].name, described[2]) == described[2]:
                 code, size, message = described
                 kinds[code], lengths[code] = message.name, size
-                layouts.setdefault(message.name, message)
+                layouts[message.name] = message
                 places.setdefault(message.name, array("q"))
         elif kind in kinds:
             places[kinds[kind]].append(at)
@@ -129,7 +130,10 @@ def _scan(path: Path, raw: bytes) -> Contents:
 
 
 def _describe(body: bytes) -> tuple[int, int, Message] | None:
-    """Return the type, the length and the layout in a format message; None if it is damaged or has no known layout."""
+    """Return the type, the length and the layout in a format message.
+
+    None if the message is damaged, if it has no known layout, or if its time is not a number.
+    """
     code, length = body[0], body[1]
     name, codes, labels = (body[a:b].split(b"\0")[0].decode("latin-1") for a, b in ((2, 6), (6, 22), (22, 86)))
     fields = labels.split(",") if labels else []
@@ -137,10 +141,13 @@ def _describe(body: bytes) -> tuple[int, int, Message] | None:
         return None
     if any(each not in CODES for each in codes) or len(set(fields)) != len(fields) or not all(fields):
         return None
+    units = {each: CODES[c][1] for each, c in zip(fields, codes, strict=True)}
+    if units.get(TIME) == 0.0:
+        return None
     dtype = np.dtype([(each, CODES[c][0]) for each, c in zip(fields, codes, strict=True)])
     if dtype.itemsize + 3 != length:
         return None
-    return code, length, Message(name, dtype, {each: CODES[c][1] for each, c in zip(fields, codes, strict=True)})
+    return code, length, Message(name, dtype, units)
 
 
 def _rows(data: np.ndarray, message: Message, at: np.ndarray) -> np.ndarray:

@@ -17,7 +17,10 @@ def read_npz(
     if time is None:
         raise LogError(f'{path}: an NPZ file needs a table [time] in the map, as field = "t" and unit = "s"')
     arrays = NpzMembers(path)
-    t = _flat(path, time.field, arrays)[:, 0] * time.scale
+    times = _flat(path, time.field, arrays)
+    if times.shape[1] != 1:
+        raise LogError(f"{path}: {time.field!r} holds {times.shape[1]} numbers per sample, not a time")
+    t = times[:, 0] * time.scale
     result = dict[str, Series]()
     for what, parts in find_fields(request, lambda each: _flat(path, each, arrays), optional):
         for name, column in zip(request[what], parts, strict=True):
@@ -34,7 +37,7 @@ def _flat(path: Path, name: str, arrays: NpzMembers) -> np.ndarray:
     if base not in arrays:
         raise missing_field(path, base, list(arrays))
     array = arrays[base]
-    if array.ndim == 0 or len(array) == 0 or array.dtype.kind not in "fiu":
+    if array.ndim == 0 or array.size == 0 or array.dtype.kind not in "fiu":
         raise LogError(f"{path}: {base!r} is not an array of numbers over time")
     columns = array.reshape(len(array), -1).astype(float)
     if not part:

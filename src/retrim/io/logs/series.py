@@ -108,4 +108,5 @@ def missing_field(path: Path, name: str, names: Sequence[str]) -> LogError:
     shown_names = [
         "".join(c if c.isprintable() else "\ufffd" for c in each[:80]) for each in dict.fromkeys([*near, *names])
     ][:MOST_NAMES]
-    return LogError(f"{path}: no field {name[:80]!r}; {suggestion(name, shown_names)}{more}")
+    known = suggestion(name, shown_names) if shown_names else "the log has none"
+    return LogError(f"{path}: no field {name[:80]!r}; {known}{more}")

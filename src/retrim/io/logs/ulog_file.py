@@ -78,7 +78,8 @@ def _parse(path: Path) -> Any:
     from pyulog import ULog
 
     try:
-        with MessageFile(io.FileIO(path)) as file, contextlib.redirect_stdout(io.StringIO()):  # the parser prints its findings
+        # The parser prints its findings.
+        with MessageFile(io.FileIO(path)) as file, contextlib.redirect_stdout(io.StringIO()):
             log = ULog(file)
     except Exception as error:  # the parser raises various errors for bytes that are not a ULog
         raise LogError(f"{path}: cannot be read as ULog ({type(error).__name__}: {error})") from error
