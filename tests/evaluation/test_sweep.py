@@ -222,7 +222,7 @@ def test_failed_remote_flights_are_recorded_and_repeated(tmp_path, monkeypatch):
     policies = {0: Setup.from_preset(preset).new_policy(jax.random.key(0))}
     fleet = Fleet(preset, policies, [Scenario(plant="simple")], methods=("base",), starts=2, seconds=1.2)
     reporter, run = Silent(), Run("test", tmp_path)
-    flight_rows = sweep._FlightRows(run, reporter)
+    flight_rows = sweep._FlightRows(run, reporter, {})
     reporter.say = text.append
     calls = []
 
@@ -244,7 +244,7 @@ def test_failed_remote_flights_are_recorded_and_repeated(tmp_path, monkeypatch):
     sweep._fly(
         fleet,
         {spec: sweep._key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs},
-        sweep._FlightRows(run, reporter),
+        sweep._FlightRows(run, reporter, {}),
         run,
         reporter,
     )

@@ -15,11 +15,13 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from fake_flights import flight
 from hostile import TEXTS, AuditHook, CaseMaker
 from retrim import load_learner_state, load_policy
 from retrim.config import read_vehicle
 from retrim.errors import CheckpointError, ConfigError, LogError, RetrimError
 from retrim.evaluation import sweep
+from retrim.evaluation.metrics import FIGURES, record
 from retrim.io.logs import npz_members, read_flight_log, read_map
 from retrim.io.logs.npz_members import NpzMembers
 from retrim.live.operator.page import free_port
@@ -155,14 +157,30 @@ def test_excessive_size_in_header_takes_no_memory(folder):
 
 
 def test_invalid_rows_of_sweep_are_repeated(folder):
-    row = dict.fromkeys((*sweep.GROUP, *sweep.FIGURES, "metric")) | {"key": "good", "metric": "m", "error": 0.1}
-    wrong = [{**row, "key": "a", "error": "x"}, {**row, "key": "b", "plant": 3}, {"key": "c"}, {**row, "key": 4}, [], 1]
-    lines = [json.dumps(each).encode() for each in (*wrong, row)]
+    """A row needs all entries of a record, with finite figures, and the conditions that belong to its key."""
+    row, key = {"key": 15 * "0" + "a", "preset": "p", **record(flight(0.1))}, 15 * "0" + "b"
+    expected = {key: {"preset": "p", "method": "full", "seed": 3}}
+    good = [row, {**row, "key": key, "method": "full", "seed": 3, "behind_s": -0.5}]
+    good.append({**row, "key": 15 * "0" + "c", "crashed": True, "error": None})
+    changes = [
+        *({"key": value} for value in (4, "good", "../../../../x", 5000 * "a")),
+        *({name: 3} for name in ("preset", "plant", "reference", "failed", "fault", "metric")),
+        *({name: value} for name in ("seed", "start") for value in ([1], -1, 1.0, True, None)),
+        *({"crashed": value} for value in ("x", 0, None, True)),
+        *({name: value} for name in FIGURES for value in ("x", [0.1], True, -5, 1e308, float("nan"), 10**400)
+          if (name, value) != ("behind_s", -5)),
+        {"error": None}, {"delay": None}, {"thrust_error": float("inf")},
+        {"key": key}, {"key": key, "method": "full"}, {"key": key, "seed": 3}, {"key": key, "plant": "bem"},
+    ]  # fmt: skip
+    wrong = [*({**row, **change} for change in changes), {"key": row["key"]}, [], 1]
+    wrong += [{name: value for name, value in row.items() if name != missing} for missing in row]
+    lines = [json.dumps(each).encode() for each in (*wrong, *good)]
     (folder / "flights.jsonl").write_bytes(b"\n".join([b"\xff\xfe", *lines, b'{"key": "torn']))
     text, reporter = [], Silent()
     reporter.say = text.append
-    assert list(sweep._FlightRows(Run("test", folder), reporter).by_key) == ["good"]
-    assert text == [f"{folder / 'flights.jsonl'}: unusable lines, 8; their flights are flown again"]
+    assert list(sweep._FlightRows(Run("test", folder), reporter, expected).by_key.values()) == good
+    count = len(wrong) + 2  # bytes that are no text, and a torn line
+    assert text == [f"{folder / 'flights.jsonl'}: unusable lines, {count}; their flights are flown again"]
 
 
 def test_invalid_host_gives_one_line():

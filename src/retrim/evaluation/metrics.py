@@ -35,22 +35,13 @@ EFFORT = ("rates_rms", "rates_change_rms")
 
 def record(flight: Flight) -> dict[str, Any]:
     """Return one flight's figures; the errors of a terminated flight are None."""
-    spec, has_crashed = flight.spec, flight.log.terminated
-    effort = flight.effort if find_method(spec.method).on_board is None else (np.nan, np.nan)  # no rates are commanded
+    has_crashed = flight.log.terminated
+    effort = (
+        flight.effort if find_method(flight.spec.method).on_board is None else (np.nan, np.nan)
+    )  # no rates are commanded
     behind, aligned_error = flight.behind or (None, None)
-    scenario = spec.scenario
     return {
-        "disturbance": scenario.disturbance,
-        "method": spec.method,
-        "plant": scenario.plant,
-        "vehicle": flight.vehicle,
-        "sensors": scenario.sensors,
-        "thrust_error": scenario.thrust_error,
-        "delay": scenario.delay,
-        "fault": scenario.fault,
-        "reference": scenario.reference,
-        "seed": spec.seed,
-        "start": spec.start,
+        **conditions_of(flight.spec, flight.vehicle),
         "metric": flight.metric,
         "error": None if has_crashed else flight.steady,
         "peak_after_5s": _finite(flight.peak),
@@ -74,9 +65,20 @@ def failed_record(spec: FlightSpec, vehicle: str, metric: str, why: str) -> dict
         metric: Name of the task's error.
         why: The job's error, in one line.
     """
-    conditions = {name: getattr(spec.scenario, name) for name in CONDITIONS if hasattr(spec.scenario, name)}
-    about = {**conditions, "method": spec.method, "vehicle": vehicle, "seed": spec.seed, "start": spec.start}
+    about = conditions_of(spec, vehicle)
     return {**dict.fromkeys(FIGURES), **about, "metric": metric, "crashed": False, "failed": why}
+
+
+def conditions_of(spec: FlightSpec, vehicle: str) -> dict[str, Any]:
+    """Return the part of a flight's record that its specification states.
+
+    Args:
+        spec: Specification of the flight.
+        vehicle: Name of the vehicle.
+    """
+    own = {"method": spec.method, "vehicle": vehicle}
+    conditions = {name: own[name] if name in own else getattr(spec.scenario, name) for name in CONDITIONS}
+    return {**conditions, "seed": spec.seed, "start": spec.start}
 
 
 def rows(flights: Sequence[Flight], *, by_seed: bool = False) -> Rows:

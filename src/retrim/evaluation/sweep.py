@@ -32,14 +32,14 @@ from .executor import report_progress
 from .fleet import Fleet
 from .flight_table import figure_cells, figure_columns, millimetres
 from .limits import check_seeds
-from .metrics import EFFORT, Rows, failed_record, record, summary
+from .metrics import Rows, conditions_of, failed_record, record, summary
 from .policies import train_policies
+from .stored_record import is_record
 
 FLIGHTS = "flights"
 """Key of the rows of completed flights."""
 STRICT = ConfigDict(extra="forbid")
 GROUP = ("preset", "plant", "vehicle", "sensors", "reference", "disturbance", "method")
-FIGURES = ("error", "peak_after_5s", "settle_s", "cross_track_m", "behind_s", "unshifted_m", *EFFORT)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -117,9 +117,14 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
     for fleet in fleets:
         for scenario in sweep.scenarios():
             scenario.make(fleet.preset.vehicle, dt=fleet.preset.dt)  # fails if a package is missing
-    rows = _FlightRows(run, reporter, need_logs=sweep.logs)
     # The keys are made once, before the first flight; a file that changes in the meantime affects only the next run.
     keys = [{spec: _key(fleet.preset, spec, fleet.seconds) for spec in fleet.specs} for fleet in fleets]
+    conditions = {
+        key: {"preset": fleet.preset.name, **conditions_of(spec, spec.scenario.vehicle_name(fleet.preset.vehicle))}
+        for fleet, of_fleet in zip(fleets, keys, strict=True)
+        for spec, key in of_fleet.items()
+    }
+    rows = _FlightRows(run, reporter, conditions, need_logs=sweep.logs)
     for preset, of_fleet in zip(presets, keys, strict=True):
         with run.interruptible():
             policies = train_policies(preset, sweep.seeds, run, reporter)
@@ -181,20 +186,24 @@ def _fly(fleet: Fleet, keys: Mapping[FlightSpec, str], rows: "_FlightRows", run:
 class _FlightRows:
     """Rows of completed flights by their keys, one line of JSON each; failed flights and unusable lines fly again."""
 
-    def __init__(self, run: Run, reporter: Reporter, *, need_logs: bool = False) -> None:
+    def __init__(
+        self, run: Run, reporter: Reporter, conditions: Mapping[str, Mapping[str, Any]], *, need_logs: bool = False
+    ) -> None:
         """Read the rows of an earlier run.
 
         Args:
             run: Run whose folder has the rows.
             reporter: Receives a line about rows that cannot be used.
+            conditions: Conditions of each flight of the sweep, by its key, which its row must have.
             need_logs: Whether each row needs the log of its flight; flights without a log fly again.
         """
         self._store, self._folder, self._need_logs = run.store(reporter), run.folder, need_logs
         lines = self._store.get(FLIGHTS, rows_codec()) or ()
-        if unusable := sum(not _is_record(row) for row in lines):
+        records = [row for row in lines if is_record(row, conditions)]
+        if unusable := len(lines) - len(records):
             path = self._store.path(FLIGHTS, rows_codec())
             reporter.say(f"{path}: unusable lines, {unusable}; their flights are flown again")
-        self.by_key = {row["key"]: row for row in lines if _is_record(row) and row.get("failed") is None}
+        self.by_key = {row["key"]: row for row in records if row["failed"] is None}
         self.earlier = frozenset(filter(self.has, self.by_key))
 
     def has(self, key: str) -> bool:
@@ -217,14 +226,6 @@ class _FlightRows:
         """Add rows by their keys, and store all rows."""
         self.by_key |= {key: {"key": key, **row} for key, row in rows.items()}
         self._store.put(FLIGHTS, list(self.by_key.values()), rows_codec())
-
-
-def _is_record(row: Any) -> bool:
-    """Return whether a line is a flight's record with valid types."""
-    if not (isinstance(row, dict) and isinstance(row.get("key"), str) and row.keys() >= {*GROUP, *FIGURES, "metric"}):
-        return False
-    texts = all(row[name] is None or isinstance(row[name], str) for name in (*GROUP, "metric"))
-    return texts and all(row[name] is None or type(row[name]) in (int, float) for name in FIGURES)
 
 
 def _key(preset: Preset, spec: FlightSpec, seconds: float) -> str:
