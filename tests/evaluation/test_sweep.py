@@ -3,6 +3,7 @@
 import json
 import signal
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -13,6 +14,7 @@ from commands import OVERLAY, results, retrim, start_process
 from fake_flights import flight
 from helpers import brief_preset
 from retrim import ConfigError, Fleet, Scenario, Setup
+from retrim.config import read_vehicle
 from retrim.evaluation import policies, sweep
 from retrim.evaluation.executor import Flights
 from retrim.evaluation.flight_table import millimetres
@@ -163,6 +165,31 @@ def test_vehicle_file_is_relative_to_sweep_file(tmp_path):
     (studies / "s.toml").write_text('vehicles = ["none_such.toml"]\n')
     with pytest.raises(ConfigError, match=r"none_such\.toml"):
         read_sweep(studies / "s.toml")
+
+
+VEHICLE = read_vehicle(Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml")
+TWICE = {"presets": "hover/fast", "methods": "base", "disturbances": "none", "plants": "bem", "sensors": "ideal",
+         "references": "circle"}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        *(({name: (value, value)}, f"{name}: '{value}' is listed twice; list each") for name, value in TWICE.items()),
+        ({"seeds": (2, 2)}, "seeds 2, 2: at least one is needed, and each only once"),
+        ({"vehicles": ("small", "small")}, "two vehicles are named 'small'; list each only once"),
+        ({"vehicles": (VEHICLE, replace(VEHICLE, mass=0.6))}, "two vehicles are named 'seven-inch'"),
+        ({"vehicles": (replace(VEHICLE, name="small"), "small")}, "give each file its own name"),
+        ({"presets": ("hover/fast", "hover/retrim"), "overlay": {"name": "x"}}, "two presets are named 'x'; give each"),
+    ],
+    ids=lambda value: ", ".join(value) if isinstance(value, dict) else "",
+)
+def test_rows_of_one_name_are_refused_before_training(keys, text, tmp_path):
+    """Flights of different things would be in one row, or a flight would count twice."""
+    with pytest.raises(ConfigError, match=text) as error:
+        run_sweep(Sweep(**keys), Run("sweep", tmp_path / "out"), Silent())
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
 
 
 def test_sweep_contains_every_combination():

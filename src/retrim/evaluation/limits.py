@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from ..errors import ConfigError
+from ..errors import ConfigError, excerpt
 
 MAX_SEED, MAX_STARTS, MAX_SECONDS = 2**32 - 1, 100_000, 36_000.0
 
@@ -18,6 +18,20 @@ def check_seeds(seeds: Sequence[int]) -> None:
             raise ConfigError(f"seed {seed}: must be 0 to {MAX_SEED}")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {', '.join(map(str, seeds)) or 'none'}: at least one is needed, and each only once")
+
+
+def check_once(names: Sequence[str], message: str) -> None:
+    """Check that each name is in a list only once, so that no flight counts twice and no row mixes different things.
+
+    Args:
+        names: The list.
+        message: Text of the error, with ``{}`` for the name.
+
+    Raises:
+        ConfigError: A name is in the list more than once.
+    """
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise ConfigError(message.format(excerpt(twice[0])))
 
 
 def check_flights(starts: int, seconds: float | None) -> None:

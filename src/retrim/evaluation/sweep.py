@@ -16,6 +16,7 @@ from ..config.setup import Setup
 from ..config.trust import check_trust
 from ..config.validation import read_toml, validate
 from ..config.vehicle_file import VehicleSpec
+from ..config.vehicles import name_of
 from ..control.policy import AbstractPolicy
 from ..io.logs.recording import write_npz
 from ..runkit.codecs import rows_codec
@@ -31,7 +32,7 @@ from ..viz.plots import save
 from .executor import report_progress
 from .fleet import Fleet
 from .flight_table import figure_cells, figure_columns, millimetres
-from .limits import check_seeds
+from .limits import check_once, check_seeds
 from .metrics import Rows, conditions_of, failed_record, record, summary
 from .policies import train_policies
 from .stored_record import is_record
@@ -112,7 +113,13 @@ def run_sweep(sweep: Sweep, run: Run, reporter: Reporter) -> Rows:
         ConfigError: A name does not exist, or two settings are incompatible; raised before any training.
     """
     check_seeds(sweep.seeds)
+    for what in ("presets", "methods", "disturbances", "plants", "sensors", "references"):
+        check_once(getattr(sweep, what), f"{what}: {{}} is listed twice; list each only once")
+    names = [name_of(vehicle) for vehicle in sweep.vehicles]
+    check_once(names, "two vehicles are named {}; list each only once, and give each file its own name")
     presets = [changed(load(name), **sweep.overlay) for name in sweep.presets]
+    names = [preset.name for preset in presets]
+    check_once(names, "two presets are named {}; give each its own name, and none in [overlay]")
     fleets = [_fleet(preset, _make_untrained(preset, sweep), sweep) for preset in presets]
     for fleet in fleets:
         for scenario in sweep.scenarios():
