@@ -9,7 +9,9 @@ from retrim import Scenario, Setup, load
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
 from retrim.errors import ConfigError
 from retrim.evaluation.fleet import Fleet
+from retrim.replay import flight_vehicle
 from retrim.replay.flight_vehicle import check_vehicle_file, write_flight_vehicle
+from retrim.replay.identification import Estimate
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -41,6 +43,18 @@ def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
     assert result.rate_damping[0] == pytest.approx(0.7, rel=0.1)
     assert result.motor_tau == pytest.approx(0.04, rel=0.15)
     assert result.mass == pytest.approx(float(setup.vehicle.mass))  # a flight does not reveal it
+
+
+def test_vehicle_that_cannot_be_flown_is_written_and_reported(sample_flight, tmp_path, monkeypatch):
+    path, faults, write = tmp_path / "found.toml", [], flight_vehicle.vehicle_toml
+    weak = Estimate(13.0, 12.0, 14.0)
+    monkeypatch.setattr(
+        flight_vehicle, "vehicle_toml", lambda found, *rest: write(dataclasses.replace(found, full_thrust=weak), *rest)
+    )
+    assert write_flight_vehicle(*sample_flight, path, faults) == [path]
+    (fault,) = faults
+    assert fault.startswith(f"--save-vehicle {path}: the vehicle is identified, but cannot be flown: thrust_max = ")
+    assert "\n" not in fault
 
 
 def test_no_file_is_written_without_option(sample_flight):

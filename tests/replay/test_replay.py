@@ -179,11 +179,80 @@ def test_missing_values_come_from_vehicle_file(files, tmp_path, monkeypatch):
     assert identified_one == dataclasses.replace(heavy, name="heavy-identified")
 
 
-def test_uninformative_log_writes_no_vehicle_file(brief, files, tmp_path, monkeypatch):
+THRUST = Estimate(4.6 / 0.32, 14.0, 15.0)
+"""Full thrust of 1.47 times the weight; a vehicle file needs 1.6 times."""
+
+
+@pytest.mark.parametrize(("thrust", "is_flown"), [(THRUST, False), (Estimate(30.0, 29.0, 31.0), True)])
+def test_vehicle_that_cannot_be_flown_is_written_and_reported(thrust, is_flown, files, tmp_path, monkeypatch):
+    found = IdentifiedVehicle(*[None] * 9, (None, None, None), 0.1)
+    monkeypatch.setattr(replays, "identify", lambda log, seed: dataclasses.replace(found, full_thrust=thrust))
+    monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
+    calls = Replay(map=str(files[1]), buffer=2.0, horizon=1.0, identify=True)
+    document = replay(files[0], calls, Run("replay", tmp_path), Silent())
+    assert document.files == [tmp_path / "replay.md", tmp_path / "vehicle.toml"]
+    text = (tmp_path / "replay.md").read_text()
+    assert ("cannot be flown, and `retrim pretrain` refuses it**: thrust_max = " in text) is not is_flown
+    if is_flown:
+        read_vehicle(tmp_path / "vehicle.toml")
+    else:
+        assert "1.47 times the weight" in text
+        with pytest.raises(ConfigError, match=r"1\.47 times the weight"):
+            read_vehicle(tmp_path / "vehicle.toml")
+
+
+OTHERS = ("vehicle.toml", "replay.png", "replay.svg", "adapted.safetensors", "delta.safetensors",
+          "learner_state.safetensors")  # fmt: skip
+
+
+def test_results_of_earlier_replay_are_removed_by_name(files, tmp_path, monkeypatch):
+    """A folder has the files of one log only; files that are read, and those of other commands, stay."""
+    monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
+    calls = Replay(map=str(files[1]), buffer=2.0, horizon=1.0)
+    for name in (*OTHERS, "policy.safetensors", "replay.csv"):
+        (tmp_path / name).write_text(HEAVY)
+    document = replay(files[0], calls, Run("replay", tmp_path), Silent())
+    assert all((tmp_path / name).exists() for name in OTHERS)  # there was no report of a replay
+    own = dataclasses.replace(calls, vehicle=str(tmp_path / "." / "vehicle.toml"))
+    replay(files[0], own, Run("replay", tmp_path), Silent())
+    left = {"replay.md", "replay.json", "policy.safetensors", "replay.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == left | {"vehicle.toml"}
+    replay(files[0], calls, Run("replay", tmp_path), Silent())
+    assert {path.name for path in tmp_path.iterdir()} == left
+    assert document.files == [tmp_path / "replay.md"]
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"buffer": 5.0, "horizon": 10.0}, "choose a shorter --buffer or --horizon"),
+        ({"buffer": 0.2}, "--buffer 0.2: must be"),
+        ({"identify": True}, "identification needs 8 s at least"),
+        ({"adapt": "full", "dt": 0.01}, "a sample every 20 ms, but the policy's tick is 10 ms"),
+        ({"adapt": "full", "window": 2000}, "no 40 s of flight in one piece, which the learner's window needs"),
+    ],
+)
+def test_log_that_does_not_fit_is_refused_before_work(change, text, files, brief, tmp_path, monkeypatch):
+    """Nothing is predicted, written or removed."""
+    monkeypatch.setattr(replays, "_score_predictions", lambda *calls: pytest.fail("it was refused after the work"))
+    for name in ("replay.json", "replay.md", *OTHERS):
+        (tmp_path / name).write_text("of an earlier replay")
+    if "adapt" in change:
+        preset = tiny_preset(adapt={"window": change.pop("window", 50)}, dt=change.pop("dt", 0.02))
+        policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
+        save_policy(tmp_path / "p.safetensors", policy, preset)
+        change["policy"] = tmp_path / "p.safetensors"
+    calls = Replay(**{"map": str(files[1]), "buffer": 2.0, "horizon": 1.0} | change)
+    with pytest.raises((LogError, ConfigError), match=text):
+        replay(brief, calls, Run("replay", tmp_path), Silent())
+    assert {(tmp_path / name).read_text() for name in ("replay.json", "replay.md", *OTHERS)} == {"of an earlier replay"}
+
+
+def test_uninformative_log_writes_no_vehicle_file(files, tmp_path, monkeypatch):
     monkeypatch.setattr(replays, "identify", lambda log, seed: IdentifiedVehicle(*[None] * 9, (None, None, None), 0.1))
     monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
     calls = Replay(map=str(files[1]), buffer=2.0, horizon=1.0, identify=True)
-    document = replay(brief, calls, Run("replay", tmp_path), Silent())
+    document = replay(files[0], calls, Run("replay", tmp_path), Silent())
     assert "no vehicle file is written" in document.sections[-1].about
     assert not (tmp_path / "vehicle.toml").exists()
 

@@ -11,8 +11,6 @@ from ..replay.replay import replay as replayed
 from ..runkit.run import Run
 from .console import RichReporter, report_start, show_paths
 
-LEFT = ("replay.md", "replay.png", "vehicle.toml", "adapted.safetensors", "delta.safetensors")
-
 
 def replay(
     log: tyro.conf.Positional[Path],
@@ -29,8 +27,7 @@ def replay(
 
     def execute(stop: threading.Event) -> int:
         run = report_start(Run("replay", out, stop=stop))
-        replayed(log, request, run, RichReporter())
-        show_paths([path for name in LEFT if (path := run.folder / name).is_file()])
+        show_paths(replayed(log, request, run, RichReporter()).files)
         return run.exit_code
 
     return execute

@@ -80,19 +80,29 @@ def adapt_to(
     return AdaptationResult(LearnerState(policy_state, residual), admissions, attempts, before, after)
 
 
+def ends_of_windows(rows: Targets, setup: Setup) -> list[int]:
+    """Return the end of each of the learner's windows that contains enough flight data.
+
+    Raises:
+        LogError: There is no such window.
+    """
+    a, dt, valid = setup.preset.adapt, setup.preset.dt, np.asarray(rows.valid)
+    ends = range(a.window, len(valid) + 1, max(1, round(a.fit_every / dt)))
+    if not (result := [end for end in ends if valid[end - a.window : end].mean() >= LEAST_VALID]):
+        raise LogError(f"the log has no {a.window * dt:g} s of flight in one piece, which the learner's window needs")
+    return result
+
+
 def _fit(rows: Targets, setup: Setup, state: Any) -> Any:
     """Return the state of the residual model after the last complete window."""
-    a, dt = setup.preset.adapt, setup.preset.dt
-    last_fit = 0
-    for last in range(a.window, rows.valid.shape[0] + 1, max(1, round(a.fit_every / dt))):
-        part: Targets = jax.tree.map(lambda leaf, last=last: leaf[last - a.window : last], rows)
-        if float(np.mean(part.valid)) < LEAST_VALID:
-            continue
+    has_fit = False
+    for last in ends_of_windows(rows, setup):
+        part: Targets = jax.tree.map(lambda leaf, last=last: leaf[last - setup.preset.adapt.window : last], rows)
         new = refit(setup.learner.residual_model, state, part)
         if bool(all_finite(new)):
-            state, last_fit = new, last_fit + 1
-    if not last_fit:
-        raise LogError(f"the log has no {a.window * dt:g} s of flight in one piece, which the learner's window needs")
+            state, has_fit = new, True
+    if not has_fit:
+        raise LogError("no window of the log determines a finite residual; choose another --residual")
     return state
 
 

@@ -1,5 +1,6 @@
 """Reports on a log of commands, gyroscope and accelerometer, with a reason for each value that is not determined."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 from ..config.setup import Setup
@@ -9,9 +10,9 @@ from ..runkit.document import Document, TableSection
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from .body_identification import BodyIdentification, identify_body
+from .files import clear_outputs, write_vehicle
 from .identification import Estimate
 from .report import agreement_section, warning_of
-from .vehicle import vehicle_toml
 
 REMARK = "The delay counts from the setpoint in the autopilot; add the delay of the link that sends commands to it."
 RATES, THRUST = "needs commanded rates that change", "needs an accelerometer, and a thrust that changes"
@@ -20,7 +21,16 @@ GAINS = (0.8, 1.25)  # limits for the ratio of measured to commanded rates; a ra
 
 
 def replay_body(
-    log: BodyLog, path: Path, setup: Setup, run: Run, reporter: Reporter, *, identify: bool, seed: int, adapt: str
+    log: BodyLog,
+    path: Path,
+    setup: Setup,
+    run: Run,
+    reporter: Reporter,
+    *,
+    identify: bool,
+    seed: int,
+    adapt: str,
+    keep: Collection[Path] = (),
 ) -> Document:
     """Report on a log without attitudes and velocities in ``replay.md`` and ``replay.json``.
 
@@ -33,6 +43,7 @@ def replay_body(
         identify: Whether a vehicle file is written.
         seed: Seed for the bootstrap.
         adapt: Method that adapts a policy; only ``none`` is possible.
+        keep: Files that are read, which stay in the folder.
 
     Raises:
         LogError: The log is too short, or a policy is to be adapted to it.
@@ -47,13 +58,14 @@ def replay_body(
         advance(1.0, "done")
     intro = "The log has commands, a gyroscope and perhaps an accelerometer, but no attitudes and no velocities."
     intro = f"{warning_of(log)}\n\n{intro}" if log.warnings else intro
+    clear_outputs(run.folder, keep)
     document = Document(run, "replay", f"Replay of {path.name}", intro, [seed], reporter)
     document.more["agreement"] = dict(log.agreement)
     document.more["identified"] = _figures(result)
     document.add(agreement_section(log))
     document.add(body_section(log, result))
     if identify and result.known:
-        run.write_text("vehicle.toml", vehicle_toml(result.vehicle, setup, path.name, remark=REMARK))
+        write_vehicle(document, result.vehicle, setup, path.name, remark=REMARK)
     document.write()
     return document
 

@@ -13,6 +13,7 @@ from ..estimation.command_path import PathEstimator
 from ..io.files import write_whole
 from ..runkit.flights import Flight
 from ..runtime.flight import Log
+from .files import refusal_of
 from .identification import Estimate, IdentifiedVehicle
 from .vehicle import vehicle_toml
 
@@ -44,7 +45,7 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
         flight: Flight to identify the vehicle from.
         setup: Set-up of the policy that flew.
         path: File to write; None if the option is not given.
-        faults: Receives a line if the vehicle cannot be identified or written.
+        faults: Receives a line if the vehicle cannot be identified, written or flown.
     """
     if path is None:
         return []
@@ -53,6 +54,8 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
     except (LogError, OSError) as error:
         faults.append(f"--save-vehicle {path}: {error}")
         return []
+    if reason := refusal_of(path):
+        faults.append(f"--save-vehicle {path}: the vehicle is identified, but cannot be flown: {reason}")
     return [path]
 
 

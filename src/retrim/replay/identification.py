@@ -21,6 +21,7 @@ from .path_of_log import path_of_log
 from .rows import acting_commands
 
 BLOCK, DRAWS = 2.0, 200  # length of a block [s], and number of bootstrap samples
+LEAST_BLOCKS = 4
 PERCENTILES = (5.0, 95.0)  # percentiles at the ends of an interval
 WARM_UP = 0.3  # [s], at the beginning of a piece of flight, where a lag depends on commands before the piece
 LEAST_SPEED = 0.3  # [m/s], root-mean-square velocity along an axis below which drag is not observable
@@ -84,9 +85,7 @@ def identify(log: FlightLog, *, seed: int = 0) -> IdentifiedVehicle:
     Raises:
         LogError: The flight is too short.
     """
-    blocks = _blocks(log)
-    if len(blocks) < 4:
-        raise LogError(f"{len(blocks) * BLOCK:g} s of flight in one piece are left; identification needs 8 s at least")
+    blocks = blocks_of(log)
     thrust = _thrust(log, blocks)
     rates = {} if log.command is None else {
         name: _rates(log, log.command, blocks, axes) for name, axes in (("rates", [0, 1]), ("yaw", [2]))
@@ -162,8 +161,12 @@ def _solve(channels: dict[str, Channel], thrust: Channel, draw: np.ndarray) -> d
     return result
 
 
-def _blocks(log: FlightLog) -> np.ndarray:
-    """Return the ticks of each complete block: two seconds of flight after a settling time."""
+def blocks_of(log: FlightLog) -> np.ndarray:
+    """Return the ticks of each complete block: two seconds of flight after a settling time.
+
+    Raises:
+        LogError: The flight is too short.
+    """
     size, warm = 10 * max(1, round(0.1 * BLOCK / log.dt)), round(WARM_UP / log.dt)
     good = log.valid[:-1] & log.valid[1:]
     has_settled = np.convolve(good, np.ones(warm + 1), mode="full")[: len(good)] > warm
@@ -173,6 +176,11 @@ def _blocks(log: FlightLog) -> np.ndarray:
         if run == size:
             result.append(np.arange(k - size + 1, k + 1))
             run = 0
+    if len(result) < LEAST_BLOCKS:
+        raise LogError(
+            f"{len(result) * BLOCK:g} s of flight in one piece are left; identification needs "
+            f"{LEAST_BLOCKS * BLOCK:g} s at least"
+        )
     return np.array(result)
 
 

@@ -21,14 +21,14 @@ from ..runkit.document import Document, TableSection
 from ..runkit.outputs import write_state
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
-from .adaptation import adapt_to
+from .adaptation import adapt_to, ends_of_windows
 from .body_replay import replay_body
-from .identification import identify
+from .files import clear_outputs, write_vehicle
+from .identification import blocks_of, identify
 from .prediction import PredictionScore, Protocol, predict_log
 from .predictors import model_factory, yardsticks
 from .report import agreement_section, identified_section, picture, prediction_section, residual_section, warning_of
 from .rows import rows_of
-from .vehicle import vehicle_toml
 
 REPORT_MODELS = ("regression", "ensemble", "linear")  # residual models to compare with the baselines
 ENSEMBLE_RATE = 1e-3  # learning rate; with that of hover/paper, an ensemble fits the noise in a real log
@@ -95,6 +95,11 @@ class Replay:
         if not 1 <= self.updates <= 10_000:
             raise ConfigError(f"--updates {self.updates}: must be 1 to 10000")
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that the options name."""
+        return tuple(Path(name) for name in (self.map, self.vehicle, self.policy) if name is not None)
+
 
 def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Document:
     """Report on a log in ``replay.md``, ``replay.json`` and a picture; identify and adapt if requested.
@@ -121,14 +126,10 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
         reporter.say(f"{VEHICLE_NOTE}, which is not stated: {name_of(setup.preset.vehicle)!r}")
     if isinstance(log, BodyLog):
         return replay_body(log, path, setup, run, reporter, identify=request.identify, seed=request.seed,
-                           adapt=request.adapt)  # fmt: skip
-    least, most = setup.preset.plant_delay_ticks + SAMPLES[0], SAMPLES[1]
-    if not least <= round(request.buffer / log.dt) <= most:
-        raise ConfigError(
-            f"--buffer {request.buffer:g}: must be {least * log.dt:.2g} to {most * log.dt:.4g} s for a log that has a "
-            f"sample every {1000 * log.dt:.3g} ms"
-        )
+                           adapt=request.adapt, keep=request.files)  # fmt: skip
     rows, protocol = rows_of(log, delay=request.delay, lag=request.lag), Protocol(request.buffer, request.horizon)
+    _check_log(request, protocol, setup, log, rows)
+    clear_outputs(run.folder, request.files)
     late = f" Thrust acts {1000 * request.delay:g} ms late, with a lag of {1000 * request.lag:g} ms."
     intro = "Residual a - (c R e3 - g e3), world frame." + late * bool(request.delay or request.lag)
     intro = f"{warning_of(log)}\n\n{intro}" if log.warnings else intro
@@ -150,11 +151,33 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
         document.more["identified"] = tree.map(float, dataclasses.asdict(vehicle))
         document.add(identified_section(vehicle))
         if vehicle.known:
-            run.write_text("vehicle.toml", vehicle_toml(vehicle, setup, path.name))
+            write_vehicle(document, vehicle, setup, path.name)
     if policy is not None and request.adapt != "none" and not run.interrupted:
-        document.add(_adapt(request, setup, policy, log, rows, run, reporter))
+        document.add(_adapt(request, setup, policy, rows, document))
     document.write()
     return document
+
+
+def _check_log(request: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets) -> None:
+    """Raise an error if a log is too short or too coarse for what is requested, before anything is written."""
+    least, most = setup.preset.plant_delay_ticks + SAMPLES[0], SAMPLES[1]
+    if not least <= round(request.buffer / log.dt) <= most:
+        raise ConfigError(
+            f"--buffer {request.buffer:g}: must be {least * log.dt:.2g} to {most * log.dt:.4g} s for a log that has a "
+            f"sample every {1000 * log.dt:.3g} ms"
+        )
+    protocol.windows(np.asarray(rows.valid), log.dt)
+    if request.identify:
+        blocks_of(log)
+    if request.adapt == "none":
+        return
+    dt = setup.preset.dt
+    if abs(log.dt - dt) > 0.02 * dt:
+        raise LogError(
+            f"the log has a sample every {1000 * log.dt:.3g} ms, but the policy's tick is {1000 * dt:g} ms; "
+            f"log states at least that often to adapt to them"
+        )
+    ends_of_windows(rows, setup)
 
 
 def _score_predictions(
@@ -178,22 +201,20 @@ def _score_predictions(
     return result
 
 
-def _adapt(
-    request: Replay, setup: Setup, policy: AbstractPolicy, log: FlightLog, rows: Targets, run: Run, reporter: Reporter
-) -> TableSection:
-    preset = setup.preset
-    if abs(log.dt - preset.dt) > 0.02 * preset.dt:
-        raise LogError(
-            f"the log has a sample every {1000 * log.dt:.3g} ms, but the policy's tick is {1000 * preset.dt:g} ms; "
-            f"log states at least that often to adapt to them"
-        )
+def _adapt(request: Replay, setup: Setup, policy: AbstractPolicy, rows: Targets, document: Document) -> TableSection:
     result = adapt_to(
-        rows, setup, policy, method=request.adapt, updates=request.updates, seed=request.seed, reporter=reporter
+        rows,
+        setup,
+        policy,
+        method=request.adapt,
+        updates=request.updates,
+        seed=request.seed,
+        reporter=document.reporter,
     )
-    write_state(result.state, preset, run.folder)
+    document.files.append(write_state(result.state, setup.preset, document.run.folder))
     lines = (("as it was", f"{result.before:.3f}"), ("adapted", f"{result.after:.3f}"))
     about = (
-        f"{result.admissions} of {result.attempts} updates passed the gate, residual `{preset.adapt.residual}`. "
+        f"{result.admissions} of {result.attempts} updates passed the gate, residual `{setup.preset.adapt.residual}`. "
         "Error over the last half second of 6 s in the model that the log has corrected, 64 starts of the task."
     )
     if not result.after < LOST:

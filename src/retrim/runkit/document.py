@@ -79,11 +79,14 @@ class Document:
     """Name of the JSON file; by default the document's name."""
     sections: list[TableSection] = field(default_factory=list)
     """The sections so far."""
+    files: list[Path] = field(default_factory=list)
+    """Written files that a user opens: the page, its pictures, and others that were added."""
     _rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, section: TableSection, rows: Sequence[dict[str, Any]] = ()) -> None:
         """Add a section and its rows of results; write both files."""
         self.sections.append(section)
+        self.files += [] if section.picture is None else [section.picture]
         self._rows += rows
         self.reporter.say("\n".join(line for line in section.markdown() if not line.startswith("![")))
         self.write()
@@ -101,6 +104,8 @@ class Document:
         page = self.run.write_text(f"{self.name}.md", "\n".join([*head, *body, *foot]))
         if page not in self.run.pages:
             self.run.pages.append(page)
+        if page not in self.files:
+            self.files.insert(0, page)
         return page
 
     def _provenance(self) -> str:

@@ -132,11 +132,12 @@ def write_learner_state(flights: Sequence[Flight], preset: Preset, folder: Path)
         write_state(learner_state, preset, folder)
 
 
-def write_state(learner_state: LearnerState, preset: Preset, folder: Path) -> None:
-    """Write a learner state to resume from, and its policy or low-rank delta."""
+def write_state(learner_state: LearnerState, preset: Preset, folder: Path) -> Path:
+    """Write a learner state to resume from, and its policy or low-rank delta; return the path of the latter."""
     save_learner_state(folder / "learner_state.safetensors", learner_state, preset)
     policy = learner_state.policy.policy
     if isinstance(policy, LoraPolicy):
-        save_delta(folder / "delta.safetensors", policy)
+        save_delta(path := folder / "delta.safetensors", policy)
     else:
-        save_policy(folder / "adapted.safetensors", policy, preset)
+        save_policy(path := folder / "adapted.safetensors", policy, preset)
+    return path
