@@ -347,8 +347,8 @@ class CaseMaker:
 
         def read(text):
             sweep: Sweep = read_sweep(self.file(text(), ".toml"))
+            from retrim.config.limits import check_seeds
             from retrim.config.methods import find_method
-            from retrim.evaluation.limits import check_seeds
 
             check_seeds(sweep.seeds)
             sweep.scenarios()

@@ -4,12 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from retrim.config.limits import check_flights, check_seeds
 from retrim.config.loading import changed, load_for
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.errors import ConfigError
 from retrim.evaluation.figures import picture
-from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import rows
 from retrim.evaluation.study import Study, fly_all
 from retrim.runkit.document import TableSection

@@ -72,6 +72,13 @@ def test_larger_population_extends_smaller_one(population):
     assert draw_vehicles(3, seed=6) != population[:3]
 
 
+def test_seed_of_population_has_32_bits():
+    draw_vehicles(1, 2**32 - 1)
+    for seed in (-1, 2**32):
+        with pytest.raises(ConfigError, match=f"draw {seed}: must be 0 to 4294967295"):
+            draw_vehicles(1, seed)
+
+
 def test_plant_has_parameters_of_vehicle(population):
     """The plant is of second order, with the lag, damping, gain and delay of the vehicle, which the preset does not
     contain.

@@ -102,6 +102,8 @@ def test_too_short_log_is_refused_with_remedy(log):
         ({"policy": Path("h")}, "--policy needs --adapt METHOD, or --identify"),
         ({"adapt": "base"}, "must be full, lora or none"),
         ({"updates": 0}, "--updates 0"),
+        ({"seed": -1}, "seed -1: must be 0 to 4294967295"),
+        ({"seed": 10**20}, "seed 1000*: must be 0 to 4294967295"),
     ],
 )
 def test_invalid_options_are_refused(wrong, text):

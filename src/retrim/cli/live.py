@@ -10,11 +10,11 @@ import tyro
 from rich.live import Live
 from rich.table import Table
 
+from ..config.limits import check_seeds
 from ..config.loading import load_for
 from ..config.setup import Setup
 from ..errors import ConfigError
 from ..evaluation.figures import picture
-from ..evaluation.limits import check_seeds
 from ..io.logs.viewers import check_recording
 from ..live.display import figures, live_line, live_rows
 from ..live.events import LiveEvents

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import tyro
 
+from ..config.limits import check_seeds
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..errors import CheckpointError
-from ..evaluation.limits import check_seeds
 from ..runkit.outputs import write_trained_policy
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import ground_warning, nominal_error, train

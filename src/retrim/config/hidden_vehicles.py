@@ -10,6 +10,7 @@ import numpy as np
 
 from ..physics.state import STANDARD_GRAVITY
 from ..physics.vehicle import small
+from .limits import check_seeds
 from .scenario import Scenario
 from .vehicle_file import VehicleSpec
 
@@ -86,7 +87,11 @@ def draw_vehicles(count: int, seed: int = 0) -> list[HiddenVehicle]:
     Args:
         count: Number of vehicles.
         seed: Seed of the population; for one seed, the first vehicles are the same for every ``count``.
+
+    Raises:
+        ConfigError: The seed is negative or exceeds 32 bits.
     """
+    check_seeds((seed,), "draw")
     return [_draw(np.random.default_rng((SEED_TAG, seed, n)), n) for n in range(count)]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from jax import random
 
 from ..adapt.learner_state import LearnerState
+from ..config.limits import check_flights, check_seeds
 from ..config.loading import dump
 from ..config.methods import find_method
 from ..config.presets import Preset
@@ -23,7 +24,6 @@ from ..runkit.flying import fly_batch, fly_one, plant_of, program_of
 from .batches import FlightBatch, in_batches, lanes
 from .executor import Flights, Progress, Submit, gather_flights, report_progress
 from .jobs import Job, fly_job
-from .limits import check_flights, check_seeds
 
 COMPILATION_END = 1.0  # flight time by which all programs of a batch have run [s]
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from jax import random
 
+from ..config.limits import check_flights, check_seeds
 from ..config.loading import load_for
 from ..config.presets import Preset
 from ..config.scenario import Scenario
@@ -18,7 +19,6 @@ from ..runkit.training import nominal_error
 from .executor import Flights, report_progress
 from .fleet import Fleet
 from .flight_groups import FlightGroups
-from .limits import check_flights, check_seeds
 from .policies import train_policies
 
 

@@ -9,6 +9,7 @@ from jax import random
 from pydantic import ConfigDict, Field, Strict
 from pydantic.dataclasses import dataclass
 
+from ..config.limits import check_once, check_seeds
 from ..config.loading import beside, changed, dump, load
 from ..config.presets import Preset
 from ..config.scenario import Scenario
@@ -32,7 +33,6 @@ from ..viz.plots import save
 from .executor import report_progress
 from .fleet import Fleet
 from .flight_table import figure_cells, figure_columns, millimetres
-from .limits import check_once, check_seeds
 from .metrics import Rows, conditions_of, failed_record, record, summary
 from .policies import train_policies
 from .stored_record import is_record

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jax import tree
 
+from ..config.limits import check_seeds
 from ..config.loading import changed, load, with_vehicle
 from ..config.methods import find_method, learning_methods
 from ..config.setup import Setup
@@ -94,6 +95,7 @@ class Replay:
             raise ConfigError(f"--flight {self.flight}: flights are numbered from 1")
         if not 1 <= self.updates <= 10_000:
             raise ConfigError(f"--updates {self.updates}: must be 1 to 10000")
+        check_seeds((self.seed,))
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from retrim.config.limits import check_flights, check_seeds
 from retrim.config.loading import changed, dump, load
 from retrim.config.presets import Adapt, Preset
 from retrim.config.scenario import Scenario
 from retrim.evaluation.flight_groups import clear_flights
-from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import cell
 from retrim.evaluation.study import Study, fly_all, train_all
 from retrim.runkit.codecs import Rows, section_codec

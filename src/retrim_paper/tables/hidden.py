@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from retrim.config.hidden_vehicles import HiddenVehicle, draw_vehicles
+from retrim.config.limits import check_flights, check_seeds
 from retrim.config.loading import load_for
 from retrim.config.methods import find_method
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
 from retrim.evaluation.flight_groups import clear_flights
-from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.evaluation.metrics import metres
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
 from retrim.runkit.document import Document, TableSection

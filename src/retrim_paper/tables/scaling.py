@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from retrim.config.limits import check_flights
 from retrim.config.scenario import Scenario
 from retrim.errors import ConfigError
 from retrim.evaluation.batches import CPU_LIMIT
 from retrim.evaluation.executor import report_progress
 from retrim.evaluation.fleet import Fleet
-from retrim.evaluation.limits import check_flights
 from retrim.evaluation.study import refuse_misfits, table_presets, train_all
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import Flight

@@ -8,13 +8,13 @@ import numpy as np
 from jax import random
 
 from retrim.config.baselines import baseline_request
+from retrim.config.limits import check_flights, check_seeds
 from retrim.config.loading import load
 from retrim.config.methods import MethodRequest
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
 from retrim.control.baselines import BASELINES, Baseline, Settings
 from retrim.errors import ConfigError
-from retrim.evaluation.limits import check_flights, check_seeds
 from retrim.plants.sim import SimPlant
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import FlightSpec

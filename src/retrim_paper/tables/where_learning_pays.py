@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from retrim.config.limits import check_seeds
 from retrim.config.loading import dump
 from retrim.errors import ConfigError
 from retrim.evaluation.flight_groups import clear_flights
-from retrim.evaluation.limits import check_seeds
 from retrim.evaluation.study import Study, fly_all, refuse_misfits, train_all
 from retrim.runkit.document import Document, TableSection
 from retrim.runkit.flights import Flight

@@ -7,15 +7,19 @@ from ..errors import ConfigError, excerpt
 MAX_SEED, MAX_STARTS, MAX_SECONDS = 2**32 - 1, 100_000, 36_000.0
 
 
-def check_seeds(seeds: Sequence[int]) -> None:
+def check_seeds(seeds: Sequence[int], what: str = "seed") -> None:
     """Check the seeds of a run.
+
+    Args:
+        seeds: The seeds.
+        what: What the seeds are, for the message.
 
     Raises:
         ConfigError: The list is empty or contains duplicates, or a seed is negative or exceeds 32 bits.
     """
     for seed in seeds:
         if not 0 <= seed <= MAX_SEED:
-            raise ConfigError(f"seed {seed}: must be 0 to {MAX_SEED}")
+            raise ConfigError(f"{what} {seed}: must be 0 to {MAX_SEED}")
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {', '.join(map(str, seeds)) or 'none'}: at least one is needed, and each only once")
 
