@@ -3,10 +3,12 @@
 import errno
 import os
 
+import numpy as np
 import pytest
 
 from retrim import ConfigError
 from retrim.io.files import write_whole
+from retrim.io.logs.recording import quaternions
 from retrim.runkit.outlet import Outlet
 from retrim.runkit.run import Run
 
@@ -70,3 +72,22 @@ def test_full_disk_error_names_file(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left on device") as error_info:
         write_whole(tmp_path / "a", "1")
     assert error_info.value.filename == str(tmp_path / "a")
+
+
+def test_failure_of_one_output_is_reported_and_others_are_written(outlet):
+    """For example, the name of a Matplotlib back end in the environment is wrong."""
+
+    def put(folder):
+        raise ValueError("no back end of this name")
+
+    assert outlet.write("the picture", put) is None
+    assert outlet.faults == ["the picture cannot be made (ValueError: no back end of this name)"]
+    assert outlet.write_results(Run("fly", outlet.folder), [], seeds=[0]) == outlet.folder / "results.json"
+
+
+def test_quaternions_of_attitudes_that_are_not_finite_are_nan():
+    rows = np.zeros((3, 15))
+    rows[:, 3:12] = np.eye(3).ravel()
+    rows[1, 5] = np.nan
+    np.testing.assert_array_equal(quaternions(rows)[[0, 2]], [[0.0, 0.0, 0.0, 1.0]] * 2)
+    assert np.isnan(quaternions(rows)[1]).all()

@@ -64,6 +64,9 @@ class Outlet:
                     with contextlib.suppress(OSError):
                         folder.rmdir()
                 continue
+            except Exception as error:  # a broken back end or viewer must not prevent the other outputs
+                self.faults.append(f"{name} cannot be made ({type(error).__name__}: {error})")
+                return None
             if folder != self.folder:
                 self.faults.append(f"{name} cannot be written to {self.folder} ({reason}); it is in {folder}")
             return result

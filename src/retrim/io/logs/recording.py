@@ -101,10 +101,14 @@ def write_mcap(path: Path, flight: Recording) -> None:
 
 
 def quaternions(x: np.ndarray) -> np.ndarray:
-    """Return the states' attitudes as quaternions x, y, z, w, (n, 4)."""
+    """Return the states' attitudes as quaternions x, y, z, w, (n, 4); NaN for an attitude that is not finite."""
     from scipy.spatial.transform import Rotation  # local, because it takes as long to import as all of retrim
 
-    result: np.ndarray = Rotation.from_matrix(x[:, 3:12].reshape(-1, 3, 3)).as_quat()
+    R = x[:, 3:12].reshape(-1, 3, 3)
+    is_finite = np.isfinite(R).all(axis=(1, 2))
+    result = np.full((len(R), 4), np.nan)
+    if is_finite.any():
+        result[is_finite] = Rotation.from_matrix(R[is_finite]).as_quat()
     return result
 
 
