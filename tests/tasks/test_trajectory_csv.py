@@ -249,6 +249,79 @@ def test_once_follows_curve_between_points(tmp_path):
     )
 
 
+def largest_excursion(points, reference):
+    """Return the largest distance [m] of a reference from the box of the two points before and after each time."""
+    rows, times = np.asarray(reference.rows, float), points[:, 0] - points[0, 0]
+    now = np.arange(len(rows)) * float(reference.every)
+    k = np.clip(np.searchsorted(times, now, side="right") - 1, 0, len(times) - 2)
+    near = points[np.clip(k[:, None] + np.arange(-1, 3), 0, len(times) - 1), 1:4]
+    return float(np.maximum(rows[:, :3] - near.max(axis=1), near.min(axis=1) - rows[:, :3]).max())
+
+
+def path_file(tmp_path, points):
+    return write(tmp_path, "\n".join(",".join(f"{value:.6f}" for value in row) for row in points))
+
+
+def wave(s):
+    return np.column_stack([0.5 - 0.5 * np.cos(0.9 * s), 0.3 * np.sin(s), 1.0 + 0.2 * np.sin(0.7 * s)])
+
+
+@pytest.mark.parametrize("where", [0, 20, 59, 118])
+@pytest.mark.parametrize("length", [1.0, 30.0, 500.0])
+def test_wait_stays_in_its_place(length, where, tmp_path):
+    """Two equal points, long after each other between points every 0.1 s, are a wait at rest."""
+    s = 0.1 * np.arange(120)
+    points = np.column_stack([s, wave(s)])
+    points[where + 1 :, 1:] = np.concatenate([points[where : where + 1, 1:], points[where + 1 : -1, 1:]])
+    points[where + 1 :, 0] += length
+    reference = from_csv(path_file(tmp_path, points), laps=False)
+    assert largest_excursion(points, reference) < 0.02
+    begin, end = points[where : where + 2, 0]
+    wait = at(reference, np.linspace(begin + 0.4 * (end - begin), begin + 0.6 * (end - begin), 9))
+    np.testing.assert_allclose(wait.p, np.repeat(points[where : where + 1, 1:4], 9, axis=0), atol=2e-3)
+    np.testing.assert_allclose(wait.v, 0.0, atol=0.02)
+
+
+def test_wait_is_entered_with_continuous_acceleration(tmp_path):
+    """From row to row, the acceleration changes by little: there is no corner, and no jump of the thrust."""
+    s = 0.5 * np.arange(24)
+    points = np.column_stack([s + 20.0 * (s > 6.0), wave(np.where(s > 6.0, s - 0.5, s))])
+    rows = np.asarray(from_csv(path_file(tmp_path, points), laps=False).rows, float)
+    v = rows[:, 3:6]
+    accelerations = np.diff(v, axis=0) / (points[-1, 0] / (len(rows) - 1))
+    assert np.abs(np.diff(accelerations, axis=0)).max() < 0.5
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_uneven_times_keep_path_near_its_points(seed, tmp_path):
+    """Intervals of a smooth path from 0.03 s to 10 s, in random order, with waits among them."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([np.cumsum(10.0 ** rng.uniform(-1.5, 1.0, 60)), wave(0.1 * np.arange(60))])
+    points[30, 1:] = points[29, 1:]
+    assert largest_excursion(points, from_csv(path_file(tmp_path, points))) < 0.06
+
+
+def test_missing_points_of_motion_are_not_a_wait(tmp_path):
+    """A tenth of a recorded circle is missing: the spline joins its ends along the circle."""
+    times = np.linspace(0.0, 3.0, 151)
+    times = times[(times < 1.01) | (times > 1.31)]
+    rows = np.asarray(from_csv(sample_to_file(tmp_path, circle_lap, times)).rows, float)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, :2] - [1.0, 0.0], axis=1), 1.0, atol=2e-3)
+
+
+def test_lap_with_wait_waits_in_every_lap(tmp_path):
+    times = np.linspace(0.0, 3.0, 61)
+    points = np.column_stack([times, [circle_lap(t) for t in times]])
+    points = np.insert(points, 31, points[30], axis=0)
+    points[31:, 0] += 20.0
+    reference = from_csv(path_file(tmp_path, points))
+    assert float(reference.lap[1] - reference.lap[0]) == pytest.approx(23.0)
+    wait = at(reference, [10.0, 33.0, 56.0]).p
+    np.testing.assert_allclose(wait, np.repeat(points[30:31, 1:4], 3, axis=0), atol=1e-3)
+    radius = np.linalg.norm(np.asarray(reference.rows)[:, :2] - [1.0, 0.0], axis=1)
+    np.testing.assert_allclose(radius, 1.0, atol=0.02)
+
+
 # ---- accepted forms
 
 ROWS = np.array([[0.0, 0.0, 0.0, 1.0, 0.1], [1.0, 1.0, 0.5, 2.0, 0.2], [2.5, 2.0, 0.0, 3.0, 0.3]])

@@ -19,6 +19,10 @@ CLOSED_YAW = 0.02  # [rad]
 SHORTEST_LAP = 0.5  # [s]
 VELOCITY_TOLERANCE = 0.1  # share of the speed by which the velocities of two passes of one lap may differ
 ROW = 0.02  # [s], largest time between rows
+LONG = 3.0  # an interval this many times as long as a neighbour may be a wait
+STEEP = 3.0  # a cubic whose ends are steeper than this, in units of its mean slope, can overshoot (Fritsch, Carlson)
+LEVEL = 0.01  # [m], [rad]; motion during an interval that is too small to overshoot visibly
+PASSES = 4  # an overshoot that is removed can reveal a smaller one beside it
 EXTRA_POINTS = 12  # points added beyond a lap's end, since the end of a spline affects about that many points
 
 
@@ -31,6 +35,9 @@ def from_csv(file: Path, laps: bool | None = None) -> Reference:
     the built-in shapes. Any other file is flown once, from rest to rest, and its end is held. If the points at an end
     are too close together for a vehicle to stop between them, the reference remains in motion at that end, and
     :meth:`Reference.infeasibility` reports it.
+
+    In an interval that is much longer than its neighbours, the path waits or flies straight on if the spline would
+    overshoot there.
 
     Args:
         file: Times, positions and headings; see :func:`retrim.tasks.trajectory_table.read_table` for the format.
@@ -152,9 +159,56 @@ def _end(table: np.ndarray, which: int) -> str:
 
 
 def _spline(table: np.ndarray, ends: str | tuple[str, str]) -> Any:
+    """Return a spline through the points, with straight lines in the intervals in which it would overshoot."""
     from scipy.interpolate import CubicSpline  # local, because it takes as long to import as all of retrim
 
-    return CubicSpline(table[:, 0], table[:, 1:], bc_type=ends)
+    spline = CubicSpline(table[:, 0], table[:, 1:], bc_type=ends)
+    for _ in range(PASSES):
+        added = _wait_points(table, spline, periodic=ends == "periodic")
+        if len(added) == 0:
+            break
+        table = np.concatenate([table, added])
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        spline = CubicSpline(table[:, 0], table[:, 1:], bc_type=ends)
+    return spline
+
+
+def _wait_points(table: np.ndarray, spline: Any, *, periodic: bool) -> np.ndarray:
+    """Return points to add where the spline overshoots, because an interval is much longer than its neighbours.
+
+    The position, the heading or both are on the straight line between the points of the interval.
+    """
+    times = table[:, 0]
+    steps, slopes = np.diff(times), spline(times, 1)
+    before, after = np.roll(steps, 1), np.roll(steps, -1)
+    if not periodic:
+        before[0] = after[-1] = np.inf
+    added = [np.empty((0, table.shape[1]))]
+    for k in np.flatnonzero(steps > LONG * np.minimum(before, after)):
+        change = table[k + 1, 1:] - table[k, 1:]
+        straight = [
+            column
+            for part in (slice(0, 3), slice(3, 4))
+            if steps[k] * np.linalg.norm(slopes[k : k + 2, part], axis=1).max()
+            > STEEP * np.linalg.norm(change[part]) + LEVEL
+            for column in range(part.start, part.stop)
+        ]
+        if straight:
+            t = times[k] + _wait_times(steps[k], before[k], after[k])
+            points = np.column_stack([t, spline(t)])
+            line = table[k, 1:] + ((t - times[k]) / steps[k])[:, None] * change
+            points[:, [1 + column for column in straight]] = line[:, straight]
+            added.append(points)
+    return np.concatenate(added)
+
+
+def _wait_times(length: float, before: float, after: float) -> np.ndarray:
+    """Return times within a long interval [s] whose distances double towards its middle."""
+    halves = []
+    for step in (before, after):
+        n = math.floor(math.log2(0.4 * length / step + 1.0))
+        halves.append(step * (2.0 ** np.arange(1, n + 1) - 1.0))
+    return np.unique(np.concatenate([halves[0], length - halves[1]]))
 
 
 def _points(seconds: float) -> int:
