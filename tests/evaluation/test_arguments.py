@@ -11,11 +11,11 @@ from retrim.cli.arguments import (
     FlightArguments,
     load_inputs,
     reference_of_flight,
-    same_policy,
     training_preset,
     with_residual,
 )
 from retrim.config.registry import describe_user_error
+from retrim.config.trained_values import same_policy
 from retrim.io.policies import load_policy, save_policy
 
 SEVEN_INCH = Path(__file__).parents[2] / "examples" / "extensions" / "vehicle.toml"
@@ -82,6 +82,41 @@ def test_flight_may_excite_vehicle_but_not_change_its_family():
     ):
         with pytest.raises(ConfigError, match=rf"a\.toml: {text}"):
             same_policy(original, other, Path("a.toml"))
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "text"),
+    [
+        ("track/blind", {"track": {"reference": "figure8"}}, "track.reference = 'figure8', .* with 'circle"),
+        ("track/blind", {"goal": (0.0, 0.0, 2.0)}, r"goal = \(0.0, 0.0, 2.0\), .* with \(0.0, 0.0, 1.0\)"),
+        ("track/paper", {"track": {"observation": "blind"}}, "track.observation = 'blind'"),
+        ("vision/paper", {"vision": {"whiten_pixels": True}}, "vision.whiten_pixels = True, .* with False"),
+        ("vision/paper", {"vision": {"encoder_steps": 7}}, "vision.encoder_steps = 7, .* with 10000"),
+        ("vision/paper", {"vision": {"encoder_motions": "near"}}, "vision.encoder_motions = 'near', .* with 'wild'"),
+        ("vision/paper", {"goal": (0.0, 0.0, 2.0)}, "goal = "),
+        ("hover/fast", {"task": "math:pi", "options": {"yaw": 0.3}}, r"options = \{'yaw': 0.3\}, .* with \{\}"),
+    ],
+)
+def test_flight_cannot_change_what_policy_observes(name, changes, text):
+    """Values that the policy cannot observe, or that change its observation, are those of its training."""
+    original, task = load(name), {"task": changes["task"]} if "task" in changes else {}
+    with pytest.raises(ConfigError, match=rf"^a\.toml: {text}"):
+        same_policy(changed(original, **task), changed(original, **changes), Path("a.toml"))
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("track/retrim", {"track": {"reference": "star"}, "goal": (0.0, 0.0, 2.0)}),
+        ("track/blind", {"reward": "l2"}),
+        ("vision/paper", {"vision": {"occlusion": True, "pixel_noise": 0.5}, "reward": "view"}),
+        ("hover/fast", {"goal": (0.0, 0.0, 2.0), "reward": "paper"}),
+    ],
+)
+def test_flight_can_change_its_conditions_and_its_learning(name, changes):
+    original = load(name)
+    other = changed(original, **changes)
+    assert same_policy(original, other, Path("a.toml")) is other
 
 
 def _whole(preset, changes):

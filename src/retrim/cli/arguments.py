@@ -11,7 +11,7 @@ from ..config.faults import FAULTS, NO_FAULT
 from ..config.loading import changed, load_for, overlaid, with_vehicle
 from ..config.methods import METHODS
 from ..config.plants import PLANTS, is_vehicle
-from ..config.presets import Family, Preset
+from ..config.presets import Preset
 from ..config.references import REFERENCES
 from ..config.residuals import RESIDUALS
 from ..config.scenario import THRUST_ERROR, Scenario
@@ -158,31 +158,6 @@ def reference_of_flight(preset: Preset, name: str | None) -> str | None:
             f"--reference {name}: this policy does not observe its reference, and was trained on {training_reference}"
         )
     return name or training_reference
-
-
-def same_policy(original: Preset, changed_one: Preset, config: Path) -> Preset:
-    """Return ``changed_one``, unless it changes a value that the weights depend on.
-
-    Raises:
-        ConfigError: ``changed_one`` changes such a value.
-    """
-    for name in ("task", "vehicle", "dt", "axes", "command_history", "family", "pretrain"):
-        before, after = (_without_excitation(getattr(each, name)) for each in (original, changed_one))
-        if before != after:
-            differences = (f"{name} = {after!r}, but the policy was trained with {before!r}"
-                     if name != "pretrain" else "[pretrain] cannot change for a policy that is trained")  # fmt: skip
-            raise ConfigError(f"{config}: {differences}")
-    before_sees, after_sees = (p.track and p.track.observation for p in (original, changed_one))
-    if before_sees != after_sees:
-        raise ConfigError(
-            f"{config}: track.observation = {after_sees!r}, but the policy was trained with {before_sees!r}"
-        )
-    return changed_one
-
-
-def _without_excitation(value: Any) -> Any:
-    """Return a preset value; for a family, reset the excitation, on which the weights do not depend."""
-    return dataclasses.replace(value, excitation=False) if isinstance(value, Family) else value
 
 
 def training_preset(

@@ -10,6 +10,7 @@ import tyro
 from ..config.loading import overlaid
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
+from ..config.trained_values import same_policy
 from ..errors import ConfigError
 from ..evaluation.executor import report_progress
 from ..evaluation.figures import picture
@@ -23,7 +24,7 @@ from ..runkit.flights import Flight
 from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
 from ..runkit.run import INTERRUPTED, Run
-from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, same_policy, with_residual
+from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, with_residual
 from .console import RichReporter, Trust, console, refuse, report_start, show_paths, show_table
 from .options import option
 

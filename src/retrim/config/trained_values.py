@@ -1,0 +1,54 @@
+"""Values of a preset that the weights of a policy depend on, which a flight cannot change."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..errors import ConfigError
+from .presets import Preset, Vision
+
+TRAINED = ("task", "vehicle", "dt", "axes", "command_history", "options")
+ABSOLUTE = ("blind", "both")  # observations of the position itself, not relative to the reference
+FLOWN = ("occlusion", "pixel_noise", "dropout")
+"""Values of the table [vision] that are conditions of a flight; its other values belong to the weights."""
+
+
+def same_policy(original: Preset, changed_one: Preset, config: Path) -> Preset:
+    """Return ``changed_one``, unless it changes a value that the weights depend on.
+
+    Args:
+        original: Preset of the policy.
+        changed_one: Preset with the values of a file.
+        config: The file, for the message.
+
+    Raises:
+        ConfigError: ``changed_one`` changes such a value.
+    """
+    before, after = dict(_trained(original)), dict(_trained(changed_one))
+    for name in {**before, **after}:
+        if before.get(name) != after.get(name):
+            raise ConfigError(
+                f"{config}: {name} = {after.get(name)!r}, but the policy was trained with {before.get(name)!r}"
+            )
+    if original.pretrain != changed_one.pretrain:
+        raise ConfigError(f"{config}: [pretrain] cannot change for a policy that is trained")
+    return changed_one
+
+
+def _trained(preset: Preset) -> Iterator[tuple[str, Any]]:
+    """Yield the values of a preset that the weights depend on, with their names."""
+    for name in TRAINED:
+        yield name, getattr(preset, name)
+    family = preset.family and dataclasses.replace(preset.family, excitation=False)  # independent of the excitation
+    yield "family", family
+    if preset.track is not None:
+        yield "track.observation", preset.track.observation
+        if preset.track.observation == "blind":
+            yield "track.reference", preset.track.reference
+    if preset.task == "vision" or (preset.track is not None and preset.track.observation in ABSOLUTE):
+        yield "goal", preset.goal
+    if preset.task == "vision":
+        for field in dataclasses.fields(Vision):
+            if field.name not in FLOWN:
+                yield f"vision.{field.name}", getattr(preset.vision or Vision(), field.name)
