@@ -12,6 +12,7 @@ from retrim.evaluation.fleet import Fleet
 from retrim.replay import flight_vehicle
 from retrim.replay.flight_vehicle import check_vehicle_file, write_flight_vehicle
 from retrim.replay.identification import Estimate
+from retrim.replay.vehicle import MARK
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -42,7 +43,18 @@ def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
     assert result.rate_lag[0] == pytest.approx(0.08, rel=0.05)
     assert result.rate_damping[0] == pytest.approx(0.7, rel=0.1)
     assert result.motor_tau == pytest.approx(0.04, rel=0.15)
-    assert result.mass == pytest.approx(float(setup.vehicle.mass))  # a flight does not reveal it
+
+
+def test_file_has_limits_of_vehicle_flown(sample_flight, tmp_path):
+    """A flight does not reveal them: they come from the vehicle of the scenario, or else from that of the policy."""
+    flight, setup = sample_flight
+    usual = dataclasses.replace(flight, spec=dataclasses.replace(flight.spec, scenario=Scenario()))
+    for each, expected in ((flight, VEHICLE.build()), (usual, setup.vehicle)):
+        path = tmp_path / "found.toml"
+        assert write_flight_vehicle(each, setup, path, []) == [path]
+        result = read_vehicle(path)
+        assert (result.mass, result.thrust_max) == pytest.approx((float(expected.mass), float(expected.thrust_max)))
+        assert result.rates_max == pytest.approx(expected.omega_max.tolist())
 
 
 def test_vehicle_that_cannot_be_flown_is_written_and_reported(sample_flight, tmp_path, monkeypatch):
@@ -78,8 +90,23 @@ def test_too_short_flight_is_refused_in_one_line(sample_flight, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("found.txt", "must end with .toml"), ("nowhere/found.toml", "does not exist; create it first")],
+    [
+        ("found.txt", "must end with .toml"),
+        ("nowhere/found.toml", "does not exist; create it first"),
+        ("/proc/found.toml", "cannot be written there .* choose a different --save-vehicle"),
+        ("folder.toml", "exists, and is not an identified vehicle; choose another name"),
+        ("mine.toml", "exists, and is not an identified vehicle; choose another name"),
+        ("flown.toml", "is the file of --vehicle; choose another name"),
+        ("link.toml", "is the file of --vehicle; choose another name"),
+    ],
 )
 def test_unwritable_file_is_refused_before_flight(tmp_path, name, message):
+    (tmp_path / "folder.toml").mkdir()
+    (tmp_path / "mine.toml").write_text("name = 'mine'\n")
+    flown = tmp_path / "flown.toml"
+    flown.write_text(f"{MARK} a flight.\n")
+    (tmp_path / "link.toml").symlink_to(flown)
     with pytest.raises(ConfigError, match=message):
-        check_vehicle_file(tmp_path / name)
+        check_vehicle_file(tmp_path / name, str(flown))
+    check_vehicle_file(flown, "small")  # of an earlier flight: it may be replaced
+    assert "name = 'mine'" in (tmp_path / "mine.toml").read_text()

@@ -9,7 +9,6 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from retrim.config.setup import Setup
 from retrim.config.validation import validate
 from retrim.config.vehicle_file import VehicleSpec
 from retrim.errors import LogError
@@ -125,7 +124,7 @@ def test_short_flight_is_refused():
 def test_identified_values_form_vehicle_file():
     truth = {"delay": 0.02, "lag": 0.05, "rate_lag": (0.08, 0.08, 0.3), "gain": 1.0, "drag": (0.3, 0.3, 0.1)}
     log = dataclasses.replace(excited_flight(0, **truth), full_thrust=25.0)
-    text = vehicle_toml(identify(log), Setup.from_preset("hover/retrim"), "a flight.csv")
+    text = vehicle_toml(identify(log), "small", "a flight.csv")
     spec = validate(VehicleSpec, tomllib.loads(text), source="vehicle")
     assert spec.motor_tau == pytest.approx(0.05, abs=0.01)
     assert spec.rate_lag == pytest.approx((0.08, 0.08, 0.3), rel=0.1)

@@ -67,7 +67,7 @@ def fly(
     """
 
     def execute(stop: threading.Event) -> int:
-        check_vehicle_file(save_vehicle)
+        check_vehicle_file(save_vehicle, flight.vehicle)
         if flight.is_vehicle:
             if delta or config or starts != 1 or latency != "fixed":
                 raise ConfigError("a vehicle flies live, without --delta, --config, --starts and --latency")

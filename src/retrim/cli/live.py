@@ -93,7 +93,7 @@ def live(
     def execute(stop: threading.Event) -> int:
         check_seeds([seed])
         check_recording(record)
-        check_vehicle_file(save_vehicle)
+        check_vehicle_file(save_vehicle, flight.vehicle)
         if page and no_page:
             raise ConfigError("--page and --no-page: choose one")
         check_limits(fence, seconds, policy_age)

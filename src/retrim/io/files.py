@@ -73,8 +73,12 @@ def read_bounded(path: Path, advice: str) -> bytes:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def check_writable(folder: Path) -> None:
+def check_writable(folder: Path, option: str = "--out") -> None:
     """Check, before a long computation, that files can be written to a folder; new folders are removed again.
+
+    Args:
+        folder: The folder.
+        option: Option that states the folder, for the message.
 
     Raises:
         ConfigError: Files cannot be written.
@@ -85,7 +89,7 @@ def check_writable(folder: Path) -> None:
         probe.write_bytes(b"x" * 4096)
     except OSError as error:
         raise ConfigError(
-            f"{folder}: results cannot be written there ({error.strerror}); choose a different --out"
+            f"{folder}: results cannot be written there ({error.strerror}); choose a different {option}"
         ) from error
     finally:
         with contextlib.suppress(OSError):

@@ -42,7 +42,8 @@ def write_vehicle(
         log: Name of the log.
         remark: A further sentence for the comment at the beginning of the file.
     """
-    path = document.run.write_text("vehicle.toml", vehicle_toml(identification, setup, log, remark=remark))
+    text = vehicle_toml(identification, setup.preset.vehicle, log, remark=remark)
+    path = document.run.write_text("vehicle.toml", text)
     document.files.append(path)
     if reason := refusal_of(path):
         about = f"**The vehicle of vehicle.toml cannot be flown, and `retrim pretrain` refuses it**: {reason}"

@@ -7,28 +7,31 @@ import jax.numpy as jnp
 
 from ..adapt.vehicles import estimate_path
 from ..config.setup import Setup
+from ..config.vehicle_file import VehicleSpec
 from ..errors import ConfigError, LogError
 from ..estimation.command_path import Estimate as PathParameter
 from ..estimation.command_path import PathEstimator
-from ..io.files import write_whole
+from ..io.files import check_writable, read_bounded, write_whole
 from ..runkit.flights import Flight
 from ..runtime.flight import Log
 from .files import refusal_of
 from .identification import Estimate, IdentifiedVehicle
-from .vehicle import vehicle_toml
+from .vehicle import MARK, vehicle_toml
 
 MEMORY = 1e4  # [s]: the vehicle does not change during a flight
 LEAST = 1.0  # shortest flight [s]
 
 
-def check_vehicle_file(path: Path | None) -> None:
+def check_vehicle_file(path: Path | None, flown: str | None = None) -> None:
     """Check the file of ``--save-vehicle`` before the flight.
 
     Args:
         path: File to write; None if the option is not given.
+        flown: Vehicle of the flight, which may be a vehicle file; None for the training vehicle.
 
     Raises:
-        ConfigError: The name does not end in .toml, or the folder does not exist.
+        ConfigError: The name does not end in .toml, the folder does not exist or cannot be written, or the file exists
+            and is the vehicle of the flight or was not written by retrim.
     """
     if path is None:
         return
@@ -36,6 +39,12 @@ def check_vehicle_file(path: Path | None) -> None:
         raise ConfigError(f"--save-vehicle {path}: the name of a vehicle file must end with .toml")
     if not path.absolute().parent.is_dir():
         raise ConfigError(f"--save-vehicle {path}: folder {path.absolute().parent} does not exist; create it first")
+    if path.exists():
+        if flown is not None and Path(flown).exists() and path.samefile(flown):
+            raise ConfigError(f"--save-vehicle {path}: is the file of --vehicle; choose another name")
+        if not path.is_file() or not read_bounded(path, "").startswith(MARK.encode()):
+            raise ConfigError(f"--save-vehicle {path}: exists, and is not an identified vehicle; choose another name")
+    check_writable(path.absolute().parent, "--save-vehicle")
 
 
 def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults: list[str]) -> list[Path]:
@@ -43,14 +52,15 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
 
     Args:
         flight: Flight to identify the vehicle from.
-        setup: Set-up of the policy that flew.
+        setup: Set-up of the policy that flew. Its vehicle was flown if the flight's scenario has none.
         path: File to write; None if the option is not given.
         faults: Receives a line if the vehicle cannot be identified, written or flown.
     """
     if path is None:
         return []
     try:
-        write_whole(path, flight_vehicle_toml(flight.log, setup, path.stem).encode())
+        spec = flight.spec.scenario.vehicle or setup.preset.vehicle
+        write_whole(path, flight_vehicle_toml(flight.log, spec, path.stem).encode())
     except (LogError, OSError) as error:
         faults.append(f"--save-vehicle {path}: {error}")
         return []
@@ -59,14 +69,14 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
     return [path]
 
 
-def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
+def flight_vehicle_toml(log: Log, spec: str | VehicleSpec, name: str) -> str:
     """Return a flight's vehicle as TOML, with the identified delay, lags and damping.
 
-    All other values come from the preset.
+    All other values come from ``spec``.
 
     Args:
         log: The flight.
-        setup: Set-up of the policy that flew the vehicle.
+        spec: The vehicle that was flown.
         name: Name of the flight, for the comment.
 
     Raises:
@@ -93,7 +103,7 @@ def flight_vehicle_toml(log: Log, setup: Setup, name: str) -> str:
     )
     if result.delay is None and result.rate_lag is None and result.thrust_lag is None:
         raise LogError("the flight moves too little to identify its vehicle: fly from farther away, or under a push")
-    return vehicle_toml(result, setup, name)
+    return vehicle_toml(result, spec, name)
 
 
 def _estimate_of(each: PathParameter) -> Estimate | None:

@@ -3,31 +3,32 @@
 import tomllib
 
 from ..config.names import LONGEST_NAME, plain_from
-from ..config.setup import Setup
 from ..config.vehicle_file import VehicleSpec
-from ..config.vehicles import name_of
+from ..config.vehicles import make_vehicle, name_of
 from .identification import Estimate, IdentifiedVehicle
 
 SHORTEST, LONGEST = 0.002, 0.5  # limits for a lag in a vehicle file [s]
 SUFFIX = "-identified"
+MARK = "# Identified from"
+"""The beginning of a vehicle file of this module."""
 LONGEST_DELAY = 0.2  # longest delay in a vehicle file [s]
 DAMPINGS = (0.1, 10.0)  # limits for a damping ratio in a vehicle file
 
 
-def vehicle_toml(identification: IdentifiedVehicle, setup: Setup, log: str, *, remark: str = "") -> str:
-    """Return a vehicle file with the identified values; all other values come from the preset's vehicle.
+def vehicle_toml(identification: IdentifiedVehicle, spec: str | VehicleSpec, log: str, *, remark: str = "") -> str:
+    """Return a vehicle file with the identified values; all other values come from ``spec``.
 
     Args:
         identification: The identified parameters.
-        setup: The preset's set-up.
+        spec: Vehicle for the values that are not identified.
         log: Name of the log.
         remark: A further sentence for the comment at the beginning.
     """
-    base, spec = setup.vehicle, setup.preset.vehicle
+    base = make_vehicle(spec)
     keep = spec if isinstance(spec, VehicleSpec) else None
     mass = float(base.mass)
     lines = [
-        f"# Identified from {plain_from(log)}. Values without a remark are those of {plain_from(name_of(spec))!r}.",
+        f"{MARK} {plain_from(log)}. Values without a remark are those of {plain_from(name_of(spec))!r}.",
         "# Intervals contain the true value with a probability of 90 %.",
         *([f"# {remark}"] if remark else []),
         *(
