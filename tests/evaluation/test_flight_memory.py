@@ -1,6 +1,7 @@
 """Memory between flights: the next flight starts with the map, and a wrong or damaged memory is harmless."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,12 @@ from jax import random
 from helpers import tiny_preset
 from retrim.config.scenario import Scenario
 from retrim.config.setup import Setup
+from retrim.config.vehicle_file import VehicleSpec
 from retrim.errors import CheckpointError, ConfigError
 from retrim.runkit.flight_memory import FlightMemory, recall_flight
 from retrim.runkit.flights import Flight, FlightSpec
 from retrim.runtime.flight import Log, States
+from retrim.transport import wire
 
 GOAL = (0.0, 0.0, 1.0)
 
@@ -151,6 +154,37 @@ def test_vehicles_with_equal_file_names_do_not_share_map(tmp_path, setup, policy
     FlightMemory(tmp_path, "my quad").write([flight(state)], setup, [])
     with pytest.raises(CheckpointError, match="'my quad', expected 'my-quad'"):
         FlightMemory(tmp_path, "my-quad").state(setup, policy, "full", 0)
+
+
+QUAD = VehicleSpec(
+    name="quad", mass=0.6, inertia=(0.003, 0.003, 0.005), arm=(0.09, 0.09), thrust_max=24.0, rates_max=(6.0, 6.0, 3.0),
+    motor_tau=0.03,
+)  # fmt: skip
+
+
+def test_vehicle_files_with_equal_names_do_not_share_map(tmp_path, setup, policy, state):
+    """Two vehicle files may contain the same name; the map of the other vehicle is neither recalled nor replaced."""
+    (file,) = FlightMemory(tmp_path, QUAD).write([flight(state)], setup, [])
+    before = file.read_bytes()
+    assert FlightMemory(tmp_path, dataclasses.replace(QUAD)).state(setup, policy, "full", 0) is not None
+    heavy = Scenario(vehicle=dataclasses.replace(QUAD, mass=0.9))
+    with pytest.raises(CheckpointError, match=r"must be the memory of this vehicle 'quad', .* remove the file"):
+        recall_flight(tmp_path, setup, heavy, policy, None, "full", 0, print)
+    assert file.read_bytes() == before
+
+
+def test_memory_without_digest_is_refused(tmp_path, setup, policy, state):
+    """Earlier releases wrote only the name."""
+    memory = FlightMemory(tmp_path, "small")
+    about = {"vehicle": "small", "residual": "place"}
+    memory.path(setup).write_bytes(wire.pack(state.residual, kind="memory", about=about))
+    with pytest.raises(CheckpointError, match="remove the file"):
+        memory.state(setup, policy, "full", 0)
+
+
+def test_unwritable_folder_is_refused_before_flight(setup, policy):
+    with pytest.raises(ConfigError, match=r"/proc/hall: results cannot be written there .* different --memory"):
+        recall_flight(Path("/proc/hall"), setup, Scenario(), policy, None, "full", 0, print)
 
 
 def test_vehicle_names_cannot_leave_folder(tmp_path, setup):

@@ -5,6 +5,7 @@ command names, since a policy that was adapted to other conditions may be worse 
 """
 
 import dataclasses
+import hashlib
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -14,14 +15,17 @@ from typing import Any
 import jax
 from jax import random
 from jaxtyping import Array, Key
+from pydantic import TypeAdapter
 
 from ..adapt.learner_state import LearnerState
 from ..config.methods import find_method
 from ..config.scenario import Scenario
 from ..config.setup import Setup
+from ..config.vehicle_file import VehicleSpec
+from ..config.vehicles import name_of
 from ..control.policy import AbstractPolicy
 from ..errors import CheckpointError, ConfigError, MessageError
-from ..io.files import read_bounded, write_whole
+from ..io.files import check_writable, read_bounded, write_whole
 from ..io.releases import this_release
 from ..io.sanity import check_size
 from ..transport import wire
@@ -39,13 +43,18 @@ class FlightMemory:
 
     folder: Path
     """Folder of the place."""
-    vehicle: str
-    """Name of the vehicle."""
+    vehicle: str | VehicleSpec
+    """The vehicle: its name, or the content of its vehicle file."""
+
+    @property
+    def digest(self) -> str:
+        """Digest of the vehicle, which distinguishes vehicle files with the same name."""
+        return hashlib.sha256(TypeAdapter(str | VehicleSpec).dump_json(self.vehicle)).hexdigest()[:16]
 
     def path(self, setup: Setup) -> Path:
         """Return the file for a set-up: one for each vehicle, residual model and control period."""
         preset = setup.preset
-        name = f"{self.vehicle}_{preset.adapt.residual}_{1000 * preset.dt:g}ms"
+        name = f"{name_of(self.vehicle)}_{preset.adapt.residual}_{1000 * preset.dt:g}ms"
         return self.folder / f"{re.sub(r'[^A-Za-z0-9._-]+', '-', name).lstrip('.-')}.safetensors"
 
     def state(self, setup: Setup, policy: AbstractPolicy, method: str, seed: int) -> LearnerState | None:
@@ -59,7 +68,7 @@ class FlightMemory:
 
         Raises:
             ConfigError: The method does not learn, or the residual model remembers nothing beyond a flight.
-            CheckpointError: The file is damaged, or belongs to a different model.
+            CheckpointError: The file is damaged, or belongs to a different model or vehicle.
         """
         recall = _recall(setup)
         learns = find_method(method).learns
@@ -71,12 +80,18 @@ class FlightMemory:
         like = jax.eval_shape(setup.learner.residual_model.init, key)
         try:
             data = read_bounded(path, "a flight writes it")
-            owner = wire.describe(data, kind=KIND, source=str(path)).get("vehicle", "")
+            about = wire.describe(data, kind=KIND, source=str(path))
             residual: Any = wire.unpack(data, like, kind=KIND, source=str(path))
         except MessageError as error:
             raise CheckpointError(f"{error}; remove the file to fly without it") from error
-        if owner != self.vehicle:  # two names may differ only in characters that a file name cannot have
-            raise CheckpointError(f"{path}: is the memory of vehicle {owner!r}, expected {self.vehicle!r}")
+        owner, name = about.get("vehicle", ""), name_of(self.vehicle)
+        if owner != name:  # two names may differ only in characters that a file name cannot have
+            raise CheckpointError(f"{path}: is the memory of vehicle {owner!r}, expected {name!r}")
+        if about.get("digest") != self.digest:
+            raise CheckpointError(
+                f"{path}: must be the memory of this vehicle {name!r}, but was written for one with other values; "
+                "choose another --memory, or remove the file"
+            )
         check_size(residual, source=str(path), largest=LARGEST_NUMBER)
         residual_state = recall(residual)
         model: Any = setup.learner.residual_model
@@ -92,7 +107,7 @@ class FlightMemory:
         """Return one line about the memory and its age."""
         path = self.path(setup)
         if not path.exists():
-            return f"memory: no earlier flight of {self.vehicle} in {self.folder}"
+            return f"memory: no earlier flight of {name_of(self.vehicle)} in {self.folder}"
         hours = (time.time() - path.stat().st_mtime) / 3600.0
         return f"memory: {path}, written {hours:.1f} h ago"
 
@@ -108,7 +123,8 @@ class FlightMemory:
         if state is None:
             faults.append(f"the memory in {self.folder} is unchanged: no flight that learned ended without a crash")
             return []
-        about = {"vehicle": self.vehicle, "residual": setup.preset.adapt.residual, "version": this_release()}
+        about = {"vehicle": name_of(self.vehicle), "digest": self.digest, "residual": setup.preset.adapt.residual,
+                 "version": this_release()}  # fmt: skip
         path = self.path(setup)
         try:
             write_whole(path, wire.pack(state.residual, kind=KIND, about=about))
@@ -146,19 +162,19 @@ def recall_flight(
         say: Function that receives a line about the memory and its age.
 
     Raises:
-        ConfigError: The flight resumes a learner state, or learns nothing that can be remembered.
-        CheckpointError: The memory is damaged.
+        ConfigError: The flight resumes a learner state, learns nothing that can be remembered, or the folder cannot be
+            written.
+        CheckpointError: The memory is damaged, or is that of another vehicle with the same name.
     """
     if folder is None:
         return None, state
     if state is not None:
         raise ConfigError("--memory and --resume: choose one, since each has its own residual model")
-    memory = FlightMemory(folder, scenario.vehicle_name(setup.preset.vehicle))
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"--memory {folder} must be a folder, but is a file; choose a different --memory")
+    memory = FlightMemory(folder, scenario.entry.own_vehicle or scenario.vehicle or setup.preset.vehicle)
     state = memory.state(setup, policy, method, seed)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--memory {folder} must be a folder ({error.strerror or error})") from error
+    check_writable(folder, "--memory")
     say(memory.describe(setup))
     return memory, state
 
