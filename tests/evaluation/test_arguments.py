@@ -1,6 +1,7 @@
 """Command-line arguments determine the preset and the scenario, and inconsistent ones are refused."""
 
 import dataclasses
+import threading
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from retrim.cli.arguments import (
     training_preset,
     with_residual,
 )
+from retrim.cli.fly import fly
 from retrim.config.registry import describe_user_error
 from retrim.config.trained_values import same_policy
 from retrim.io.policies import load_policy, save_policy
@@ -124,6 +126,20 @@ def _whole(preset, changes):
         name: dataclasses.replace(getattr(preset, name), **value) if isinstance(value, dict) else value
         for name, value in changes.items()
     }
+
+
+def test_zero_and_empty_text_are_not_defaults():
+    """An option is a default only if it is not given; 0 and an empty text are values, and refused."""
+    preset = changed(load("track/retrim"), track={"reference": "circle"})
+    with pytest.raises(ConfigError, match=r"^no disturbance ''"):
+        FlightArguments(disturbance="").scenario(preset)
+    with pytest.raises(ConfigError, match="reference ''"):
+        Setup.from_preset(preset, reference_of_flight(preset, ""))
+    with pytest.raises(ConfigError, match=r"^no preset ''"):
+        training_preset("hover", "")
+    vehicle = FlightArguments(plant="mavlink:udp:127.0.0.1:14540")
+    with pytest.raises(ConfigError, match=r"^--seconds 0 must be between 1 and"):
+        fly(Path("h"), flight=vehicle, seconds=0.0)(threading.Event())
 
 
 def test_residual_can_change_except_in_resumed_flight(key):

@@ -115,8 +115,9 @@ class FlightArguments:
             PlantError: A requirement of the plant is not installed.
         """
         usual = "none" if self.is_vehicle else "large"
+        disturbance = usual if self.disturbance is None else self.disturbance
         follows = reference_of_flight(preset, self.reference)
-        scenario = Scenario(self.disturbance or usual, self.plant, self.vehicle, self.sensors, self.thrust_error,
+        scenario = Scenario(disturbance, self.plant, self.vehicle, self.sensors, self.thrust_error,
                             follows, self.delay, self.fault)  # fmt: skip
         if scenario.entry.needs is not None:
             scenario.entry.needs()
@@ -157,7 +158,7 @@ def reference_of_flight(preset: Preset, name: str | None) -> str | None:
         raise ConfigError(
             f"--reference {name}: this policy does not observe its reference, and was trained on {training_reference}"
         )
-    return name or training_reference
+    return training_reference if name is None else name
 
 
 def training_preset(
@@ -187,7 +188,7 @@ def training_preset(
         ConfigError: A name, key or value is invalid.
     """
     entry = find_task(task)
-    base = load_for(task, preset or entry.default_preset)
+    base = load_for(task, entry.default_preset if preset is None else preset)
     if config is not None:
         base = overlaid(base, config, trust=trust)
     if reference is not None:

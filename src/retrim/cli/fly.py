@@ -73,8 +73,9 @@ def fly(
                 raise ConfigError("a vehicle flies live, without --delta, --config, --starts and --latency")
             from .live import live  # imported here, because other flights do not need it
 
+            length = 30.0 if seconds is None else seconds
             return live(
-                policy, resume, flight=flight, adapt=adapt, residual=residual, seconds=seconds or 30.0, seed=seed,
+                policy, resume, flight=flight, adapt=adapt, residual=residual, seconds=length, seed=seed,
                 save_vehicle=save_vehicle, trust=trust, out=out,
             )(stop)  # fmt: skip
         weights, preset, state = load_inputs(policy, resume, delta, trust=trust)
