@@ -1,6 +1,7 @@
 """An exported policy has the results of JAX in every format; a file with different results is refused."""
 
 import ast
+import dataclasses
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from retrim.control.controller import PolicyController
 from retrim.control.lora import LoraPolicy
 from retrim.errors import CheckpointError, ConfigError
 from retrim.export import runner
-from retrim.export.checking import FLAGS
+from retrim.export.checking import FLAGS, Parity
 from retrim.export.export import FORMATS, PARITY, export
 from retrim.export.portable import commands, observations, portable_of
 from retrim.export.runner import Runner
@@ -207,6 +208,32 @@ def test_foreign_runner_file_is_not_overwritten(policy_file, tmp_path):
     assert "\n" not in str(error.value)
     assert (tmp_path / "runner.py").read_text() == "print('mine')\n"
     assert not (tmp_path / "r.npz").exists()
+
+
+@HAS_C
+@pytest.mark.parametrize(
+    ("file", "name"), [("é.h", "policy__"), ("2nd.h", "policy_2nd"), ("_.h", "policy__"), ("int.h", "int")]
+)
+def test_every_file_name_gives_a_valid_header(file, name, policy_file, tmp_path):
+    """Names that begin with two underscores or a digit are not available to a program."""
+    export(policy_file, "c", tmp_path / file, None, Silent())
+    assert f"static inline int {name}_finite(" in (tmp_path / file).read_text()
+
+
+@pytest.mark.parametrize("fails", ["with an error", "with a deviation"])
+def test_file_that_fails_its_check_replaces_nothing(fails, policy_file, tmp_path, monkeypatch):
+    def check(path, *_):
+        if fails == "with an error":
+            raise ConfigError(f"{path.name}: does not compile")
+        return Parity("gcc", 0.1, 1e-6)
+
+    monkeypatch.setitem(FORMATS, "c", dataclasses.replace(FORMATS["c"], check=check))
+    (tmp_path / "p.h").write_text("earlier")
+    for path in (tmp_path / "p.h", tmp_path / "new.h"):
+        with pytest.raises(ConfigError, match=r"does not compile|nothing was written"):
+            export(policy_file, "c", path, None, Silent())
+    assert [each.name for each in tmp_path.iterdir()] == ["p.h"]
+    assert (tmp_path / "p.h").read_text() == "earlier"
 
 
 def test_missing_policy_is_named(tmp_path):

@@ -24,9 +24,9 @@ def write_c(path: Path, policy: Portable) -> list[Path]:
 
 
 def name_of(path: Path) -> str:
-    """Return the prefix of all names in the header file at ``path``."""
+    """Return the prefix of all names in the header file at ``path``: its name, which must begin with a letter in C."""
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
-    return f"_{name}" if name[0].isdigit() else name
+    return name if re.match("[A-Za-z]", name) else f"policy_{name}"
 
 
 def remark(text: object) -> str:

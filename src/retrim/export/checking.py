@@ -95,7 +95,7 @@ def check_c(path: Path, policy: Portable, rows: np.ndarray, commands: np.ndarray
         words = [compiler, *FLAGS, "main.c", "-o", "main", "-lm"]
         compilation = subprocess.run(words, cwd=place, capture_output=True, text=True, timeout=LONGEST)
         if compilation.returncode != 0:
-            raise ConfigError(f"{path}: does not compile: {compilation.stderr[:300]}")
+            raise ConfigError(f"{path.name}: does not compile: {compilation.stderr[:300]}")
         process = subprocess.run([str(place / "main")], input=rows.tobytes(), capture_output=True, timeout=LONGEST)
     seconds, own = (float(word) for word in process.stderr.split())
     outputs = np.frombuffer(process.stdout, dtype=np.float32).reshape(-1, 4)

@@ -1,5 +1,6 @@
 """Write a policy in another format, run the result and compare it with JAX."""
 
+import tempfile
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 from ..config.setup import Setup
 from ..errors import ConfigError
 from ..io.checkpoint import load_delta
+from ..io.files import write_whole
 from ..io.policies import load_policy
 from ..runkit.reporter import Reporter
 from .c_header import write_c
@@ -72,18 +74,24 @@ def export(
     if delta is not None:
         weights = load_delta(delta, weights).merged()
     portable = portable_of(weights, Setup.from_preset(preset))
-    paths = FORMATS[to].write(path, portable)
     rows = SPREAD * observations(portable.sizes[0], ROWS, seed=1)
-    result = FORMATS[to].check(path, portable, rows, commands(weights, rows))
+    with tempfile.TemporaryDirectory() as folder:  # the target is replaced only after the check
+        staged = FORMATS[to].write(Path(folder) / path.name, portable)
+        result = FORMATS[to].check(staged[0], portable, rows, commands(weights, rows))
+        contents = {path.with_name(each.name): each.read_bytes() for each in staged}
+    if result is not None and not result.worst <= PARITY:
+        raise ConfigError(
+            f"{path}: {result.by} deviates from JAX by {result.worst:.1e} of the command range; nothing was written"
+        )
+    for each, content in contents.items():
+        if each != path and each.exists() and (not each.is_file() or each.read_bytes() != content):
+            raise ConfigError(f"{each} already exists, and is not the runner of this release: move it, or choose --out")
+    for each, content in contents.items():
+        write_whole(each, content)
+    paths = list(contents)
     if result is None:
         reporter.say(f"{path} was not run: there is nothing here that runs it")
         return paths
-    if not result.worst <= PARITY:
-        for each in paths:
-            each.unlink(missing_ok=True)
-        raise ConfigError(
-            f"{path}: {result.by} deviates from JAX by {result.worst:.1e} of the command range; the files were removed"
-        )
     reporter.say(
         f"{result.by} and JAX: {result.worst:.1e} of the command range at most, on {len(rows)} observations; "
         f"{1e6 * result.step_s:.1f} µs a step"

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from ..control.lora import LoraPolicy
-from ..errors import ConfigError
 from ..io.checkpoint import fingerprint
 from ..io.files import npz_bytes, write_whole
 from .portable import Portable
@@ -16,14 +15,8 @@ RUNNER = "runner.py"
 
 
 def write_npz(path: Path, policy: Portable) -> list[Path]:
-    """Write a policy, with the runner in the same folder; return both paths.
-
-    Raises:
-        ConfigError: A different file already has the name of the runner.
-    """
+    """Write a policy, with the runner in the same folder; return both paths."""
     runner, code = path.with_name(RUNNER), files(__package__).joinpath(RUNNER).read_bytes()
-    if runner.exists() and (not runner.is_file() or runner.read_bytes() != code):
-        raise ConfigError(f"{runner} already exists, and is not the runner of this release: move it, or choose --out")
     about = {**policy.about, "layers": len(policy.layers), "observation": policy.observation}
     arrays = {f"w{i}": w for i, (w, _) in enumerate(policy.layers)} | {
         f"b{i}": b for i, (_, b) in enumerate(policy.layers)
