@@ -9,7 +9,7 @@ import pytest
 from fake_flights import flight
 from helpers import tiny_preset
 from retrim import Event, Scenario, Setup
-from retrim.evaluation.figures import _colours, picture, spans
+from retrim.evaluation.figures import _colours, file_stem, picture, spans
 from retrim.runkit import FlightSpec
 from retrim.viz.panels import bars
 
@@ -35,6 +35,17 @@ def test_plot_shows_only_flights_of_its_scenario(tmp_path):
     assert names[0].name == "hover_wind_3_payload_0.1.png"
     again = picture([adapted_policy], setup, scenario, tmp_path, stem="mine")
     assert dataclasses.asdict(scenario)["disturbance"] in again[1].read_text()
+
+
+def test_long_names_are_shortened_to_different_files(tmp_path):
+    """A sum of many disturbances is longer than a file name can be; short names remain readable."""
+    long = [f"hover_{'+'.join(['wind=3'] * 50)}+payload=0.{k}" for k in range(3)] + ["飛" * 80]
+    stems = [file_stem(name) for name in long]
+    assert len(set(stems)) == len(long)
+    for stem in stems:
+        (tmp_path / f"{stem}.png").touch()
+    assert stems[0].startswith("hover_wind_3_wind_3")
+    assert file_stem("hover_wind=3+payload=0.1") == "hover_wind_3_payload_0.1"
 
 
 def test_plot_labels_methods(tmp_path):

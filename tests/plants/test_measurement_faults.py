@@ -119,6 +119,9 @@ def test_every_registered_fault_has_a_default_size():
     [
         ("late=0", "size must be between 1 and 25 ticks, got 0"),
         ("late=x", "'x' is not a number"),
+        ("late=1.5", "must be a whole number of ticks, got 1.5"),
+        ("frozen=2.5", "must be a whole number of ticks, got 2.5"),
+        ("gaps=1.1", "must be a whole number of ticks, got 1.1"),
         ("repeated=1.5", "between 0 and 0.95"),
         ("none=1", "has no size"),
         ("latte", "latte"),

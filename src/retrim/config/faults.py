@@ -22,6 +22,7 @@ from .registry import Registry
 from .sizes import name_and_size
 
 NO_FAULT = "none"
+TICKS = "ticks"
 
 FaultFactory = Callable[[float | None], AbstractMeasurementFault | None]
 """Function that takes a size (or None for the default size) and returns a fault."""
@@ -58,6 +59,8 @@ def _register(
         value = default if size is None else size
         if not low <= value <= high:
             raise ConfigError(f"fault {name!r}: the size must be between {low:g} and {high:g} {unit}, got {value:g}")
+        if unit == TICKS and not value.is_integer():
+            raise ConfigError(f"fault {name!r}: the size must be a whole number of {TICKS}, got {value:g}")
         return make(value)
 
     FAULTS.register(name, make_checked)
@@ -88,12 +91,12 @@ FAULTS.register(NO_FAULT, _none)
 _register("velocity-spikes", partial(_velocity_error, every=25), 2.0, -20.0, 20.0, "m/s")
 _register("rare-spikes", partial(_velocity_error, every=150), 3.0, -20.0, 20.0, "m/s")
 _register("swapped-markers", _swap_markers, 1.5, -3.2, 3.2, "rad")
-_register("late", lambda size: Late(round(size)), 3.0, 1.0, 25.0, "ticks")
-_register("frozen", lambda size: Frozen(jnp.array(200), round(size)), 15.0, 1.0, 100.0, "ticks")
+_register("late", lambda size: Late(round(size)), 3.0, 1.0, 25.0, TICKS)
+_register("frozen", lambda size: Frozen(jnp.array(200), round(size)), 15.0, 1.0, 100.0, TICKS)
 _register("repeated", lambda size: Repeated(jnp.array(size)), 0.2, 0.0, 0.95, "of all measurements")
 _register("scaled-velocity", lambda size: ScaledVelocity(jnp.array(size)), 0.5, 0.0, 3.0, "times the velocity")
 _register("velocity-bias", partial(_velocity_error, every=1), 0.1, -5.0, 5.0, "m/s")
 _register("attitude-bias", _tilt, 0.03, -0.5, 0.5, "rad")
 _register("drift", lambda size: DriftingPosition(_along_x(size), jnp.array(250.0)), 0.1, 0.0, 5.0, "m")
-_register("gaps", lambda size: Gaps(150, round(size)), 5.0, 1.0, 50.0, "ticks")
+_register("gaps", lambda size: Gaps(150, round(size)), 5.0, 1.0, 50.0, TICKS)
 _register("clock-jumps", lambda size: JumpingClock(100, size), 0.1, -2.0, 2.0, "s")

@@ -19,7 +19,11 @@ from .validation import read_toml, validate
 
 INCH = 0.0254  # [m]
 MILLI = (("ms", 1e-3),)
-Rate = Annotated[Positive, AfterValidator(at_most(40.0, "rad/s", ("deg/s", math.pi / 180.0)))]
+Rate = Annotated[
+    float,
+    Field(ge=0.1, allow_inf_nan=False, strict=True),
+    AfterValidator(at_most(40.0, "rad/s", ("deg/s", math.pi / 180.0))),
+]
 Damping = Annotated[float, Field(ge=0.1, le=10.0, strict=True)]
 Lag = Annotated[Positive, AfterValidator(at_most(2.0, "s", *MILLI))]
 

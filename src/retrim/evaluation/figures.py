@@ -1,5 +1,6 @@
 """Draws pictures of flights."""
 
+import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -26,6 +27,7 @@ from ..tasks.track import AbstractTrack
 from ..tasks.transition import SplicedReference
 from ..viz import animation, plots
 
+LONGEST_STEM = 200  # [bytes]; file systems accept names of 255
 USER_EVENTS = ("request", "asked", "knobs", "reference")
 """Kinds of events that a user causes in a live flight; "asked" is in earlier recordings."""
 
@@ -86,8 +88,15 @@ def picture(
         x, y, z = (float(value) for value in task.home())
         beside = partial(plots.paths, groups=groups, goal=(x, y, z))
     figure = plots.flight_figure(title, groups, spans(scenario.disturbance, task.home(), seconds), beside)
-    clean = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in f"{preset.task}_{scenario.disturbance}")
-    return plots.save(figure, folder, stem or clean)
+    return plots.save(figure, folder, stem or file_stem(f"{preset.task}_{scenario.disturbance}"))
+
+
+def file_stem(name: str) -> str:
+    """Return a file name without its suffix for a name; a digest replaces the end of a name that is too long."""
+    stem = "".join(sign if sign.isalnum() or sign in "-." else "_" for sign in name)
+    if len(stem.encode()) <= LONGEST_STEM:
+        return stem
+    return f"{stem[: LONGEST_STEM // 4]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def animate(
