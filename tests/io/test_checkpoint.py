@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import os
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,6 +18,7 @@ from safetensors.numpy import load_file, save_file
 from retrim import CheckpointError
 from retrim.control import Policy
 from retrim.io import read_policy, write_policy
+from retrim.io.files import read_bounded, write_whole
 from retrim.physics import small
 from retrim.transport import message, wire
 
@@ -60,8 +63,31 @@ def test_missing_file_is_refused(tmp_path):
         read_policy(tmp_path / "nothing")
     with pytest.raises(CheckpointError, match=r"policy\.safetensors: no such file"):
         read_policy(tmp_path)  # a folder without a policy
-    with pytest.raises(CheckpointError, match="/dev/zero: no such file"):
+    with pytest.raises(CheckpointError, match="/dev/zero: not a regular file, but a device or a pipe; `retrim"):
         read_policy("/dev/zero")
+
+
+def test_reason_why_file_cannot_be_read_is_named(tmp_path):
+    """An existing folder or pipe is not called missing."""
+    os.mkfifo(tmp_path / "pipe")
+    for name, reason in (
+        (".", "not a regular file, but a folder; make it"),
+        ("pipe", "not a regular file, but a device or a pipe; make it"),
+        ("nothing", "no such file; make it"),
+        ("x" * 300, r"cannot be read \(File name too long\)"),
+    ):
+        with pytest.raises(CheckpointError, match=reason):
+            read_bounded(tmp_path / name, "make it")
+
+
+def test_error_of_writing_names_target(tmp_path):
+    """The user did not ask for the partial file, which is gone."""
+    (tmp_path / "folder").mkdir()
+    for path in (Path("/proc/policy.npz"), tmp_path / "folder"):
+        with pytest.raises(OSError, match=path.name) as error:
+            write_whole(path, b"1")
+        assert (error.value.filename, error.value.filename2) == (str(path), None)
+    assert [each.name for each in tmp_path.iterdir()] == ["folder"]
 
 
 @pytest.mark.parametrize("keep", [0, 5, 100, 5000, -1])

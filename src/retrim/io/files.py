@@ -18,7 +18,7 @@ def write_whole(path: Path, data: bytes | str) -> None:
     """Write a file via a partial one in the same folder; an interruption leaves either the old file or the new one.
 
     Raises:
-        OSError: The folder cannot be written, or the disk is full.
+        OSError: The folder cannot be written, or the disk is full; the error names ``path``, not the partial file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
@@ -30,7 +30,7 @@ def write_whole(path: Path, data: bytes | str) -> None:
         partial.replace(path)
     except OSError as error:
         if error.errno is not None:
-            error.filename = error.filename or str(path)  # the error for a full disk does not contain a file name
+            error.filename, error.filename2 = str(path), None
         raise
     finally:
         with contextlib.suppress(OSError):
@@ -63,11 +63,14 @@ def read_bounded(path: Path, advice: str) -> bytes:
         CheckpointError: The file is missing or is not a regular file (the message then contains ``advice`` on how
             to make one), is too large, or cannot be read.
     """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such file; {advice}")
-    if (size := path.stat().st_size) > MAX_BYTES:
-        raise CheckpointError(f"{path}: {size} bytes, more than the {MAX_BYTES} that are accepted")
     try:
+        if path.is_dir():
+            raise CheckpointError(f"{path}: not a regular file, but a folder; {advice}")
+        if not path.is_file():
+            reason = "not a regular file, but a device or a pipe" if path.exists() else "no such file"
+            raise CheckpointError(f"{path}: {reason}; {advice}")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise CheckpointError(f"{path}: {size} bytes, more than the {MAX_BYTES} that are accepted")
         return path.read_bytes()
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
