@@ -456,7 +456,7 @@ def test_raptor_flies_with_policies_trained_for_its_vehicles(tmp_path, monkeypat
     ]  # fmt: skip
     for section in plan:
         assert tuple(section.methods) == table.METHODS
-        assert section.levels == table.DISTURBED
+        assert section.levels == table.DISTURBANCES
         assert section.drawn_methods == ("raptor", "full")
         assert section.title.endswith(section.preset.vehicle)
 
