@@ -96,7 +96,6 @@ def test_flight_may_excite_vehicle_but_not_change_its_family():
         ("vision/paper", {"vision": {"encoder_steps": 7}}, "vision.encoder_steps = 7, .* with 10000"),
         ("vision/paper", {"vision": {"encoder_motions": "near"}}, "vision.encoder_motions = 'near', .* with 'wild'"),
         ("vision/paper", {"goal": (0.0, 0.0, 2.0)}, "goal = "),
-        ("hover/fast", {"task": "math:pi", "options": {"yaw": 0.3}}, r"options = \{'yaw': 0.3\}, .* with \{\}"),
     ],
 )
 def test_flight_cannot_change_what_policy_observes(name, changes, text):

@@ -8,7 +8,7 @@ from typing import Any
 from ..errors import ConfigError
 from .presets import Preset, Vision
 
-TRAINED = ("task", "vehicle", "dt", "axes", "command_history", "options")
+TRAINED = ("task", "vehicle", "dt", "axes", "command_history")
 ABSOLUTE = ("blind", "both")  # observations of the position itself, not relative to the reference
 FLOWN = ("occlusion", "pixel_noise", "dropout")
 """Values of the table [vision] that are conditions of a flight; its other values belong to the weights."""
