@@ -22,12 +22,12 @@ MEMORY = 1e4  # [s]: the vehicle does not change during a flight
 LEAST = 1.0  # shortest flight [s]
 
 
-def check_vehicle_file(path: Path | None, flown: str | None = None) -> None:
+def check_vehicle_file(path: Path | None, vehicle: str | None = None) -> None:
     """Check the file of ``--save-vehicle`` before the flight.
 
     Args:
-        path: File to write; None if the option is not given.
-        flown: Vehicle of the flight, which may be a vehicle file; None for the training vehicle.
+        path: File to write, if any.
+        vehicle: Vehicle of the flight, which may be a vehicle file; by default the training vehicle.
 
     Raises:
         ConfigError: The name does not end in .toml, the folder does not exist or cannot be written, or the file exists
@@ -40,7 +40,7 @@ def check_vehicle_file(path: Path | None, flown: str | None = None) -> None:
     if not path.absolute().parent.is_dir():
         raise ConfigError(f"--save-vehicle {path}: folder {path.absolute().parent} does not exist; create it first")
     if path.exists():
-        if flown is not None and Path(flown).exists() and path.samefile(flown):
+        if vehicle is not None and Path(vehicle).exists() and path.samefile(vehicle):
             raise ConfigError(f"--save-vehicle {path}: is the file of --vehicle; choose another name")
         if not path.is_file() or not read_bounded(path, "").startswith(MARK.encode()):
             raise ConfigError(f"--save-vehicle {path}: exists, and is not an identified vehicle; choose another name")
@@ -52,8 +52,8 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
 
     Args:
         flight: Flight to identify the vehicle from.
-        setup: Set-up of the policy that flew. Its vehicle was flown if the flight's scenario has none.
-        path: File to write; None if the option is not given.
+        setup: Set-up of the policy; its vehicle is used if the flight's scenario has none.
+        path: File to write, if any.
         faults: Receives a line if the vehicle cannot be identified, written or flown.
     """
     if path is None:
@@ -76,7 +76,7 @@ def flight_vehicle_toml(log: Log, spec: str | VehicleSpec, name: str) -> str:
 
     Args:
         log: The flight.
-        spec: The vehicle that was flown.
+        spec: Vehicle of the flight.
         name: Name of the flight, for the comment.
 
     Raises:
