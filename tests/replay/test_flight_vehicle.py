@@ -65,7 +65,7 @@ def test_vehicle_that_cannot_be_flown_is_written_and_reported(sample_flight, tmp
     )
     assert write_flight_vehicle(*sample_flight, path, faults) == [path]
     (fault,) = faults
-    assert fault.startswith(f"--save-vehicle {path}: the vehicle is identified, but cannot be flown: thrust_max = ")
+    assert fault.startswith(f"--save-vehicle {path}: the vehicle is identified, but cannot fly: thrust_max = ")
     assert "\n" not in fault
 
 

@@ -194,7 +194,7 @@ def test_vehicle_that_cannot_be_flown_is_written_and_reported(thrust, is_flown, 
     document = replay(files[0], calls, Run("replay", tmp_path), Silent())
     assert document.files == [tmp_path / "replay.md", tmp_path / "vehicle.toml"]
     text = (tmp_path / "replay.md").read_text()
-    assert ("cannot be flown, and `retrim pretrain` refuses it**: thrust_max = " in text) is not is_flown
+    assert ("cannot fly, and `retrim pretrain` refuses it**: thrust_max = " in text) is not is_flown
     if is_flown:
         read_vehicle(tmp_path / "vehicle.toml")
     else:

@@ -29,7 +29,7 @@ from .options import join_names, option
 def load_inputs(
     policy: Path | None, resume: Path | None, delta: Path | None = None, *, trust: Collection[str] = ()
 ) -> tuple[AbstractPolicy, Preset, LearnerState | None]:
-    """Return the weights, the preset, and the learner state of an earlier flight (or None).
+    """Return the weights, the preset, and the learner state of an earlier flight, if any.
 
     Args:
         policy: A policy, or the folder that contains one.
@@ -142,7 +142,7 @@ def reference_of_flight(preset: Preset, name: str | None) -> str | None:
 
     Args:
         preset: Preset of the policy.
-        name: Name of the reference; None for the training reference.
+        name: Name of the reference; by default, the training reference.
 
     Raises:
         ConfigError: The policy cannot follow this reference.
@@ -182,7 +182,7 @@ def training_preset(
         reference: Reference to track; overrides the preset and the file.
         residual: Residual model for later adaptation; overrides the preset and the file.
         trust: Python names that the file may contain, e.g. ``mine:task``.
-        **pretrain: Values for the table ``pretrain`` that override the preset and the file; None changes nothing.
+        **pretrain: Values for the table ``pretrain`` that override the preset and the file, except those that are None.
 
     Raises:
         ConfigError: A name, key or value is invalid.

@@ -36,10 +36,10 @@ class MethodRequest:
     policy: Any
     """Policy, or the network of a method that uses its own network."""
     key: Key[Array, ""] | None = None
-    """Random key of the method; None for a deterministic method."""
+    """Random key of the method, unless it is deterministic."""
     latency: "Latency" = "fixed"
     state: LearnerState | None = None
-    """Learner state of an earlier flight, from which to continue; None for a new learner state."""
+    """Learner state of an earlier flight, from which to continue; by default, a new learner state."""
 
     def controller(self) -> AbstractController[Any]:
         """Return the policy with the observation used in flight."""

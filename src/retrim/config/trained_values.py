@@ -8,37 +8,37 @@ from typing import Any
 from ..errors import ConfigError
 from .presets import Preset, Vision
 
-TRAINED = ("task", "vehicle", "dt", "axes", "command_history")
+WEIGHT_KEYS = ("task", "vehicle", "dt", "axes", "command_history")
 ABSOLUTE = ("blind", "both")  # observations of the position itself, not relative to the reference
-FLOWN = ("occlusion", "pixel_noise", "dropout")
+CONDITION_KEYS = ("occlusion", "pixel_noise", "dropout")
 """Values of the table [vision] that are conditions of a flight; its other values belong to the weights."""
 
 
-def same_policy(original: Preset, changed_one: Preset, config: Path) -> Preset:
-    """Return ``changed_one``, unless it changes a value that the weights depend on.
+def same_policy(original: Preset, candidate: Preset, config: Path) -> Preset:
+    """Return ``candidate``, unless it changes a value that the weights depend on.
 
     Args:
         original: Preset of the policy.
-        changed_one: Preset with the values of a file.
+        candidate: Preset with the values of a file.
         config: The file, for the message.
 
     Raises:
-        ConfigError: ``changed_one`` changes such a value.
+        ConfigError: ``candidate`` changes such a value.
     """
-    before, after = dict(_trained(original)), dict(_trained(changed_one))
+    before, after = dict(_weight_values(original)), dict(_weight_values(candidate))
     for name in {**before, **after}:
         if before.get(name) != after.get(name):
             raise ConfigError(
                 f"{config}: {name} = {after.get(name)!r}, but the policy was trained with {before.get(name)!r}"
             )
-    if original.pretrain != changed_one.pretrain:
+    if original.pretrain != candidate.pretrain:
         raise ConfigError(f"{config}: [pretrain] cannot change for a policy that is trained")
-    return changed_one
+    return candidate
 
 
-def _trained(preset: Preset) -> Iterator[tuple[str, Any]]:
+def _weight_values(preset: Preset) -> Iterator[tuple[str, Any]]:
     """Yield the values of a preset that the weights depend on, with their names."""
-    for name in TRAINED:
+    for name in WEIGHT_KEYS:
         yield name, getattr(preset, name)
     family = preset.family and dataclasses.replace(preset.family, excitation=False)  # independent of the excitation
     yield "family", family
@@ -50,5 +50,5 @@ def _trained(preset: Preset) -> Iterator[tuple[str, Any]]:
         yield "goal", preset.goal
     if preset.task == "vision":
         for field in dataclasses.fields(Vision):
-            if field.name not in FLOWN:
+            if field.name not in CONDITION_KEYS:
                 yield f"vision.{field.name}", getattr(preset.vision or Vision(), field.name)

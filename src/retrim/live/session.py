@@ -52,7 +52,7 @@ def live_setup(preset: Preset, reference: str | None, method: str) -> Setup:
 
     Args:
         preset: Preset of the policy.
-        reference: Reference of the flight; None for the one in the preset.
+        reference: Reference of the flight; by default, the one in the preset.
         method: Method of the flight.
 
     Raises:
@@ -81,8 +81,8 @@ def check_limits(fence: float, seconds: float | None, policy_age: float | None) 
 
     Args:
         fence: Maximum distance of the vehicle from the reference [m].
-        seconds: Duration of the flight [s]; None to fly until the user stops the flight.
-        policy_age: Maximum age of the flight data from which the policy was learned [s]; None for no limit.
+        seconds: Duration of the flight [s]; by default, the user stops the flight.
+        policy_age: Maximum age of the flight data from which the policy was learned [s]; by default, there is no limit.
 
     Raises:
         ConfigError: One of the limits is out of range.
@@ -114,13 +114,13 @@ class LiveRequest:
     state: LearnerState | None = None
     """Learned state of an earlier flight, from which learning continues."""
     page: tuple[str, int] | None = None
-    """Address and port of the page; None for a flight without a page."""
+    """Address and port of the page, if any."""
     learners: Address | None = None
-    """Address of the learners on another machine; None for learners on this machine."""
+    """Address of the learners on another machine; by default, they run on this machine."""
     policy_age: float = float("inf")
     """Maximum age of the flight data from which the policy was learned [s]."""
     record: Path | None = None
-    """Path of an additional recording; None for no additional recording."""
+    """Path of an additional recording, if any."""
     until_stop: bool = False
     """Whether an interruption is the intended end of the flight."""
 
@@ -193,9 +193,9 @@ def learners_at(text: str | None, say: Callable[[str], None], key: Path | None =
     """Return the address of the learners on another machine; None if the learners run on this machine.
 
     Args:
-        text: Address, e.g. ``zenoh:192.168.1.5:7447``; None for this machine.
+        text: Address, e.g. ``zenoh:192.168.1.5:7447``; by default, this machine.
         say: Function that is called with messages for the user.
-        key: File with the key that the flight shares with the learners; None for the key from ``RETRIM_KEY``, if set.
+        key: File with the key that the flight shares with the learners; by default, the key in ``RETRIM_KEY``, if any.
 
     Raises:
         ConfigError: The text is not an address, a required package is not installed, an address outside this machine
@@ -244,7 +244,7 @@ def learner_state(request: LiveRequest, policy: AbstractPolicy, method: str, res
         request: Request for the flight.
         policy: Policy from which the learners start.
         method: Learning method.
-        residual: State of the fitted residual; None for the initial state.
+        residual: State of the fitted residual; by default, the initial state.
     """
     key, prepare = request.flight.key(), find_method(method).learns
     start_policy = policy if prepare is None else prepare(request.setup, policy, key)

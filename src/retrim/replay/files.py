@@ -33,7 +33,7 @@ def clear_outputs(folder: Path, keep: Collection[Path] = ()) -> None:
 def write_vehicle(
     document: Document, identification: IdentifiedVehicle, setup: Setup, log: str, *, remark: str = ""
 ) -> None:
-    """Write ``vehicle.toml``; a vehicle that cannot be flown is reported with the reason.
+    """Write ``vehicle.toml``; if the vehicle cannot fly, report the reason.
 
     Args:
         document: Report that receives the reason.
@@ -46,12 +46,12 @@ def write_vehicle(
     path = document.run.write_text("vehicle.toml", text)
     document.files.append(path)
     if reason := refusal_of(path):
-        about = f"**The vehicle of vehicle.toml cannot be flown, and `retrim pretrain` refuses it**: {reason}"
+        about = f"**The vehicle of vehicle.toml cannot fly, and `retrim pretrain` refuses it**: {reason}"
         document.add(TableSection((), (), "", about))
 
 
 def refusal_of(path: Path) -> str:
-    """Return the reason why a vehicle file cannot be flown, in one line; empty if it can be."""
+    """Return the reason, in one line, for which the vehicle of a file cannot fly; empty if it can."""
     try:
         read_vehicle(path)
     except ConfigError as error:

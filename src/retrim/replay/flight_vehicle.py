@@ -54,7 +54,7 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
         flight: Flight to identify the vehicle from.
         setup: Set-up of the policy; its vehicle is used if the flight's scenario has none.
         path: File to write, if any.
-        faults: Receives a line if the vehicle cannot be identified, written or flown.
+        faults: Receives a line if the vehicle cannot be identified or written, or cannot fly.
     """
     if path is None:
         return []
@@ -65,7 +65,7 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
         faults.append(f"--save-vehicle {path}: {error}")
         return []
     if reason := refusal_of(path):
-        faults.append(f"--save-vehicle {path}: the vehicle is identified, but cannot be flown: {reason}")
+        faults.append(f"--save-vehicle {path}: the vehicle is identified, but cannot fly: {reason}")
     return [path]
 
 

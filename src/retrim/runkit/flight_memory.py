@@ -89,8 +89,8 @@ class FlightMemory:
             raise CheckpointError(f"{path}: is the memory of vehicle {owner!r}, expected {name!r}")
         if about.get("digest") != self.digest:
             raise CheckpointError(
-                f"{path}: must be the memory of this vehicle {name!r}, but was written for one with other values; "
-                "choose another --memory, or remove the file"
+                f"{path}: must be the memory of this vehicle {name!r}, but was written for other values, or by an "
+                "earlier release; choose another --memory, or remove the file"
             )
         check_size(residual, source=str(path), largest=LARGEST_NUMBER)
         residual_state = recall(residual)
@@ -152,11 +152,11 @@ def recall_flight(
     """Return the memory of a place, and the learner state at the start of the flight.
 
     Args:
-        folder: Folder of the place; None for a flight without memory.
+        folder: Folder of the place, if the flight has a memory.
         setup: Set-up of the flight.
         scenario: Scenario of the flight, with its vehicle.
         policy: Policy of the flight.
-        state: Learner state from which the flight resumes; None for an untrained one.
+        state: Learner state from which the flight resumes, if any.
         method: Method of the flight.
         seed: Seed of the flight.
         say: Function that receives a line about the memory and its age.

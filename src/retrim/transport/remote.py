@@ -109,7 +109,7 @@ def flights_at(texts: Sequence[str], key: Path | None) -> list[Address]:
 
     Args:
         texts: For example ``zenoh:192.168.1.5:7447``.
-        key: File with the key that the flights also have; None for the key in ``RETRIM_KEY``, if it is set.
+        key: File with the key that the flights also have; by default, the key in ``RETRIM_KEY``, if any.
 
     Raises:
         ConfigError: There is no address, an address is invalid, or the key cannot be read.
