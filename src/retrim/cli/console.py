@@ -15,7 +15,7 @@ from ..runkit.document import TableSection
 from ..runkit.reporter import Advance
 from ..runkit.run import Run
 
-console = Console(highlight=False)
+console, error_console = Console(highlight=False), Console(highlight=False, stderr=True)
 Trust = tyro.conf.UseAppendAction[tuple[str, ...]]  # `--trust a:b --trust c:d`
 LINE_EVERY = 10.0  # [s]: interval between progress lines if the output is not a terminal
 
@@ -65,8 +65,8 @@ def report_start(run: Run) -> Run:
 
 
 def refuse(message: str) -> int:
-    """Print an error on one line, and return the exit code."""
-    console.print(f"[bold red]retrim:[/] {escape(one_line(message))}", soft_wrap=True)
+    """Print an error on one line of the standard error, and return the exit code."""
+    error_console.print(f"[bold red]retrim:[/] {escape(one_line(message))}", soft_wrap=True)
     return 1
 
 

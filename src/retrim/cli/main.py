@@ -3,13 +3,13 @@
 Command modules are imported only when they are needed, so --help is fast.
 """
 
-import os
 import sys
 import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 
 from ..signals import stop_on_signal
+from ..standard_outputs import tolerate_lost_outputs
 
 PACKAGE = __name__.rpartition(".")[0]
 COMMANDS = {
@@ -71,14 +71,17 @@ def main(words: Sequence[str] | None = None) -> None:
     """Run a command and exit.
 
     Exit codes: 0 for success, 1 for an error with a message, 2 for wrong usage, 130 for an interruption. Results
-    from before an interruption are kept.
+    from before an interruption are kept. A standard output that cannot be
+    written, for example after a pipe was closed, changes neither.
 
     Args:
         words: Command and options; by default, ``sys.argv``.
     """
     if words is not None:
         sys.argv = ["retrim", *words]  # results record this command line
-    sys.exit(_run(sys.argv[1:]))
+    with tolerate_lost_outputs():
+        code = _run(sys.argv[1:])
+    sys.exit(code)
 
 
 def _run(words: list[str]) -> int:
@@ -105,9 +108,6 @@ def _run(words: list[str]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the pipe is closed: avoid errors at exit
-        return 1
 
 
 def _command(name: str, about: str, module: str, words: list[str], stop: threading.Event) -> int:
