@@ -43,7 +43,11 @@ def handle_signals(handler: Handler) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_signal(stop: threading.Event) -> Iterator[None]:
-    """Make ending signals set ``stop`` and raise KeyboardInterrupt; ``stop`` stays set if JAX swallows the error."""
+    """Make ending signals set ``stop`` and raise KeyboardInterrupt; ``stop`` stays set if JAX swallows the error.
+
+    Raises:
+        KeyboardInterrupt: A signal arrived, or ``stop`` was already set.
+    """
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -56,6 +60,8 @@ def stop_on_signal(stop: threading.Event) -> Iterator[None]:
     hook, sys.unraisablehook = sys.unraisablehook, report_signal
     try:
         with handle_signals(handle):
+            if stop.is_set():
+                raise KeyboardInterrupt
             yield
     finally:
         sys.unraisablehook = hook

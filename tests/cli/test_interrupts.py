@@ -1,5 +1,6 @@
 """Ctrl-C, SIGTERM or SIGHUP at any moment: exit code 130, no traceback, and finished work is saved."""
 
+import importlib
 import re
 import signal
 
@@ -22,6 +23,31 @@ def folder(tmp_path_factory, as_a_user):
     preset = tiny_preset()
     save_policy(here / "p" / "policy.safetensors", Setup.from_preset(preset).new_policy(jax.random.key(0)), preset)
     return here
+
+
+IMPORT = """
+import signal
+from pathlib import Path
+
+signal.raise_signal(signal.{name})
+Path("imported").touch()
+
+
+def slow():
+    return lambda stop: Path("called").touch()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_interruption_of_imports_lets_them_finish_and_does_not_start_command(name, tmp_path, monkeypatch):
+    main, module = importlib.import_module("retrim.cli.main"), f"command_{name}"
+    (tmp_path / f"{module}.py").write_text(IMPORT.format(name=name))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(main, "own_commands", lambda: {"slow": ("Do something.", module)})
+    monkeypatch.setattr(signal, "getsignal", lambda number: signal.SIG_DFL)  # the runner of the tests may ignore SIGHUP
+    assert retrim("slow", cwd=tmp_path, code=130) == "interrupted\n"
+    assert (tmp_path / "imported").exists()
+    assert not (tmp_path / "called").exists()
 
 
 PRETRAIN = "pretrain", "hover", "--config", "small.toml"

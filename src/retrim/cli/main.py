@@ -8,7 +8,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 
-from ..signals import stop_on_signal
+from ..signals import handle_signals, stop_on_signal
 from ..standard_outputs import tolerate_lost_outputs
 
 PACKAGE = __name__.rpartition(".")[0]
@@ -71,20 +71,20 @@ def main(words: Sequence[str] | None = None) -> None:
     """Run a command and exit.
 
     Exit codes: 0 for success, 1 for an error with a message, 2 for wrong usage, 130 for an interruption. Results
-    from before an interruption are kept. A standard output that cannot be
-    written, for example after a pipe was closed, changes neither.
+    from before an interruption are kept. A closed or full standard output changes neither.
 
     Args:
         words: Command and options; by default, ``sys.argv``.
     """
     if words is not None:
         sys.argv = ["retrim", *words]  # results record this command line
-    with tolerate_lost_outputs():
-        code = _run(sys.argv[1:])
+    stop = threading.Event()
+    with tolerate_lost_outputs(), handle_signals(lambda *_: stop.set()):  # an exception would break imports
+        code = _run(sys.argv[1:], stop)
     sys.exit(code)
 
 
-def _run(words: list[str]) -> int:
+def _run(words: list[str], stop: threading.Event) -> int:
     if not words or words[0] in ("--help", "-h"):
         print(describe(commands()))
         return 0 if words else 2
@@ -101,10 +101,8 @@ def _run(words: list[str]) -> int:
         hint = f"did you mean {near[0]!r}? " if near else ""
         print(f"retrim: no command {words[0]!r}; {hint}there are {', '.join(entries)}", file=sys.stderr)
         return 2
-    stop = threading.Event()
     try:
-        with stop_on_signal(stop):
-            return _command(words[0], *entries[words[0]], words[1:], stop)
+        return _command(words[0], *entries[words[0]], words[1:], stop)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -132,7 +130,8 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
                 call = tyro.extras.subcommand_cli_from_dict(entries, prog=prog, description=about, args=words)
             else:
                 call = tyro.cli(simplify_help(getattr(command, name)), prog=prog, args=words)
-        code: int = call(stop)
+        with stop_on_signal(stop):
+            code: int = call(stop)
     except Exception as error:
         if full_traceback:
             raise
