@@ -74,16 +74,16 @@ def _notebook_bar(title: str) -> Iterator[Advance]:
 def _terminal_bar(title: str) -> Iterator[Advance]:
     """Show a bar on the standard error, and remove it at the end."""
     from rich.console import Console
-    from rich.markup import escape as plain
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns: tuple[Any, ...] = (
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeElapsedColumn(),
+        TextColumn("{task.description}", markup=False), BarColumn(),
+        TextColumn("{task.fields[note]}", markup=False), TimeElapsedColumn(),
     )  # fmt: skip
     # Without a refresh thread, which would compete with a flight in real time.
     with Progress(*columns, console=Console(stderr=True), auto_refresh=False, transient=True) as bars:
-        task = bars.add_task(plain(title), total=1.0, note="")
-        yield lambda share, text: bars.update(task, completed=share, note=plain(text), refresh=True)
+        task = bars.add_task(title, total=1.0, note="")
+        yield lambda share, text: bars.update(task, completed=share, note=text, refresh=True)
 
 
 def _at_intervals(advance: Advance) -> Advance:

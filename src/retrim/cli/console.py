@@ -6,16 +6,17 @@ from contextlib import contextmanager
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from ..errors import one_line, printable
 from ..runkit.document import TableSection
 from ..runkit.reporter import Advance
 from ..runkit.run import Run
 
-console, error_console = Console(highlight=False), Console(highlight=False, stderr=True)
+# No markup: values from files and paths may contain brackets.
+console, error_console = (Console(highlight=False, markup=False, emoji=False, stderr=x) for x in (False, True))
 Trust = tyro.conf.UseAppendAction[tuple[str, ...]]  # `--trust a:b --trust c:d`
 LINE_EVERY = 10.0  # [s]: interval between progress lines if the output is not a terminal
 
@@ -25,7 +26,7 @@ class RichReporter:
 
     def say(self, text: str) -> None:
         """Print plain text."""
-        console.print(printable(text), markup=False, soft_wrap=True)
+        console.print(printable(text), soft_wrap=True)
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Advance]:
@@ -34,12 +35,12 @@ class RichReporter:
             yield _lines(title)
             return
         columns = (
-            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(), TimeRemainingColumn(),
+            TextColumn("{task.description}", markup=False), BarColumn(),
+            TextColumn("{task.fields[note]}", markup=False), TimeElapsedColumn(), TimeRemainingColumn(),
         )  # fmt: skip
         with Progress(*columns, console=console) as bars:
             bar = bars.add_task(title, total=1.0, note="")
-            yield lambda share, note: bars.update(bar, completed=share, note=escape(printable(note)))
+            yield lambda share, note: bars.update(bar, completed=share, note=printable(note))
 
 
 def _lines(title: str) -> Advance:
@@ -50,9 +51,7 @@ def _lines(title: str) -> Advance:
         now = time.monotonic()
         if now - last[0] >= LINE_EVERY or share >= 1.0:
             last[0] = now
-            console.print(
-                f"{title}: {100 * share:.0f} %, {printable(note)}, {now - began:.0f} s", markup=False, soft_wrap=True
-            )
+            console.print(f"{title}: {100 * share:.0f} %, {printable(note)}, {now - began:.0f} s", soft_wrap=True)
 
     return advance
 
@@ -60,23 +59,28 @@ def _lines(title: str) -> Advance:
 def report_start(run: Run) -> Run:
     """Print a message if a run resumes or overwrites an earlier run, and return the run."""
     if message := run.of_earlier():
-        console.print(message, markup=False, soft_wrap=True)
+        console.print(message, soft_wrap=True)
     return run
 
 
 def refuse(message: str) -> int:
     """Print an error on one line of the standard error, and return the exit code."""
-    error_console.print(f"[bold red]retrim:[/] {escape(one_line(message))}", soft_wrap=True)
+    error_console.print(Text.assemble(("retrim:", "bold red"), " ", one_line(message)), soft_wrap=True)
     return 1
+
+
+def warn(message: str) -> None:
+    """Print a warning."""
+    console.print(Text.assemble(("warning:", "yellow"), " ", printable(message)), soft_wrap=True)
 
 
 def show_table(section: TableSection) -> None:
     """Print a table."""
     if section.title:  # on its own line, since a table wraps titles that are wider than itself
-        console.print(f"[bold]{escape(section.title)}[/]", soft_wrap=True)
+        console.print(section.title, style="bold", soft_wrap=True)
     table = Table()
     for column in section.columns:
-        table.add_column(escape(column))
+        table.add_column(column)
     for row in section.rows:
         table.add_row(*(_style(text) for text in row))
     console.print(table)
@@ -85,9 +89,9 @@ def show_table(section: TableSection) -> None:
 def show_paths(paths: Sequence[object]) -> None:
     """Print the paths of written files."""
     for path in paths:
-        console.print(f"[bold]{escape(str(path))}[/]", soft_wrap=True)
+        console.print(str(path), style="bold", soft_wrap=True)
 
 
-def _style(text: str) -> str:
-    """Convert bold text from Markdown to terminal markup."""
-    return f"[bold]{escape(text.replace('**', ''))}[/]" if text.startswith("**") else escape(text)
+def _style(text: str) -> Text:
+    """Convert bold text from Markdown to terminal text."""
+    return Text(text.replace("**", ""), "bold") if text.startswith("**") else Text(text)

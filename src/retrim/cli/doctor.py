@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from rich.table import Table
 
 from ..evaluation.jax_bug_check import wrong_rows
+from ..runkit.document import TableSection
 from ..runkit.provenance import commit, describe_hardware, versions
-from .console import console
+from .console import show_table
 
 
 def doctor() -> Callable[[threading.Event], int]:
@@ -19,19 +19,14 @@ def doctor() -> Callable[[threading.Event], int]:
 
 def _doctor() -> int:
     wrong = sum(wrong_rows(n, jnp.dtype("float32")) for n in (1_000, 16_385, 32_769))
-    if wrong:
-        verdict = f"[bold red]wrong[/]: {wrong} rows of a batched product; another version of jax is needed"
-    else:
-        verdict = "[green]right[/]"
-    table = Table(show_header=False)
-    for name, value in (
+    verdict = f"**wrong**: {wrong} rows of a batched product; another version of jax is needed" if wrong else "right"
+    rows = (
         ("commit", commit()),
         *versions().items(),
         ("machine", describe_hardware()),
         ("devices of JAX", f"{jax.device_count()}, {jax.default_backend()}"),
         ("compile cache", str(jax.config.values["jax_compilation_cache_dir"])),
         ("batched products (jax-ml/jax#39103)", verdict),
-    ):
-        table.add_row(name, value)
-    console.print(table)
+    )
+    show_table(TableSection(("part", "value"), rows))
     return 1 if wrong else 0

@@ -25,7 +25,7 @@ from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outlet import Outlet
 from ..runkit.run import INTERRUPTED, Run
 from .arguments import METHOD, RESIDUAL, FlightArguments, load_inputs, with_residual
-from .console import RichReporter, Trust, console, refuse, report_start, show_paths, show_table
+from .console import RichReporter, Trust, console, refuse, report_start, show_paths, show_table, warn
 from .options import option
 
 
@@ -116,7 +116,7 @@ def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, 
     lines = tuple((row["disturbance"], row["method"], *figure_cells(row)) for row in result)
     show_table(TableSection(("disturbance", "method", *figure_columns(fleet.seconds)), lines, title))
     for note in notes(flights, preset):
-        console.print(note, markup=False, soft_wrap=True)
+        console.print(note, soft_wrap=True)
     vehicle_path = write_flight_vehicle(flights[-1], setup, vehicle_file, outlet.faults)
     show_paths([*pictures, *([] if results is None else [results]), *vehicle_path, *memories])
     return run.exit_code or max((refuse(fault) for fault in outlet.faults), default=0)
@@ -126,4 +126,4 @@ def _warn(setup: Setup, scenario: Scenario) -> None:
     """Warn if the reference exceeds the limits of the vehicle."""
     if wrong := setup.limits_exceeded(scenario.make_vehicle(setup.preset.vehicle)):
         who = scenario.vehicle_name(setup.preset.vehicle)
-        console.print(f"[yellow]warning:[/] vehicle {who} cannot fly all of reference {scenario.reference}: {wrong}")
+        warn(f"vehicle {who} cannot fly all of reference {scenario.reference}: {wrong}")

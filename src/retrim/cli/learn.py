@@ -35,7 +35,7 @@ def learn(
         result = flights_at(addresses, key)
         with RichReporter().progress(", ".join(addresses)) as advance:
             last = learn_for(result, stop, lambda text: advance(0.5, text), trust)
-        console.print(printable(last), markup=False, soft_wrap=True)
+        console.print(printable(last), soft_wrap=True)
         return 0
 
     return execute

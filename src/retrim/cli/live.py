@@ -140,7 +140,7 @@ def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None, memory: Flig
 
 def _open_page(url: str, folder: Path) -> None:
     """Print the address of the page, and open it in a browser if the output is a terminal."""
-    console.print(f"page: {url}", markup=False, soft_wrap=True)
+    console.print(f"page: {url}", soft_wrap=True)
     if console.is_terminal:
         open_page(url, folder)
 
@@ -156,10 +156,10 @@ def _display(events: LiveEvents) -> Iterator[Callable[[Status, list[Event]], Non
             screen.update(_screen(status, events), refresh=True)
         elif status.t - last >= LINE_EVERY:
             last = status.t
-            console.print(live_line(status), markup=False, soft_wrap=True)
+            console.print(live_line(status), soft_wrap=True)
         for event in new:
             if event.kind not in ("policy", "residual", "rejected"):
-                screen.console.print(f"{event.t:.1f} s {event.kind}: {event.note}", markup=False, soft_wrap=True)
+                screen.console.print(f"{event.t:.1f} s {event.kind}: {event.note}", soft_wrap=True)
 
     with Live(console=console, auto_refresh=False) as screen:
         yield show

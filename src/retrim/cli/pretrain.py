@@ -14,7 +14,7 @@ from ..runkit.outputs import write_trained_policy
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import ground_warning, nominal_error, train
 from .arguments import training_preset
-from .console import RichReporter, Trust, console, report_start, show_paths
+from .console import RichReporter, Trust, console, report_start, show_paths, warn
 
 
 def pretrain(
@@ -61,7 +61,7 @@ def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event
     setup = Setup.from_preset(preset)
     run, reporter = report_start(Run("pretrain", out, stop=stop)), RichReporter()
     if warning := ground_warning(setup):
-        console.print(f"[yellow]warning:[/] {warning}", soft_wrap=True)
+        warn(warning)
     policy, losses = train(setup, seed, reporter=reporter, stop=stop)
     if not losses:
         console.print("interrupted before the first steps were done; nothing was saved")
@@ -76,7 +76,7 @@ def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event
             error_m = nominal_error(setup, policy)
             write_trained_policy(run, setup, policy, losses, seed=seed, error_m=error_m)
             summary = f"{preset.task} error in its own model: {1000 * error_m:.1f} mm after {len(losses)} steps"
-            console.print(summary, markup=False)
+            console.print(summary)
     if run.interrupted:
         console.print(f"interrupted after {len(losses)} steps, which are saved")
     console.print(run.watch.sentence())
