@@ -79,3 +79,11 @@ def test_process_with_closed_pipe_prints_no_traceback():
     done = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (done.returncode, done.stderr) == (0, LOST.format("Broken pipe"))
+
+
+def test_output_with_few_characters_replaces_others():
+    memory = io.BytesIO()
+    output = io.TextIOWrapper(memory, encoding="ascii")
+    with contextlib.redirect_stdout(output), tolerate_lost_outputs():
+        print("1.0 ± 0.2 mm \udcff")
+    assert memory.getvalue() == b"1.0 ? 0.2 mm ?\n"

@@ -1,4 +1,4 @@
-"""Keep a command alive if its standard outputs cannot be written, for example after a pipe was closed."""
+"""Keep a command alive if its outputs cannot be written: a closed pipe, a full disk, or an encoding with few signs."""
 
 import contextlib
 import os
@@ -8,7 +8,7 @@ from typing import Any, TextIO, cast
 
 
 class RobustOutput:
-    """Text output that goes to the null device after the first error of writing."""
+    """Text output that replaces characters without a code, and goes to the null device after an error of writing."""
 
     def __init__(self, output: Any, name: str = "") -> None:
         """Wrap an output.
@@ -24,6 +24,8 @@ class RobustOutput:
         """Write a text; return its length."""
         try:
             self._output.write(text)
+        except UnicodeEncodeError as error:
+            self.write(text.encode(error.encoding, "replace").decode(error.encoding))
         except OSError as error:
             self._abandon(error)
         return len(text)
@@ -49,7 +51,7 @@ class RobustOutput:
 
 @contextlib.contextmanager
 def tolerate_lost_outputs() -> Iterator[None]:
-    """Let a command continue if its standard output or standard error is closed or full."""
+    """Let a command continue if its standard output or error is closed or full, or lacks codes for characters."""
     before = sys.stdout, sys.stderr
     with open(os.devnull, "w") as nowhere:  # in place of an output that was closed before the start
         sys.stdout = cast(TextIO, RobustOutput(sys.stdout or nowhere, "the standard output"))

@@ -16,8 +16,10 @@ from retrim.evaluation.metrics import failed_record, notes, summary
 from retrim.io.logs.viewers import can_record
 from retrim.io.policies import load_learner_state, load_policy
 from retrim.runkit import FlightSpec, Run, outputs
+from retrim.runkit.document import Document, TableSection
 from retrim.runkit.outlet import Outlet
 from retrim.runkit.outputs import clear_outputs
+from retrim.runkit.reporter import Silent
 
 SPECS = [FlightSpec(Scenario(), method, start, 4) for method in ("base", "full") for start in (0, 1)]
 
@@ -167,3 +169,26 @@ def test_runs_of_the_same_second_have_separate_folders(monkeypatch, tmp_path):
     first = Run("fly").folder
     monkeypatch.setattr(os, "getpid", lambda: -1)
     assert Run("fly").folder != first
+
+
+class Failing(Silent):
+    """A reporter whose output cannot take the text."""
+
+    def __init__(self):
+        self.texts = []
+
+    def say(self, text):
+        self.texts.append(text)
+        raise UnicodeEncodeError("ascii", text, 0, 1, "ordinal not in range(128)")
+
+
+def test_document_is_written_even_if_its_text_cannot_be_printed(tmp_path, monkeypatch):
+    document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Failing())
+    with pytest.raises(UnicodeEncodeError):
+        document.add(TableSection(("error",), (("1 ± 2 mm",),)), [{"n": 1}])
+    assert "| 1 ± 2 mm |" in (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "table.json").read_text())["rows"] == [{"n": 1}]
+    monkeypatch.setattr(Run, "write_results", lambda *_, **__: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(UnicodeEncodeError):
+        document.add(TableSection(("x",), (("2",),)))
+    assert "| 2 |" in document.reporter.texts[-1]  # also printed if it cannot be written

@@ -88,8 +88,10 @@ class Document:
         self.sections.append(section)
         self.files += [] if section.picture is None else [section.picture]
         self._rows += rows
-        self.reporter.say("\n".join(line for line in section.markdown() if not line.startswith("![")))
-        self.write()
+        try:
+            self.write()  # first, since printing may fail or be interrupted
+        finally:
+            self.reporter.say("\n".join(line for line in section.markdown() if not line.startswith("![")))
 
     def write(self) -> Path:
         """Write both files; return the path of the Markdown file.
