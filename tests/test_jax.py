@@ -1,4 +1,4 @@
-"""The fault of jax 0.10.2 on CPU (jax-ml/jax#39103), and the constraint that excludes this version."""
+"""The fault of jax 0.10.2 on CPU (jax-ml/jax#39103), the version that is excluded for it, and settings of JAX."""
 
 import os
 import subprocess
@@ -10,6 +10,7 @@ import jax
 import pytest
 
 from retrim.evaluation.jax_bug_check import EXCLUDED_VERSION
+from retrim.runkit.error_messages import describe_error
 
 ROOT = Path(__file__).parent.parent
 
@@ -43,3 +44,32 @@ def test_excluded_version_is_not_installed():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert f"jax>=0.8,!={EXCLUDED_VERSION}" in project["dependencies"]
     assert f"jax=={EXCLUDED_VERSION}" not in (ROOT / "constraints.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("JAX_ENABLE_X64=perhaps", "JAX does not accept this value; unset or correct it"),
+        ("JAX_NUM_CPU_DEVICES=many", "JAX does not accept this value; unset or correct it"),
+        ("JAX_PLATFORMS=fpga", "this machine has no such device; unset it or use cpu"),
+    ],
+)
+def test_wrong_environment_of_jax_is_refused_in_one_line(setting, message):
+    name, _, value = setting.partition("=")
+    words = [sys.executable, "-m", "retrim.cli", "doctor"]
+    done = subprocess.run(words, env=os.environ | {name: value}, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"retrim: {setting}: {message}\n")
+
+
+def test_platform_without_a_reason_is_named(monkeypatch):
+    """JAX raises a bare AssertionError for cuda if a plugin for GPUs is missing."""
+
+    def fail():
+        raise AssertionError
+
+    monkeypatch.setattr(jax, "devices", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    text = "JAX_PLATFORMS=cuda: this machine has no such device; unset it or use cpu"
+    assert describe_error(AssertionError(), []) == text
+    monkeypatch.undo()
+    assert describe_error(AssertionError(), []) is None  # another fault of this package, with its traceback

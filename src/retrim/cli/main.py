@@ -8,6 +8,8 @@ import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 
+from ..errors import ConfigError
+from ..jax_import import import_jax
 from ..signals import handle_signals, stop_on_signal
 from ..standard_outputs import tolerate_lost_outputs
 
@@ -113,7 +115,13 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
 
     import tyro
 
+    try:
+        import_jax()
+    except ConfigError as error:
+        print(f"retrim: {error}", file=sys.stderr)  # the console needs packages that import JAX
+        return 1
     from ..runkit.compile_flags import compile_for
+    from ..runkit.error_messages import describe_error
     from .console import console, refuse
     from .options import simplify_help
     from .usage import one_line_usage
@@ -135,7 +143,7 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
     except Exception as error:
         if full_traceback:
             raise
-        message = _message_of(error, words)
+        message = describe_error(error, words)
         if message is None:
             raise
         return refuse(message)
@@ -143,18 +151,3 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
         console.print("interrupted; what was done is kept, if anything was")
         return code or 130
     return code
-
-
-def _message_of(error: Exception, words: list[str]) -> str | None:
-    """Return the line that describes an error; None for a fault in this package, whose traceback is needed."""
-    from ..config.registry import describe_user_error
-    from ..errors import RetrimError
-
-    if isinstance(error, RetrimError):
-        return str(error)
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror or error}"
-    if isinstance(error, MemoryError):
-        return "out of memory; use fewer --starts, smaller networks or a shorter horizon"
-    return describe_user_error(error, words)
