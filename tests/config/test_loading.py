@@ -38,6 +38,10 @@ def test_overlay(overlay):
     assert overlaid(result, overlay("[adapt]\nnum_envs = 3\n")).adapt.num_updates == 7
 
 
+def test_byte_order_mark_of_an_editor_is_accepted(overlay):
+    assert load("hover/fast", overlay(b"\xef\xbb\xbfdelay_ticks = 2\n")).delay_ticks == 2
+
+
 def test_task_table_is_overlaid_key_by_key(overlay):
     result = load("vision/occluded", overlay("[vision]\ndropout = 0.2\n"))
     assert result.vision.dropout == 0.2
@@ -60,16 +64,17 @@ def test_integers_are_accepted_as_floats(overlay):
         ("delay_tick = 3", r"delay_tick: unknown key; did you mean 'delay_ticks'\?"),
         ("task = 'track'\ntrack.referense = 'star'", r"track\.referense: unknown key; did you mean 'reference'\?"),
         ("task = 'vision'\nvision.droput = 0.1", r"vision\.droput: unknown key; did you mean 'dropout'\?"),
-        ("pretrain.num_updates = -3", r"pretrain\.num_updates: Input should be greater than or equal to 1"),
-        ("pretrain.learning_rate = 'fast'", r"pretrain\.learning_rate: Input should be a valid number"),
+        ("pretrain.num_updates = -3", r"pretrain\.num_updates: Input should be greater than or equal to 1, not -3"),
+        ("pretrain.learning_rate = 'fast'", r"pretrain\.learning_rate: Input should be a valid number, not 'fast'"),
         ("pretrain.learning_rate = nan", r"pretrain\.learning_rate: "),
         ("pretrain.learning_rate = inf", r"pretrain\.learning_rate: "),
         ("pretrain.adam_b2 = nan", r"pretrain\.adam_b2: "),
         ("adapt.spectral_weight = nan", r"adapt\.spectral_weight: "),
         ("dt = nan", r"dt: "),
-        ("adapt.num_updates = true", r"adapt\.num_updates: Input should be a valid integer"),
-        ("adapt.num_updates = 3.0", r"adapt\.num_updates: Input should be a valid integer"),
-        ("adapt.num_updates = '3'", r"adapt\.num_updates: Input should be a valid integer"),
+        ("adapt.num_updates = true", r"adapt\.num_updates: Input should be a valid integer, not True"),
+        ("adapt.num_updates = 3.0", r"adapt\.num_updates: Input should be a valid integer, not 3\.0"),
+        ("adapt.num_updates = '3'", r"adapt\.num_updates: Input should be a valid integer, not '3'"),
+        (f"adapt.num_updates = '{'3' * 999}'", r"a valid integer, not '3{30,40} \.\.\. 3{10,20}'$"),
         ("adapt.window = true", r"adapt\.window: "),
         ("delay_ticks = true", r"delay_ticks: "),
         ("command_history = true", r"command_history: "),

@@ -32,7 +32,7 @@ def read_toml(path: Path) -> dict[str, Any]:
             raise ConfigError(f"{path}: {'not a regular file' if path.exists() else 'no such file'}")
         if path.stat().st_size > MAX_TOML_BYTES:
             raise ConfigError(f"{path}: larger than the {MAX_TOML_BYTES} bytes that are accepted")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except ConfigError:
         raise
     except (ValueError, RecursionError) as error:  # an integer of 5,000 digits also raises ValueError
@@ -78,7 +78,9 @@ def _explain(kind: type[Any], error: ValidationError) -> str:
             message = "is missing"
         elif each["type"] in ("tuple_type", "list_type"):
             message = f"must be a list of values in brackets, not {excerpt(str(each['input']), quotes=False)}"
-        if result.get(where) in (None, NO_NAME):  # a table and a name are valid here: prefer the mistake in the table
+        elif each["type"] not in ("value_error", "assertion_error", "json_invalid"):  # whose messages have the value
+            message += f", not {excerpt(each['input'])}"
+        if result.get(where, NO_NAME).startswith(NO_NAME):  # a table and a name are valid: prefer the table's mistake
             result[where] = message
     order = sorted(result.items(), key=lambda each: not each[1].startswith(UNKNOWN_KEY))  # typos explain missing keys
     lines = [f"{where}: {message}" if where else message for where, message in order][:MAX_LINES]
