@@ -32,6 +32,7 @@ def test_addresses(text, parts):
         "", "udp", "udp:", "udp:14540", "udp::14540", "udp:127.0.0.1:", "udp:127.0.0.1:0", "udp:127.0.0.1:65536",
         "udp:127.0.0.1:-1", "udp:127.0.0.1:1e3", "tcp:127.0.0.1:14540", "serial:/dev/ttyACM0", "serial::9600",
         "udp:127.0.0.1:" + "9" * 5000, "udp:127.0.0.1:١٤٥", "127.0.0.1:14540",
+        "udp:..:1", f"udp:{'x' * 64}:1",
     ],
 )  # fmt: skip
 def test_invalid_address_is_refused(text):

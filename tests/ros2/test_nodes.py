@@ -127,6 +127,8 @@ def test_ros_variables_configure_cyclone(monkeypatch):
     monkeypatch.setenv("ROS_STATIC_PEERS", "10.0.0.7;quad1.local")
     assert 'name="lo"' not in configuration()
     assert '<Peer address="10.0.0.7"/><Peer address="quad1.local"/>' in configuration()
+    monkeypatch.setenv("ROS_STATIC_PEERS", "é..")  # no interface leads to a name that cannot be looked up
+    assert '<Peer address="é.."/>' in configuration()
     monkeypatch.setenv("ROS_STATIC_PEERS", '"/><x')
     with pytest.raises(ConfigError, match="is not an address of a machine"):
         configuration()

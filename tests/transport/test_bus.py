@@ -179,9 +179,10 @@ def test_every_bridge_topic_has_a_ros_2_name():
     assert len(set(names)) == len(names)
 
 
-def test_missing_master_is_reported():
-    with pytest.raises(ConfigError, match=r"ROS: no rosmaster at 'http://127.0.0.1:1'"):
-        Address.of("ros:127.0.0.1:1").join(TOPICS, listen=True)
+@pytest.mark.parametrize("place", ["127.0.0.1:1", "..:1"])
+def test_missing_master_is_reported(place):
+    with pytest.raises(ConfigError, match=f"ROS: no rosmaster at 'http://{place}'"):
+        Address.of(f"ros:{place}").join(TOPICS, listen=True)
 
 
 def test_address_in_use_is_reported():

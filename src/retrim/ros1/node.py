@@ -30,7 +30,7 @@ def join(master: str) -> Any:
     address = urlparse(master)
     try:
         socket.create_connection((address.hostname or "", address.port or 11311), 5.0).close()
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # UnicodeError: an impossible name
         raise ConfigError(f"ROS: no rosmaster at {master!r} ({error})") from error
     os.environ["ROS_MASTER_URI"] = master
     if address.hostname in ("127.0.0.1", "localhost"):  # otherwise its sockets listen on all interfaces

@@ -185,5 +185,5 @@ def _way_to(peer: str) -> str:
         try:
             probe.connect((peer, 7400))  # sends nothing
             return str(probe.getsockname()[0])
-        except OSError:
+        except (OSError, TypeError):  # TypeError: an impossible name
             return ""

@@ -176,9 +176,18 @@ def address_of(text: str, kinds: Sequence[str] = ("udp", "serial")) -> tuple[str
         or not (number.isascii() and number.isdecimal())
         or not 0 < int(number[-9:]) <= most
         or len(number) > 9
+        or not (kind == "serial" or _may_be_host(place))
     ):
         raise ConfigError(f"address {text!r}: expected {', or '.join(FORMS[each] for each in kinds)}")
     return kind, place, int(number)
+
+
+def _may_be_host(name: str) -> bool:
+    """Return whether a name can be looked up; sockets raise UnicodeError for others, e.g. with an empty label."""
+    try:
+        return bool(name.encode("idna"))
+    except UnicodeError:
+        return False
 
 
 def address_towards(host: str, port: int) -> str:
