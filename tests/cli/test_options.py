@@ -42,13 +42,24 @@ def test_methods_of_installed_packages_are_listed_and_suggested(tmp_path):
         find_method("rapto")
 
 
-def test_broken_package_does_not_affect_other_commands(monkeypatch, capsys):
+@pytest.mark.parametrize("error", [ImportError, SystemExit])
+def test_broken_package_does_not_affect_other_commands(error, monkeypatch, capsys):
     class Broken:
         value = "broken:COMMANDS"
 
         def load(self):
-            raise ImportError("no module named broken")
+            raise error("no module named broken")
 
     monkeypatch.setattr(main, "entry_points", lambda group: [Broken()])
     assert set(main.commands()) == set(main.COMMANDS)
     assert "the commands of broken:COMMANDS cannot be loaded: no module named broken" in capsys.readouterr().err
+
+
+def test_module_that_ends_the_process_does_not_make_a_command_succeed(tmp_path, monkeypatch):
+    (tmp_path / "command_that_exits.py").write_text(
+        "import sys\n\n\ndef leave():\n    return lambda stop: sys.exit(0)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(main, "own_commands", lambda: {"leave": ("Do something.", "command_that_exits")})
+    message = "retrim: a module of yours ended the command: SystemExit: 0\n"
+    assert retrim("leave", cwd=tmp_path, code=1) == message

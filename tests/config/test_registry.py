@@ -211,13 +211,15 @@ def test_installed_packages_add_names(monkeypatch):
         ("{mine}:nothing", "AttributeError: .*has no attribute 'nothing'"),
         ("broken:thing", "ZeroDivisionError: division by zero"),
         ("unfinished:thing", "SyntaxError: "),
-        ("leaving:thing", "SystemExit|RuntimeError"),
+        ("refusing:thing", "RuntimeError: not today"),
+        ("leaving:thing", "SystemExit: 0"),
     ],
 )
 def test_module_that_cannot_be_imported_is_refused(mine, tmp_path, text, message):
     (tmp_path / "broken.py").write_text("1 / 0")
     (tmp_path / "unfinished.py").write_text("def thing(:")
-    (tmp_path / "leaving.py").write_text("raise RuntimeError('not today')")
+    (tmp_path / "refusing.py").write_text("raise RuntimeError('not today')")
+    (tmp_path / "leaving.py").write_text("import sys; sys.exit(0)")
     name = text.format(mine=mine)
     with pytest.raises(ConfigError, match=f"vehicle '{name}' cannot be imported: {message}"):
         VEHICLES.find(name)

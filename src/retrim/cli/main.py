@@ -8,7 +8,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 
-from ..errors import ConfigError
+from ..errors import ConfigError, RetrimError
 from ..jax_import import import_jax
 from ..signals import handle_signals, stop_on_signal
 from ..standard_outputs import tolerate_lost_outputs
@@ -36,7 +36,7 @@ def commands() -> dict[str, tuple[str, str]]:
     for entry in entry_points(group=GROUP):
         try:
             result |= entry.load()
-        except Exception as error:  # the other commands still work
+        except (Exception, SystemExit) as error:  # the other commands still work
             print(f"retrim: the commands of {entry.value} cannot be loaded: {error}", file=sys.stderr)
     return result
 
@@ -139,7 +139,10 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
             else:
                 call = tyro.cli(simplify_help(getattr(command, name)), prog=prog, args=words)
         with stop_on_signal(stop):
-            code: int = call(stop)
+            try:
+                code: int = call(stop)
+            except SystemExit as end:  # no command of this package raises it
+                raise RetrimError(f"a module of yours ended the command: SystemExit: {end.code}") from end
     except Exception as error:
         if full_traceback:
             raise

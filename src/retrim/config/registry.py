@@ -130,7 +130,7 @@ class Registry(Mapping[str, T], Generic[T]):
             sys.path.append(here)
         try:
             return getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # a user's module can raise any exception
+        except (Exception, SystemExit) as error:  # a user's module can raise any exception
             raise ConfigError(f"{self._kind} {name!r} cannot be imported: {type(error).__name__}: {error}") from error
 
     def __getitem__(self, name: str) -> T:
