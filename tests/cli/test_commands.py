@@ -79,7 +79,9 @@ def test_resume_continues_learner_state(folder):
     assert [row["method"] for row in went_on] == ["base", "full"]
 
 
-def test_full_disk_loses_no_flight(folder, monkeypatch):
+@pytest.fixture
+def full_disk(monkeypatch):
+    """Let the folder ``full`` be on a disk without space."""
     sync = os.fsync
 
     def full(file):
@@ -88,6 +90,19 @@ def test_full_disk_loses_no_flight(folder, monkeypatch):
         sync(file)
 
     monkeypatch.setattr(os, "fsync", full)
+
+
+@pytest.mark.usefixtures("full_disk")
+def test_full_disk_loses_no_policy(folder):
+    out = retrim("pretrain", "hover", "--config", "small.toml", "--updates", "2", "--out", "full", cwd=folder, code=1)
+    (place,) = re.findall(r"the policy cannot be written to full \(No space left on device\); it is in (\S+)", out)
+    assert "nominal_error_m" in results(Path(place))["rows"][0]
+    assert load_policy(Path(place))[1].pretrain.hidden_sizes == (64, 64)
+    shutil.rmtree(place)
+
+
+@pytest.mark.usefixtures("full_disk")
+def test_full_disk_loses_no_flight(folder):
     words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--out", "full"
     out = retrim(*words, cwd=folder, code=1)
     assert "hover error, last 2 s of 2 s, 2 starts" in out

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shutil
 import signal
 
 import jax
@@ -50,6 +51,23 @@ def test_interruption_of_imports_lets_them_finish_and_does_not_start_command(nam
     assert not (tmp_path / "called").exists()
 
 
+HANG = """
+import signal, time
+
+signal.raise_signal(signal.SIGINT)
+signal.raise_signal(signal.SIGINT)
+time.sleep(600)
+"""
+
+
+def test_second_interruption_ends_an_import(tmp_path, monkeypatch):
+    main = importlib.import_module("retrim.cli.main")
+    (tmp_path / "command_that_hangs.py").write_text(HANG)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(main, "own_commands", lambda: {"slow": ("Do something.", "command_that_hangs")})
+    assert retrim("slow", cwd=tmp_path, code=130) == "interrupted\n"
+
+
 PRETRAIN = "pretrain", "hover", "--config", "small.toml"
 
 
@@ -63,6 +81,18 @@ def test_interrupted_training_saves_policy(folder):
     assert result["rows"][0]["updates"] == len(result["losses"])
     assert load_policy(folder / "cut")[1].pretrain.num_updates == 100_000
     retrim("fly", "--policy", "cut", "--seconds", "1", "--adapt", "none", "--out", "cut_flown", cwd=folder)
+
+
+def test_interrupted_training_does_not_replace_a_policy(folder):
+    (folder / "again").mkdir()
+    path = shutil.copy(folder / "p" / "policy.safetensors", folder / "again" / "policy.safetensors")
+    before = path.read_bytes()
+    code, out = run_interrupted((*PRETRAIN, "--updates", "100000", "--out", "again"), folder, after=b"loss ")
+    assert code == 130, out
+    assert path.read_bytes() == before
+    assert "again/interrupted/policy.safetensors" in out
+    assert results(folder / "again/interrupted")["interrupted"]
+    assert load_policy(folder / "again/interrupted")[1].pretrain.num_updates == 100_000
 
 
 def test_interrupted_compilation_saves_nothing(folder):

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
+from types import FrameType
 
 from ..errors import ConfigError, RetrimError
 from ..jax_import import import_jax
@@ -81,7 +82,13 @@ def main(words: Sequence[str] | None = None) -> None:
     if words is not None:
         sys.argv = ["retrim", *words]  # results record this command line
     stop = threading.Event()
-    with tolerate_lost_outputs(), handle_signals(lambda *_: stop.set()):  # an exception would break imports
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():  # the second signal: an import may hang
+            raise KeyboardInterrupt
+        stop.set()  # an exception would break imports
+
+    with tolerate_lost_outputs(), handle_signals(handle):
         code = _run(sys.argv[1:], stop)
     sys.exit(code)
 

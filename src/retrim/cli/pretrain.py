@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -9,12 +10,12 @@ import tyro
 from ..config.limits import check_seeds
 from ..config.presets import Preset
 from ..config.setup import Setup
-from ..errors import CheckpointError
-from ..runkit.outputs import write_trained_policy
+from ..runkit.outlet import Outlet
+from ..runkit.outputs import POLICY, write_trained_policy
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import ground_warning, nominal_error, train
 from .arguments import training_preset
-from .console import RichReporter, Trust, console, report_start, show_paths, warn
+from .console import RichReporter, Trust, console, refuse, report_start, show_paths, warn
 
 
 def pretrain(
@@ -66,19 +67,18 @@ def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event
     if not losses:
         console.print("interrupted before the first steps were done; nothing was saved")
         return INTERRUPTED
-    try:
-        path = write_trained_policy(run, setup, policy, losses, seed=seed)
-    except OSError as error:
-        path = write_trained_policy(Run("pretrain", stop=stop), setup, policy, losses, seed=seed)
-        raise CheckpointError(f"{run.folder}: {error.strerror}; the policy was saved as {path} instead") from error
+    is_worse = run.interrupted and (run.folder / POLICY).exists()  # fewer steps than the policy of the folder
+    outlet = Outlet(run.folder / "interrupted" if is_worse else run.folder)
+    write = partial(write_trained_policy, setup=setup, policy=policy, losses=losses, seed=seed)
+    path = outlet.write("the policy", lambda folder: write(run.at(folder)))
     with run.interruptible():
-        if not run.interrupted:
+        if path is not None and not run.interrupted:
             error_m = nominal_error(setup, policy)
-            write_trained_policy(run, setup, policy, losses, seed=seed, error_m=error_m)
+            write(run.at(path.parent), error_m=error_m)
             summary = f"{preset.task} error in its own model: {1000 * error_m:.1f} mm after {len(losses)} steps"
             console.print(summary)
     if run.interrupted:
-        console.print(f"interrupted after {len(losses)} steps, which are saved")
+        console.print(f"interrupted after {len(losses)} steps{'' if path is None else ', which are saved'}")
     console.print(run.watch.sentence())
-    show_paths([path])
-    return run.exit_code
+    show_paths([] if path is None else [path])
+    return max((refuse(fault) for fault in outlet.faults), default=run.exit_code)

@@ -1,7 +1,6 @@
 """Writes the output of a run, to a temporary folder if the run's own folder cannot be written."""
 
 import contextlib
-import copy
 import secrets
 import tempfile
 from collections.abc import Callable, Collection, Sequence
@@ -77,9 +76,7 @@ class Outlet:
         """Write a run's results like :meth:`Run.write_results`, with all faults so far; return the file's path."""
 
         def put(folder: Path) -> Path:
-            elsewhere = copy.copy(run)
-            elsewhere.folder = folder
-            return elsewhere.write_results(rows, faults=self.faults, **more)
+            return run.at(folder).write_results(rows, faults=self.faults, **more)
 
         return self.write("results.json", put)
 

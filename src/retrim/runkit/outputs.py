@@ -22,6 +22,7 @@ from .flights import Flight
 from .interrupts import interrupts_only_set
 from .run import Run
 
+POLICY = "policy.safetensors"
 LOG = re.compile(r".+_seed\d+_start\d+\.(npz|mcap)")
 """Name of a flight's log; see :func:`write_logs`."""
 
@@ -43,9 +44,9 @@ def write_trained_policy(
         Path of the policy.
 
     Raises:
-        OSError: The folder is no longer writable.
+        OSError: The folder cannot be written.
     """
-    preset, path = setup.preset, run.folder / "policy.safetensors"
+    preset, path = setup.preset, run.folder / POLICY
     row: dict[str, Any] = {"task": preset.task, "preset": preset.name, "updates": len(losses)}
     row |= {"envs": preset.pretrain.num_envs, "loss": losses[-1]}
     row |= {} if error_m is None else {"nominal_error_m": error_m}

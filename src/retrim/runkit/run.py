@@ -1,6 +1,7 @@
 """Manages a run's folder: creates it once, writes files atomically, and records an interruption."""
 
 import contextlib
+import copy
 import json
 import os
 import sys
@@ -67,6 +68,12 @@ class Run:
         self.stop = stop or threading.Event()
         commit(), code()  # cached now, since the files may change during a run that takes hours
         check_writable(self.folder)
+
+    def at(self, folder: Path) -> "Run":
+        """Return this run with another folder."""
+        result = copy.copy(self)
+        result.folder = folder
+        return result
 
     def of_earlier(self) -> str:
         """Return a line on whether the run resumes or replaces earlier results; empty if the folder has none."""
