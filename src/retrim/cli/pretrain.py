@@ -11,7 +11,7 @@ from ..config.limits import check_seeds
 from ..config.presets import Preset
 from ..config.setup import Setup
 from ..runkit.outlet import Outlet
-from ..runkit.outputs import POLICY, write_trained_policy
+from ..runkit.outputs import write_trained_policy
 from ..runkit.run import INTERRUPTED, Run
 from ..runkit.training import ground_warning, nominal_error, train
 from .arguments import training_preset
@@ -67,8 +67,7 @@ def _pretrain(preset: Preset, seed: int, out: Path | None, stop: threading.Event
     if not losses:
         console.print("interrupted before the first steps were done; nothing was saved")
         return INTERRUPTED
-    is_worse = run.interrupted and (run.folder / POLICY).exists()  # fewer steps than the policy of the folder
-    outlet = Outlet(run.folder / "interrupted" if is_worse else run.folder)
+    outlet = Outlet(run.folder)
     write = partial(write_trained_policy, setup=setup, policy=policy, losses=losses, seed=seed)
     path = outlet.write("the policy", lambda folder: write(run.at(folder)))
     with run.interruptible():

@@ -32,6 +32,8 @@ def write_trained_policy(
 ) -> Path:
     """Write ``policy.safetensors`` and its ``results.json``; Ctrl-C takes effect after both are written.
 
+    The policy of an interrupted run does not replace an earlier policy: it goes to the folder ``interrupted``.
+
     Args:
         run: Run whose folder receives the files.
         setup: Set-up of the policy's preset.
@@ -46,6 +48,8 @@ def write_trained_policy(
     Raises:
         OSError: The folder cannot be written.
     """
+    if run.interrupted and (run.folder / POLICY).exists():
+        run = run.at(run.folder / "interrupted")
     preset, path = setup.preset, run.folder / POLICY
     row: dict[str, Any] = {"task": preset.task, "preset": preset.name, "updates": len(losses)}
     row |= {"envs": preset.pretrain.num_envs, "loss": losses[-1]}
