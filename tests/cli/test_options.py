@@ -1,6 +1,7 @@
 """Help texts: names come from the registries, and an option without a default shows none."""
 
 import importlib
+import re
 
 import pytest
 
@@ -55,11 +56,16 @@ def test_broken_package_does_not_affect_other_commands(error, monkeypatch, capsy
     assert "the commands of broken:COMMANDS cannot be loaded: no module named broken" in capsys.readouterr().err
 
 
-def test_module_that_ends_the_process_does_not_make_a_command_succeed(tmp_path, monkeypatch):
-    (tmp_path / "command_that_exits.py").write_text(
-        "import sys\n\n\ndef leave():\n    return lambda stop: sys.exit(0)\n"
-    )
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("exits", "def run():\n    return lambda stop: exit(0)\n", r"retrim: a module of yours .*SystemExit: 0\n"),
+        ("exits_early", "raise SystemExit(0)\n", r"retrim: a module of yours ended the command: SystemExit: 0\n"),
+        ("raises", "x = 1\nraise ValueError('no rig')\n", r"retrim: \S+, line 2: ValueError: no rig; .*\n"),
+    ],
+)
+def test_faulty_module_of_a_command_is_reported_in_one_line(name, text, message, tmp_path, monkeypatch):
+    (tmp_path / f"command_that_{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(main, "own_commands", lambda: {"leave": ("Do something.", "command_that_exits")})
-    message = "retrim: a module of yours ended the command: SystemExit: 0\n"
-    assert retrim("leave", cwd=tmp_path, code=1) == message
+    monkeypatch.setattr(main, "commands", lambda: {"run": ("Do something.", f"command_that_{name}")})
+    assert re.fullmatch(message, retrim("run", cwd=tmp_path, code=1))

@@ -5,7 +5,8 @@ Command modules are imported only when they are needed, so --help is fast.
 
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import entry_points
 from types import FrameType
 
@@ -117,6 +118,15 @@ def _run(words: list[str], stop: threading.Event) -> int:
         return 130
 
 
+@contextmanager
+def _no_exit() -> Iterator[None]:
+    """Refuse SystemExit, which no command of this package raises."""
+    try:
+        yield
+    except SystemExit as end:
+        raise RetrimError(f"a module of yours ended the command: SystemExit: {end.code}") from end
+
+
 def _command(name: str, about: str, module: str, words: list[str], stop: threading.Event) -> int:
     import importlib
 
@@ -134,10 +144,11 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
     from .usage import one_line_usage
 
     compile_for(name)
-    command = importlib.import_module(module)
     full_traceback = TRACEBACK in words
     words = [word for word in words if word != TRACEBACK]
     try:
+        with _no_exit():
+            command = importlib.import_module(module)  # may be a user's
         prog, plain = f"retrim {name}", tyro.conf.configure(tyro.conf.AvoidSubcommands)
         with one_line_usage(prog):
             if hasattr(command, "COMMANDS"):
@@ -145,15 +156,12 @@ def _command(name: str, about: str, module: str, words: list[str], stop: threadi
                 call = tyro.extras.subcommand_cli_from_dict(entries, prog=prog, description=about, args=words)
             else:
                 call = tyro.cli(simplify_help(getattr(command, name)), prog=prog, args=words)
-        with stop_on_signal(stop):
-            try:
-                code: int = call(stop)
-            except SystemExit as end:  # no command of this package raises it
-                raise RetrimError(f"a module of yours ended the command: SystemExit: {end.code}") from end
+        with stop_on_signal(stop), _no_exit():
+            code: int = call(stop)
     except Exception as error:
         if full_traceback:
             raise
-        message = describe_error(error, words)
+        message = describe_error(error, words if name in COMMANDS else [*words, f"{module}:{name}"])
         if message is None:
             raise
         return refuse(message)
