@@ -238,6 +238,11 @@ def regimes() -> tuple[Regime, ...]:
         Regime(
             "gusts", "4 m/s and Dryden turbulence, known vehicle", hover, (Scenario("gusts"),), 20.0, at_rest,
         ),
+        Regime(
+            "gusts, many vehicles",
+            "the same; the policies were trained for many vehicles, and only the adapted ones identify theirs",
+            any_hover, (Scenario("gusts"),), 20.0, at_rest, adapted="base-id",
+        ),
     )  # fmt: skip
 
 

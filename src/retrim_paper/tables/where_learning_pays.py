@@ -38,7 +38,7 @@ times in ms], with the 95 % interval of the median (bootstrap over flights) in b
 flights, which count as infinite. The disturbance is unknown to all methods. "INDI, wrong by two": INDI that assumes
 half or twice the thrust per command, the worse of the two. "MPPI + L1" flies at most two starts per seed; all starts
 would take as long as all other methods together. "adapted": learned in flight, charged to flight time by the
-preset's fixed latencies; in the rows S1 to S3, one policy for many vehicles with the identification of the vehicle
+preset's fixed latencies; in the rows S1 to S3 and "many vehicles", one policy for many vehicles with identification
 (`base-id`), and otherwise all weights (`full`). The verdict follows from the numbers: learning pays if the adapted
 flights have less than 0.7 times the error of the best other method (observer, geometric + I, INDI, MPPI + L1) among
 those that lost no larger share of their flights, and by more than 1 mm; it is a tie within 1 mm; otherwise the best
