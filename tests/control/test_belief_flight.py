@@ -30,14 +30,18 @@ from retrim.plants.sim import Simulation
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
-DT = 0.02
+DT, TICKS = 0.02, 140
 family = PathFamily.of  # the dtype follows from the test
 SHORT = {"num_updates": 10, "num_envs": 2, "horizon": 20, "hidden_sizes": (16, 16)}
 
 
 class SlowHover(AbstractController[Command]):
-    """A slow hover controller without a policy; its memory contains its last inputs."""
+    """A slow hover controller without a policy; its memory contains its last inputs.
 
+    With a size of zero, it commands the hover thrust of its vehicle and no rates.
+    """
+
+    size: Float[Array, ""] = dataclasses.field(default_factory=lambda: jnp.array(1.0))
     actuators: ActuatorState = dataclasses.field(default_factory=lambda: ActuatorState.at(Command.hover()))
     member: Member = dataclasses.field(
         default_factory=lambda: Member(family().path(jnp.zeros(4)), PathBelief.unknown())
@@ -50,7 +54,7 @@ class SlowHover(AbstractController[Command]):
         wobble = jnp.stack([jnp.sin(7.0 * t), jnp.cos(5.0 * t), jnp.sin(3.0 * t)])
         level = jnp.stack([-x.R[2, 1], x.R[2, 0], 0.0 * t])
         pull = -2.0 * (x.p[2] - 1.0) - 2.0 * x.v[2] + 0.5 * jnp.sin(11.0 * t)
-        return Command(9.81 + pull, 2.0 * level + wobble), (self.actuators, self.member)
+        return Command(9.81 + self.size * pull, self.size * (2.0 * level + wobble)), (self.actuators, self.member)
 
     def with_actuators(self, actuators):
         return dataclasses.replace(self, actuators=actuators)
@@ -59,28 +63,18 @@ class SlowHover(AbstractController[Command]):
         return dataclasses.replace(self, member=member)
 
 
-class HoverThrust(AbstractController[None]):
-    """A controller that commands the hover thrust of its vehicle and no rates."""
-
-    def init(self, x):
-        del x
-
-    def __call__(self, memory, t, x):
-        return Command(jnp.asarray(9.81, t.dtype), jnp.zeros(3, t.dtype)), None
-
-
 class Lift(eqx.Module):
-    """A lift from 2 s on; a leaf, so that flights with another one are the same program."""
+    """A lift from 1.3 s on; a leaf, so that flights with another one are the same program."""
 
     size: Float[Array, ""]
 
     def __call__(self, t, x):
-        push = jnp.where(t >= 2.0, self.size, 0.0) * jnp.array([0.0, 0.0, 1.0], x.p.dtype)
+        push = jnp.where(t >= 1.3, self.size, 0.0) * jnp.array([0.0, 0.0, 1.0], x.p.dtype)
         return dataclasses.replace(ExternalEffects.calm(x.p.dtype), push=push.astype(x.p.dtype))
 
 
 def simulation(delay, lag, *, damping=1.0, gain=1.0, lift=0.0):
-    """Return a vehicle that is lifted by ``lift`` [m/s^2] from 2 s on."""
+    """Return a vehicle that is lifted by ``lift`` [m/s^2] from 1.3 s on."""
     limits = (small().command_min, small().command_max)
     response = ActuatorResponse.of(0.03, lag, inverse_damping=1.0 / damping, thrust_gain=gain)
     model = SecondOrderQuadrotor(response, jnp.array(1.0), jnp.array(0.3), limits, DT)
@@ -88,8 +82,8 @@ def simulation(delay, lag, *, damping=1.0, gain=1.0, lift=0.0):
 
 
 @eqx.filter_jit
-def fly(plant, controller, x0, ticks=200, *, senses=True):
-    """Fly; return true states and the memories of the controller after each tick."""
+def fly(plant, controller, x0, senses):
+    """Fly for ``TICKS``; return true states and the memories of the controller after each tick."""
     first = plant.launch(x0)
 
     def tick(carry, k):
@@ -98,7 +92,7 @@ def fly(plant, controller, x0, ticks=200, *, senses=True):
         u, memory = now(memory, plant.time(k, sim.a.dtype), plant.measure(sim))
         return (plant.advance(sim, plant.within_limits(u), k), memory), (plant.true(sim), memory)
 
-    return lax.scan(tick, (first, controller.init(plant.measure(first))), jnp.arange(ticks))[1]
+    return lax.scan(tick, (first, controller.init(plant.measure(first))), jnp.arange(TICKS))[1]
 
 
 @pytest.fixture(scope="module")
@@ -106,11 +100,21 @@ def x0(as_a_user):
     return Setup.from_preset("hover/retrim").flight_starts(1, 3)[0]
 
 
+def identified(plant, x0, *, size=1.0, excites=False, senses=True):
+    """Return the memories of the identification after each tick of a flight; the same program flies all vehicles."""
+    controller = IdentifiedFlight(
+        SlowHover(jnp.array(size)),
+        PathEstimator.of(DT),
+        family(),
+        PathBelief.unknown(),
+        excitation=Excitation.of() if excites else Excitation.of(longest=0.0),
+    )
+    return fly(plant, controller, x0, senses)[1]
+
+
 @pytest.mark.parametrize(("delay", "lag", "gain"), [(0.0, 0.03, 1.0), (0.05, 0.12, 0.7), (0.03, 0.2, 1.4)])
 def test_vehicle_is_identified_in_flight(x0, delay, lag, gain):
-    controller = IdentifiedFlight(SlowHover(), PathEstimator.of(DT), family(), PathBelief.unknown())
-    _, memory = fly(simulation(delay, lag, gain=gain), controller, x0)
-    memory = memory.flight
+    memory = identified(simulation(delay, lag, gain=gain), x0).flight
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], memory)
     true = family().coordinates(jnp.array(delay), jnp.array(lag), ringing_of(jnp.array(1.0)), jnp.array(0.03))
     assert abs(last.belief.centre[0] - true[0]) * 0.05 < 0.01  # [s]
@@ -119,37 +123,26 @@ def test_vehicle_is_identified_in_flight(x0, delay, lag, gain):
     assert np.all(np.asarray(memory.belief.half_width[0]) > 0.9)  # unknown at take-off
 
 
-def test_excitation_identifies_hovering_vehicle():
+def test_excitation_identifies_hovering_vehicle(as_a_user):
     """Without the doublets, delay and lag are not excited."""
-    flights, at = {}, 50  # 1 s
-    for name, excitation in {"still": Excitation.of(longest=0.0), "excited": Excitation.of()}.items():
-        controller = IdentifiedFlight(
-            HoverThrust(), PathEstimator.of(DT), family(), PathBelief.unknown(), excitation=excitation
-        )
-        start = State.at(jnp.array([0.0, 0.0, 1.0]))
-        flights[name] = fly(simulation(0.04, 0.1, gain=1.2), controller, start, at + 1)[1].path.estimate
-    estimate = flights["excited"]
-    assert abs(float(estimate.delay.mean[at]) - 0.04) < 0.008
-    assert abs(float(estimate.rate_lag.mean[at]) - 0.1) < 0.02
-    assert abs(float(estimate.thrust_gain.mean[at]) - 1.2) < 0.024
-    assert not bool(flights["still"].delay.excited[at])
+    plant, start, at = simulation(0.04, 0.1, gain=1.2), State.at(jnp.array([0.0, 0.0, 1.0])), 50  # 1 s
+    still, excited = (identified(plant, start, size=0.0, excites=excites).path.estimate for excites in (False, True))
+    assert abs(float(excited.delay.mean[at]) - 0.04) < 0.008
+    assert abs(float(excited.rate_lag.mean[at]) - 0.1) < 0.02
+    assert abs(float(excited.thrust_gain.mean[at]) - 1.2) < 0.024
+    assert not bool(still.delay.excited[at])
 
 
 @pytest.mark.parametrize("lift", [2.0, -2.0])
 def test_push_is_not_identified_as_thrust_gain(x0, lift):
     """The controller reduces its thrust under a lift, as it would with a larger gain."""
-    controller = IdentifiedFlight(SlowHover(), PathEstimator.of(DT), family(), PathBelief.unknown())
     for senses in (True, False):
-        plant = simulation(0.02, 0.08, gain=0.8, lift=lift)
-        _, memory = fly(plant, controller, x0, senses=senses)
-        gain = memory.path.estimate.thrust_gain
+        gain = identified(simulation(0.02, 0.08, gain=0.8, lift=lift), x0, senses=senses).path.estimate.thrust_gain
         assert np.abs(np.asarray(gain.mean)[60:] - 0.8).max() < 0.04
 
 
 def test_belief_and_gain_change_continuously(x0):
-    controller = IdentifiedFlight(SlowHover(), PathEstimator.of(DT), family(), PathBelief.unknown())
-    _, memory = fly(simulation(0.08, 0.2, gain=0.6), controller, x0)
-    memory = memory.flight
+    memory = identified(simulation(0.08, 0.2, gain=0.6), x0).flight
     low, high = jax.vmap(lambda each: each.ends)(memory.belief)
     for ends in (low, high):
         assert np.abs(np.diff(np.asarray(ends), axis=0)).max() <= 2.0 * DT + 1e-5
@@ -163,7 +156,7 @@ def test_tracked_rates_equal_rates_of_vehicle(x0, rates_sensed):
     path = model if not rates_sensed else CommandPath.of(0.0, ActuatorResponse.of(0.03, 0.01))
     plant = simulation(0.03, 0.1)
 
-    true, memory = fly(plant, ActuatorTracking(SlowHover(), path, DT), x0, 100, senses=rates_sensed)
+    true, memory = fly(plant, ActuatorTracking(SlowHover(), path, DT), x0, rates_sensed)
     message, _ = memory.inner
     R = np.asarray(true.R)
     turn = np.einsum("kji,kjl->kil", R[:-1], R[1:])

@@ -19,6 +19,7 @@ from retrim.estimation.command_path.response import mean_step_response, ringing_
 from retrim.physics.state import Command, State
 
 PIECE = 50  # ticks of one call of the program, which flights of any length share
+EVERY = 5  # ticks between two estimates, which take nearly all of the time
 TRACES: list[int] = []
 
 
@@ -28,20 +29,20 @@ def estimator():
 
 
 @eqx.filter_jit
-def estimates(estimator, s, rows, age, every, inertial):
-    """Return the state after ``PIECE`` ticks, and the estimate after each, which is new in one of ``every`` ticks."""
+def estimates(estimator, s, rows, age, inertial):
+    """Return the state after ``PIECE`` ticks, and the estimate after each, which is new in one of ``EVERY`` ticks."""
     TRACES.append(1)
 
     def tick(s, row):
         k, t, p, R, v, omega, a, u = row
         s = estimator.observe(s, t, State(p, R, v), omega if inertial else None, a if inertial else None, age)
-        s = jax.lax.cond((k + 1) % every == 0, lambda s: estimator.estimate_path(s), lambda s: s, s)
+        s = jax.lax.cond((k + 1) % EVERY == 0, lambda s: estimator.estimate_path(s), lambda s: s, s)
         return estimator.issue(s, Command.of(u)), s.estimate
 
     return jax.lax.scan(tick, s, rows)
 
 
-def estimate(flights, i=0, *, inertial=True, start=0.0, every=1, **changes):
+def estimate(flights, i=0, *, inertial=True, start=0.0, **changes):
     """Return the estimates of flight ``i`` as NumPy arrays over time."""
     choice = {name: np.array(getattr(flights, name)[i]) for name in ("p", "R", "v", "omega", "a", "u")} | changes
     n = len(choice["u"])
@@ -52,7 +53,7 @@ def estimate(flights, i=0, *, inertial=True, start=0.0, every=1, **changes):
     s, parts = estimator().init(State(*(jnp.asarray(row[0]) for row in rows[2:5]))), []
     for first in range(0, n, PIECE):
         part = tuple(jnp.asarray(x[first : first + PIECE]) for x in rows)
-        s, result = estimates(estimator(), s, part, jnp.float32(flights.age), jnp.array(every), inertial)
+        s, result = estimates(estimator(), s, part, jnp.float32(flights.age), inertial)
         parts.append(result)
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:n], *parts)
 
@@ -173,7 +174,7 @@ def many_vehicles():
     rng = np.random.default_rng(20)
     vehicles = random_vehicles(rng, 50)
     flights = fly(rng, vehicles, LEVELS["onboard"], 1.0, doublets)
-    return vehicles, [estimate(flights, i, every=5) for i in range(50)]
+    return vehicles, [estimate(flights, i) for i in range(50)]
 
 
 def test_fifty_vehicles_are_identified_within_a_second(many_vehicles):
@@ -252,7 +253,7 @@ def test_estimate_follows_change_of_vehicle():
 
     before, after = one_vehicle(rate_lag=0.04), one_vehicle(rate_lag=0.1)
     flights = fly(np.random.default_rng(6), before, LEVELS["onboard"], 7.0, excite, after, 2.0)
-    result = estimate(flights, every=5)
+    result = estimate(flights)
     assert result.rate_lag.mean[95] == pytest.approx(0.04, rel=0.1)
     assert result.rate_lag.mean[-1] == pytest.approx(0.1, rel=0.2)
 
