@@ -1,6 +1,7 @@
 """Write Blackbox logs from the description of the format: I, P and S frames with every encoding, and two events."""
 
 import struct
+from functools import cache
 
 import numpy as np
 
@@ -146,12 +147,19 @@ def header(layout, version, fine=False, **more):
 
 def blackbox(flight, version=(4, 5), *, without=(), fine=False, end=DISARM + END, **more):
     """Return a log of one flight, as bytes."""
+    lines = header(layout_of(version, without), version, fine, **more)
+    return lines + frames(flight, version, tuple(without), fine) + end
+
+
+@cache
+def frames(flight, version, without, fine):
+    """Return the frames of a flight; logs that differ in their headers share them."""
     layout = layout_of(version, without)
     columns = numbers(flight, version, fine)
     rows = np.stack([columns[each[0]] for each in layout], axis=1).tolist()
     names = [each[0] for each in layout]
     first_motor = names.index("motor[0]") if "motor[0]" in names else None
-    out, one, two = [header(layout, version, fine, **more), b"S" + encode([1, 1, 7, 7, 7], [1, 0, 0, 1, 1])], None, None
+    out, one, two = [b"S" + encode([1, 1, 7, 7, 7], [1, 0, 0, 1, 1])], None, None
     for row in rows:
         main = row[0] % I_EVERY == 0
         difference = []
@@ -165,7 +173,7 @@ def blackbox(flight, version=(4, 5), *, without=(), fine=False, end=DISARM + END
             difference.append(row[k] - expected)
         out.append((b"I" if main else b"P") + encode([each[3 if main else 5] for each in layout], difference))
         one, two = row, row if main else one
-    return b"".join([*out, end])
+    return b"".join(out)
 
 
 def decoded_csv(flight, version=(4, 5), settings=()):

@@ -11,9 +11,9 @@ DT = 1e-3
 IDLE = 0.055
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BodyFlight:
-    """Body axes forward-left-up, one row per millisecond."""
+    """Body axes forward-left-up, one row per millisecond; it is a key by its identity, since arrays have no hash."""
 
     t: np.ndarray
     command: np.ndarray

@@ -1,6 +1,7 @@
 """Blackbox logs of several firmware versions, intact and damaged: each is read exactly, or refused with one line."""
 
 import contextlib
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
@@ -172,12 +173,19 @@ def test_unreadable_log_is_refused_with_one_line(kind, tmp_path):
     assert len(str(error.value)) < 1500
 
 
+@pytest.fixture(scope="module")
+def log_without(tmp_path_factory):
+    """Return a function that reads a log without a setting, once for each setting."""
+    folder = tmp_path_factory.mktemp("without")
+    return cache(lambda name: read(folder, blackbox(SHORTER, **{name: None})))
+
+
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e400", "1e300", "-1e300"])
 @pytest.mark.parametrize("name", ["minthrottle", "vbatref", "I interval", "acc_1G", "looptime", "acc_lpf_hz"])
-def test_setting_without_finite_size_has_its_default(name, number, tmp_path):
-    data = blackbox(FLIGHT, **{name: number, "motorOutput": f"{fake_blackbox.LOW},{fake_blackbox.HIGH}"})
+def test_setting_without_finite_size_has_its_default(name, number, log_without, tmp_path):
+    data = blackbox(SHORTER, **{name: number, "motorOutput": f"{fake_blackbox.LOW},{fake_blackbox.HIGH}"})
     assert read_header(Path("log"), data, 0).numbers(name, (7.0,)) == (7.0,)
-    log, default = read(tmp_path, data), read(tmp_path, blackbox(FLIGHT, **{name: None}))
+    log, default = read(tmp_path, data), log_without(name)
     np.testing.assert_array_equal(log.command, default.command)
     np.testing.assert_array_equal(log.specific_force, default.specific_force)
 
@@ -185,7 +193,7 @@ def test_setting_without_finite_size_has_its_default(name, number, tmp_path):
 def test_motor_limits_without_finite_size_give_flight_or_one_line(tmp_path):
     for limits in ("inf,2047", "158,nan", "nan,nan", "-1e300,2047"):
         with contextlib.suppress(RetrimError):
-            assert np.isfinite(read(tmp_path, blackbox(FLIGHT, motorOutput=limits)).motors).all()
+            assert np.isfinite(read(tmp_path, blackbox(SHORTER, motorOutput=limits)).motors).all()
 
 
 def test_rates_in_unknown_unit_are_refused(tmp_path):
