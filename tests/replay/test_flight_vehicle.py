@@ -3,11 +3,14 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from retrim import Scenario, Setup, load
+from retrim.adapt.vehicles import estimate_path
 from retrim.config.vehicle_file import VehicleSpec, read_vehicle
 from retrim.errors import ConfigError
+from retrim.estimation.command_path import PathEstimator
 from retrim.evaluation.fleet import Fleet
 from retrim.replay import flight_vehicle
 from retrim.replay.flight_vehicle import check_vehicle_file, write_flight_vehicle
@@ -32,6 +35,20 @@ def sample_flight(as_a_user):
     return flight, Setup.from_preset("hover/retrim")
 
 
+@pytest.fixture(scope="module")
+def command_path(sample_flight):
+    """Return the command path of the flight."""
+    log = sample_flight[0].log
+    window = jax.tree.map(jnp.asarray, log.window(len(log.t) - 1))
+    return jax.jit(estimate_path)(PathEstimator.of(log.dt, memory=flight_vehicle.MEMORY), window)
+
+
+@pytest.fixture
+def known_path(command_path, monkeypatch):
+    """Do not estimate the path again."""
+    monkeypatch.setattr(flight_vehicle, "estimate_path", lambda estimator, window: command_path)
+
+
 def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
     flight, setup = sample_flight
     path = tmp_path / "found.toml"
@@ -45,6 +62,7 @@ def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
     assert result.motor_tau == pytest.approx(0.04, rel=0.15)
 
 
+@pytest.mark.usefixtures("known_path")
 def test_file_has_limits_of_vehicle_flown(sample_flight, tmp_path):
     """A flight does not reveal them: they come from the vehicle of the scenario, or else from that of the policy."""
     flight, setup = sample_flight
@@ -57,6 +75,7 @@ def test_file_has_limits_of_vehicle_flown(sample_flight, tmp_path):
         assert result.rates_max == pytest.approx(expected.omega_max.tolist())
 
 
+@pytest.mark.usefixtures("known_path")
 def test_vehicle_that_cannot_be_flown_is_written_and_reported(sample_flight, tmp_path, monkeypatch):
     path, faults, write = tmp_path / "found.toml", [], flight_vehicle.vehicle_toml
     weak = Estimate(13.0, 12.0, 14.0)

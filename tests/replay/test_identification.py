@@ -19,12 +19,15 @@ from retrim.replay.rows import acting_commands
 from retrim.replay.vehicle import vehicle_toml
 
 DT, SUB = 0.02, 20
+TICKS = 900  # flights of one length are identified by one program
+
+
+DRAWS = 50  # bootstrap samples, a quarter of the usual number
 
 
 @pytest.fixture(autouse=True)
 def few_draws(monkeypatch):
-    """Use a quarter of the usual bootstrap samples."""
-    monkeypatch.setattr(identification, "DRAWS", 50)
+    monkeypatch.setattr(identification, "DRAWS", DRAWS)
 
 
 def wander(rng, n, size, tau):
@@ -35,7 +38,7 @@ def wander(rng, n, size, tau):
     return x
 
 
-def excited_flight(seed, *, delay, lag, rate_lag, gain, drag, n=900, noise=1.0, size=1.0):
+def excited_flight(seed, *, delay, lag, rate_lag, gain, drag, n=TICKS, noise=1.0, size=1.0):
     """Return a vehicle under random commands, integrated in steps of 1 ms, with mild noise on the log."""
     rng, h = np.random.default_rng(seed), DT / SUB
     c = 9.81 / gain + size * wander(rng, n, 1.5, 0.3)
@@ -72,15 +75,25 @@ def _turns(phi):
     return np.eye(3) + K + 0.5 * K @ K
 
 
-@pytest.mark.parametrize(
-    ("seed", "truth"),
-    [
-        (0, {"delay": 0.03, "lag": 0.06, "rate_lag": (0.08, 0.08, 0.3), "gain": 0.9, "drag": (0.3, 0.3, 0.1)}),
-        (1, {"delay": 0.0, "lag": 0.03, "rate_lag": (0.03, 0.03, 0.03), "gain": 1.1, "drag": (0.1, 0.4, 0.0)}),
-    ],
-)
-def test_identification_recovers_parameters(seed, truth):
-    result = identify(excited_flight(seed, **truth))
+TRUTHS = [
+    {"delay": 0.03, "lag": 0.06, "rate_lag": (0.08, 0.08, 0.3), "gain": 0.9, "drag": (0.3, 0.3, 0.1)},
+    {"delay": 0.0, "lag": 0.03, "rate_lag": (0.03, 0.03, 0.03), "gain": 1.1, "drag": (0.1, 0.4, 0.0)},
+]
+
+
+@pytest.fixture(scope="module")
+def vehicles():
+    """Return the identified vehicles; the first commands its thrust as a share of full thrust."""
+    logs = [excited_flight(seed, **truth) for seed, truth in enumerate(TRUTHS)]
+    logs[0] = dataclasses.replace(logs[0], full_thrust=25.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identification, "DRAWS", DRAWS)
+        return [identify(log) for log in logs]
+
+
+@pytest.mark.parametrize("i", range(2))
+def test_identification_recovers_parameters(vehicles, i):
+    result, truth = vehicles[i], TRUTHS[i]
     assert result.delay.value == pytest.approx(truth["delay"], abs=0.003)
     assert result.thrust_lag.value == pytest.approx(truth["lag"], abs=0.004)
     assert result.thrust_gain.value == pytest.approx(truth["gain"], abs=0.01)
@@ -96,7 +109,7 @@ def test_identification_recovers_parameters(seed, truth):
 
 def test_response_of_controller_to_noise_is_not_a_rate_loop():
     """At rest only noise moves, and the command responds to it, so that the next difference seems to follow at once."""
-    rng, n = np.random.default_rng(0), 900
+    rng, n = np.random.default_rng(0), TICKS
     tilt = 2e-3 * rng.normal(size=(n, 3))
     v = 6e-3 * rng.normal(size=(n, 3))
     R = Rotation.from_rotvec(tilt).as_matrix()
@@ -121,16 +134,14 @@ def test_short_flight_is_refused():
         identify(log)
 
 
-def test_identified_values_form_vehicle_file():
-    truth = {"delay": 0.02, "lag": 0.05, "rate_lag": (0.08, 0.08, 0.3), "gain": 1.0, "drag": (0.3, 0.3, 0.1)}
-    log = dataclasses.replace(excited_flight(0, **truth), full_thrust=25.0)
-    text = vehicle_toml(identify(log), "small", "a flight.csv")
+def test_identified_values_form_vehicle_file(vehicles):
+    text = vehicle_toml(vehicles[0], "small", "a flight.csv")
     spec = validate(VehicleSpec, tomllib.loads(text), source="vehicle")
-    assert spec.motor_tau == pytest.approx(0.05, abs=0.01)
+    assert spec.motor_tau == pytest.approx(0.06, abs=0.01)
     assert spec.rate_lag == pytest.approx((0.08, 0.08, 0.3), rel=0.1)
-    assert spec.thrust_max == pytest.approx(25.0 * spec.mass, rel=0.05)
+    assert spec.thrust_max == pytest.approx(0.9 * 25.0 * spec.mass, rel=0.05)
     assert spec.build().rate_lag is not None
-    assert spec.command_delay == pytest.approx(0.02, abs=0.003)
+    assert spec.command_delay == pytest.approx(0.03, abs=0.003)
 
 
 @pytest.mark.parametrize(("delay", "lag"), [(0.0, 0.0), (0.02, 0.0), (0.013, 0.04), (0.05, 0.3)])

@@ -112,8 +112,9 @@ def test_invalid_options_are_refused(wrong, text):
 
 
 def test_report_is_table_plot_and_json(files, tmp_path, monkeypatch):
+    """The log has no commanded rates, whose identification has its own tests and a large program."""
     monkeypatch.setattr(identification, "DRAWS", 20)
-    path, choice = files
+    path, choice = files[0], write_map(tmp_path / "map.toml", MAP.partition("[rates]")[0])
     run = Run("replay", tmp_path)
     replay(path, Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True), run, Silent())
     text = (tmp_path / "replay.md").read_text()
@@ -296,6 +297,7 @@ def test_policy_is_adapted_with_its_residual_and_unsuitable_model_is_refused(fil
     preset = tiny_preset(adapt={"residual": "regression", "window": 100, "fit_every": 1.0, "fit_steps": 100})
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
     save_policy(tmp_path / "p.safetensors", policy, preset)
+    monkeypatch.setattr(replays, "_score_predictions", lambda *calls: [])
     used = []
 
     def adapt(rows, setup, policy, **calls):
