@@ -28,6 +28,7 @@ BRIEF = {
 # Compiled programs: without jit, each operation would be compiled separately.
 residual_targets = eqx.filter_jit(learn.residual_targets)
 random_starts = eqx.filter_jit(training_starts)
+call = eqx.filter_jit(lambda function, *arguments: function(*arguments))
 
 
 class CheapModel(AbstractSubstepDynamics[State]):

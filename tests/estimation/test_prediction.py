@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import random
 
-from helpers import first_order, random_command, random_state
+from helpers import call, first_order, random_command, random_state
 from retrim.estimation.prediction import Prediction
 from retrim.physics import ActuatorResponse, Command, CommandPath, PointMass
 from retrim.physics.actuator_response import ActuatorState
@@ -29,25 +29,26 @@ def test_prediction_equals_lagged_model(delay, key):
     memory = prediction.init(model.state(s))
     queue = [Command.hover(s.inner.p.dtype)] * delay
     for k in keys:
-        soon, acting = prediction(memory, model.state(s), d)
+        soon, acting = call(prediction, memory, model.state(s), d)
         after = s
         for u in queue:
-            after = model.step(after, u, d)
+            after = call(model.step, after, u, d)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), soon, model.state(after))
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), acting, after.actuators.command)
         u = random_command(k)
-        memory = prediction.issue(memory, u)
+        memory = call(prediction.issue, memory, u)
         queue.append(u)
-        s = model.step(s, queue.pop(0), d)
+        s = call(model.step, s, queue.pop(0), d)
 
 
 def test_prediction_uses_accepted_commands(key):
     x, (k_a, k_b) = random_state(key), random.split(key)
     prediction = prediction_of(TAU, 1)
     commands, accepted_command = random_command(k_a), random_command(k_b)
-    message = prediction.accept(prediction.issue(prediction.init(x), commands), accepted_command)
-    model = prediction.issue(prediction.init(x), accepted_command)
-    for a, b in zip(prediction(message, x, jnp.zeros(3)), prediction(model, x, jnp.zeros(3)), strict=True):
+    message = prediction.accept(call(prediction.issue, prediction.init(x), commands), accepted_command)
+    model = call(prediction.issue, prediction.init(x), accepted_command)
+    results = (call(prediction, memory, x, jnp.zeros(3)) for memory in (message, model))
+    for a, b in zip(*results, strict=True):
         jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
@@ -56,8 +57,8 @@ def test_old_measurement_is_predicted_to_present(key):
     x, u = random_state(key), random_command(key)
     prediction = prediction_of(0.0, 0)
     memory = prediction.issue(prediction.init(x), u)
-    now = PointMass(DT).step(x, u, jnp.zeros(3))
-    late, _ = prediction.with_age(DT)(memory, x, jnp.zeros(3))
+    now = call(PointMass(DT).step, x, u, jnp.zeros(3))
+    late, _ = call(prediction.with_age(DT), memory, x, jnp.zeros(3))
     np.testing.assert_allclose(late.R, now.R, atol=1e-9)
     np.testing.assert_allclose(late.p, now.p, atol=5e-3)  # the acceleration is assumed constant
 

@@ -188,11 +188,12 @@ def test_path_equals_fine_simulation(delay, kappa, key):
     edges = np.unique(np.round(np.concatenate([switches, np.arange(0.0, 0.5001, 0.001)]), 12))
     edges = edges[(edges >= 0.0) & (edges <= 0.5 + 1e-9)]
     s, total = ActuatorState.at(Command.hover(float)), np.zeros(4)
+    hover, issued = (jax.tree.map(np.asarray, u) for u in (Command.hover(float), us))
     for begin, end in itertools.pairwise(edges):
         k = int(np.sum(switches <= begin + 1e-9)) - 1
-        u = Command.hover(float) if k < 0 else jax.tree.map(lambda leaf, k=k: leaf[k], us)
-        part, s = advance(response, s, u, jnp.asarray(end - begin))
-        total += part.vector()
+        u = hover if k < 0 else jax.tree.map(lambda leaf, k=k: leaf[k], issued)
+        part, s = advance(response, s, u, end - begin)
+        total += np.append(part.c, part.omega)
         tick = round(end / DT) - 1
         if abs(end - DT * (tick + 1)) < 1e-9:
             np.testing.assert_allclose(mean.c[tick], total[0] / DT, rtol=1e-9)
@@ -216,12 +217,19 @@ def mixture(path, us, start, weights):
     return sum(jnp.sum(weights[0] * leaf[-1]) for leaf in jax.tree.leaves((means, states))) + jnp.sum(means.c)
 
 
+@jax.jit
+def cost(arguments):
+    return mixture(*arguments, jnp.array([0.7], arguments[1].c.dtype))
+
+
+slope_of_cost = jax.jit(jax.grad(cost))
+
+
 @pytest.mark.parametrize("kappa", [0.3, 0.97, 1.0, 1.03, 2.0])
 def test_gradients_equal_finite_differences(kappa, key):
     """Gradients with respect to commands, start, delay, lags, gains and damping, including near-critical damping."""
     response = ActuatorResponse.of(0.05, jnp.array([0.03, 0.06, 0.2]), inverse_damping=kappa, thrust_gain=1.1)
     arguments = (CommandPath.of(0.033, response), commands(key, 8), random_command(random.key(5)))
-    cost = jax.jit(lambda arguments: mixture(*arguments, jnp.array([0.7])))
     slope = check_slope(cost, arguments, key, h=2e-7, rel=1e-5)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
     assert abs(float(slope[0].delay)) > 1e-3
@@ -236,7 +244,7 @@ def test_gradients_are_finite_at_boundaries(lag, kappa, delay, key):
     arguments = (CommandPath.of(delay, response), commands(key, 5), Command.hover(float))
     for dtype in (jnp.float64, jnp.float32):
         cast = jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), arguments)
-        slope = jax.jit(jax.grad(lambda arguments: mixture(*arguments, jnp.array([0.7], arguments[1].c.dtype))))(cast)
+        slope = slope_of_cost(cast)
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope))
 
 

@@ -2,12 +2,15 @@
 
 import dataclasses
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import random
 from jax.test_util import check_grads
 
+from helpers import at
 from retrim.config.loading import load
 from retrim.config.setup import Setup
 from retrim.control.network_policy import NetworkPolicy
@@ -30,8 +33,13 @@ X = State(
 LAST = Command(jnp.array(9.0), jnp.array([0.1, 0.2, -0.1]))
 
 
+@eqx.filter_jit
+def first_observation(observation, x, last):
+    return observation(observation.init(x), T, x, last)[0]
+
+
 def observe(observation, x=X, last=LAST):
-    return np.asarray(observation(observation.init(x), T, x, last)[0])
+    return np.asarray(first_observation(observation, x, last))
 
 
 def constant(a):
@@ -61,7 +69,7 @@ def test_velocity_dependent_residual_is_evaluated_along_reference():
     drag = OBSERVATION.with_residual(lambda x, u: -0.4 * x.v)
     end = 6 + 3 * POINTS
     change = (observe(drag) - observe(OBSERVATION))[6:end].reshape(POINTS, 3) * STANDARD_GRAVITY
-    ahead = np.stack([np.asarray(REFERENCE(T + 0.04 * k).v) for k in range(POINTS)])
+    ahead = at(REFERENCE, float(T) + 0.04 * np.arange(POINTS)).v
     expected = 0.4 * (np.asarray(X.v)[None] + ahead - ahead[:1])
     np.testing.assert_allclose(change, expected @ np.asarray(X.R), atol=1e-4)
 
@@ -71,7 +79,7 @@ def test_network_commands_hover_at_rest():
     network = ThrustNetwork.of(OBSERVATION.size, vehicle, random.key(0), (8,))
     rest = dataclasses.replace(OBSERVATION, reference=figure8(1e-3, 1e-3))
     x = State.at(rest.reference(T).p)
-    o, _ = rest(rest.init(x), T, x, Command.hover())
+    o = first_observation(rest, x, Command.hover())
     np.testing.assert_allclose(network(o), np.zeros(4), atol=0.05)
 
 
@@ -94,8 +102,9 @@ def test_free_heading_closes_lap():
 
 def test_gradient_of_network_equals_finite_differences():
     network = ThrustNetwork.of(OBSERVATION.size, small(), random.key(1), (8, 8))
-    o = OBSERVATION(OBSERVATION.init(X), T, X, LAST)[0]
+    o = first_observation(OBSERVATION, X, LAST)
 
+    @jax.jit
     def output(gains, lead):
         return jnp.sum(dataclasses.replace(network, gains=jnp.asarray(gains), lead=jnp.asarray(lead))(o) ** 2)
 
@@ -106,7 +115,7 @@ def test_limited_feedback_keeps_distant_vehicle_upright():
     network = ThrustNetwork.of(OBSERVATION.size, small(), random.key(1), (8,))
     policy = NetworkPolicy.create(network, small())
     far = State(X.p + jnp.array([50.0, -30.0, 0.0]), jnp.eye(3), REFERENCE(T).v)
-    u = policy(OBSERVATION(OBSERVATION.init(far), T, far, LAST)[0])
+    u = policy(first_observation(OBSERVATION, far, LAST))
     assert float(jnp.max(jnp.abs(u.omega))) <= 6.0 + 1e-3
     assert float(u.c) > 8.0
 
