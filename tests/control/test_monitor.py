@@ -40,15 +40,17 @@ def flight(setup, monitor, *, seconds=4.0, fault=None, later=None, model=CheapMo
     push = Constant(jnp.full(3, 0.5, dtype=jnp.float32))
     simulation = Simulation(model, push, None, random.key(0), jnp.array(0.02), fault)
     half, whole = round(2.0 / DT), round(seconds / DT)
+    parts = [(monitor, whole)] if later is None else [(monitor, half), (later, whole - half)]
 
     @eqx.filter_jit
-    def fly(monitor, later, x0):
-        start = take_off(simulation, monitor, x0)
-        start, first = fly_ticks(simulation, monitor, start, half, room=half)
-        _, second = fly_ticks(simulation, later, start, whole - half, room=whole - half)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+    def fly(parts, x0):
+        start, flown = take_off(simulation, monitor, x0), []
+        for controller, n in parts:
+            start, ticks = fly_ticks(simulation, controller, start, n, room=n)
+            flown.append(ticks)
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *flown)
 
-    ticks = fly(monitor, monitor if later is None else later, setup.flight_starts(1, 4)[0])
+    ticks = fly(parts, setup.flight_starts(1, 4)[0])
     return ticks, np.linalg.norm(np.asarray(ticks.true.p) - np.array(setup.preset.goal), axis=1)
 
 
