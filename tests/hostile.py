@@ -549,7 +549,8 @@ class AuditHook:
     CHANGES = ("os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.chmod", "os.link", "os.symlink")
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.on, self.events = str(folder), False, list[str]()
+        own = (folder, jax.config.jax_compilation_cache_dir or folder)  # of the test, and of JAX
+        self.folders, self.on, self.events = tuple(map(str, own)), False, list[str]()
         sys.addaudithook(self)
 
     def __call__(self, event: str, args: tuple) -> None:
@@ -557,7 +558,7 @@ class AuditHook:
         if not self.on:
             return
         paths = event == "open" and isinstance(args[1], str) and set(args[1]) & set("wax+")
-        inside = bool(args) and str(args[0]).startswith(self.folder)
+        inside = bool(args) and str(args[0]).startswith(self.folders)
         if event == "compile" and args[1] == "<unknown>":
             return  # ast.literal_eval executes no code; NumPy reads the headers of arrays with it
         if event in ("compile", "exec") and any("/jaxtyping/" in name for name in callers()):
