@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tty
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -104,26 +105,61 @@ class Stack:
         return float(sum(dt * c * np.sin(tilt) for dt, (_, c, tilt) in zip(np.diff(times), frames, strict=True)))
 
 
-@pytest.fixture
-def stack(request):
-    result = Stack(*request.param)
-    yield result
-    result.close()
-
-
-def of(*kinds, ends=""):
-    return pytest.mark.parametrize("stack", [(kind, ends) for kind in kinds], indirect=True, ids=kinds)
-
-
-@of("udp", "tcp", "serial")
-def test_guardian_levels_vehicle_after_link_is_killed(stack):
+def kill(stack):
+    """Kill the link, and return the times of the start and the end of the recording that follows."""
     stack.listen(0.8)
-    assert stack.commands(0.0, 0.2)
     assert not stack.commands(0.0, 0.0)  # the guardian is silent while the link commands
     killed = time.monotonic()
     os.killpg(stack.link.pid, signal.SIGKILL)
     stack.listen(LATE_S + SINKS_S + STOPS_S + 1.0)
-    end = time.monotonic()
+    return killed, time.monotonic()
+
+
+def suspend(stack):
+    """Suspend the link for a while; return when it was suspended, and when it commands again."""
+    stack.listen(0.6)
+    stack.link.send_signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    stack.listen(COMMANDS.timeout + LATE_S)
+    stack.link.send_signal(signal.SIGCONT)
+    stack.listen(LATE_S)
+    back = time.monotonic()
+    stack.listen(0.4)
+    return stopped, back
+
+
+def await_end(stack):
+    stack.listen(1.0 + LATE_S)
+    return stack.link.wait(5.0)
+
+
+SCENARIOS = {
+    "udp killed": (kill, "udp"), "tcp killed": (kill, "tcp"), "serial killed": (kill, "serial"),
+    "silent": (suspend, "udp"), "released": (await_end, "udp", "released"),
+    "before it commands": (await_end, "udp", "before it commands"), "exit": (await_end, "udp", "exit"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    """Return a stack and the result of each scenario; they run at the same time, because they only wait."""
+
+    def record(function, *how):
+        stack = Stack(*how)
+        try:
+            return stack, function(stack)
+        finally:
+            stack.close()
+
+    with ThreadPoolExecutor(len(SCENARIOS)) as pool:
+        running = {name: pool.submit(record, *scenario) for name, scenario in SCENARIOS.items()}
+    return running
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp", "serial"])
+def test_guardian_levels_vehicle_after_link_is_killed(recordings, kind):
+    stack, (killed, end) = recordings[f"{kind} killed"].result()
+    assert stack.commands(0.0, 0.2)
     safe = stack.commands(killed, 0.0)
     assert abs(stack.speed(killed, end)) < 10.0 * np.sin(0.2) * LATE_S
     assert len(safe) > 0.5 * (SINKS_S + STOPS_S) / PERIOD
@@ -131,29 +167,19 @@ def test_guardian_levels_vehicle_after_link_is_killed(stack):
     assert safe[-1] - safe[0] == pytest.approx(SINKS_S + STOPS_S, abs=LATE_S)
 
 
-@of("udp")
-def test_silent_link_is_replaced_until_it_commands_again(stack):
-    stack.listen(0.6)
-    stack.link.send_signal(signal.SIGSTOP)
-    stopped = time.monotonic()
-    stack.listen(COMMANDS.timeout + LATE_S)
-    (first, *_), held = stack.commands(stopped, 0.0), stack.commands(0.0, 0.2)[-1]
+def test_silent_link_is_replaced_until_it_commands_again(recordings):
+    stack, (stopped, back) = recordings["silent"].result()
+    first = stack.commands(stopped, 0.0)[0]
+    held = [at for at in stack.commands(0.0, 0.2) if at < first][-1]
     assert first - held > 0.5 * COMMANDS.timeout
-    stack.link.send_signal(signal.SIGCONT)
-    stack.listen(LATE_S)
-    back = time.monotonic()
-    stack.listen(0.4)
     assert stack.commands(back, 0.2)
     assert not stack.commands(back, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("stack", "safe"), [(("udp", "released"), False), (("udp", "before it commands"), False), (("udp", "exit"), True)],
-    indirect=["stack"], ids=["released", "before it commands", "exit"],
-)  # fmt: skip
-def test_only_active_unreleased_link_is_replaced(stack, safe):
-    stack.listen(1.0 + LATE_S)
-    assert stack.link.wait(5.0) == 0
+@pytest.mark.parametrize(("ends", "safe"), [("released", False), ("before it commands", False), ("exit", True)])
+def test_only_active_unreleased_link_is_replaced(recordings, ends, safe):
+    stack, status = recordings[ends].result()
+    assert status == 0
     assert bool(stack.commands(0.0, 0.0)) == safe
 
 
