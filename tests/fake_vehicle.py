@@ -71,5 +71,5 @@ def entry(**faults):
 
 
 point, unarmed, lost = entry(), entry(never_arms=True), entry(lost_after=40)
-slow_to_land = entry(lands_in=3.0)
+slow_to_land = entry(lands_in=2.6)
 calm = entry(push=(0.0, 0.0, 0.0))

@@ -24,6 +24,7 @@ from retrim.transport.message import pack_arrays
 
 DRILL = {"plant": "live_processes:plant", "residual": "live_processes:learner", "policy": "live_processes:learner"}
 SECONDS = 1.5
+FLOOR = 0.6  # [m], far above the ground, so that landings take less than a second
 
 
 @pytest.fixture(scope="module")
@@ -31,21 +32,21 @@ def controller():
     return hover_source()
 
 
-def make_spec(folder, controller, **changes):
+def make_spec(folder, controller, floor=FLOOR, **changes):
     start = folder / "start.safetensors"
     start.write_bytes(pack_arrays({}, kind="learnt", about={"preset": dump(PRESETS["hover/retrim"])}))
-    setup = plan(controller)
+    limits = plan(controller, floor=floor).limits
     return replace(
         LiveSpec(
             controller, ("residual", "policy"), start, None, Scenario(), "small", level(np.array([0.0, 0.0, 0.5])),
-            HOME, setup.limits, DT, 1, 150, SECONDS, 0, folder, mains=DRILL,
+            HOME, limits, DT, 1, 150, SECONDS, 0, folder, mains=DRILL,
         ),
         **changes,
     )  # fmt: skip
 
 
-def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
-    """Fly, and kill processes at given times.
+def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL, is_enough=lambda status: False):
+    """Fly, and kill processes at given times; land after some seconds, or as soon as the status is enough.
 
     Returns:
         The last status, the events, the time until the watchdog's first command [s], and whether the system allowed
@@ -63,7 +64,7 @@ def fly_once(spec, kills=None, seconds=SECONDS, number=signal.SIGKILL):
                 del kills[role]
                 os.kill(drill.processes[role].pid, number)
                 took = _fallback_delay(drill.bus, time.monotonic()) if role == "control" else None
-            if status.t > seconds:
+            if status.t > seconds or is_enough(status):
                 drill.land()
             time.sleep(0.02)
         drill.finish()
@@ -111,7 +112,7 @@ def test_flight_without_faults_lands(tmp_path, controller):
     rows = read_whole_log(tmp_path, status)
     assert status.end_reason == "landed"
     assert rows[-1, -1] == Mode.LANDED
-    assert rows[-1, 5] <= 0.1
+    assert FLOOR - 0.1 < rows[-1, 5] <= FLOOR
     assert next(e.note for e in events if e.kind == "guard") == "descend: landing"
     assert sum(e.kind == "policy" for e in events) >= 3
     assert np.linalg.norm(rows[rows[:, 1] > 1.2][0, 3:6] - HOME) < 0.2
@@ -147,8 +148,11 @@ def test_flight_survives_processes_killed_at_random_times(tmp_path, controller, 
 def test_hung_processes_are_detected_at_random_times(tmp_path, controller, roles, seed):
     names = roles.split()
     times = np.random.default_rng([seed, len(roles)]).uniform(0.0, 1.0, len(names))
-    stops, spec = dict(zip(names, times, strict=True)), make_spec(tmp_path, controller, seconds=4.0)
-    status, events, *_ = fly_once(spec, stops, seconds=4.0, number=signal.SIGSTOP)
+    stops = dict(zip(names, times, strict=True))
+    # The landing without control takes longer than the detection.
+    spec = make_spec(tmp_path, controller, 0.1 if roles == "control" else FLOOR, seconds=10.0)
+    are_found = lambda status: status.hangs.keys() == stops.keys()  # noqa: E731
+    status, events, *_ = fly_once(spec, stops, seconds=10.0, number=signal.SIGSTOP, is_enough=are_found)
     rows = read_whole_log(tmp_path, status, times[0] - 2 * DT if roles == "control" else None)
     notes = [event.note for event in events if "hung" in event.note]
     assert status.hangs == dict.fromkeys(stops, 1)
@@ -169,7 +173,8 @@ def test_hung_processes_are_detected_at_random_times(tmp_path, controller, roles
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_vehicle_lands_without_supervisor_and_log_is_complete(tmp_path, controller, number):
-    spec = make_spec(tmp_path, controller, seconds=1.5 if number == signal.SIGKILL else 60.0)
+    mains = DRILL | ({"control": "quick_control:fly"} if number == signal.SIGSTOP else {})
+    spec = make_spec(tmp_path, controller, seconds=1.5 if number == signal.SIGKILL else 60.0, mains=mains)
     process: Popen[bytes] = launch("live_helpers:supervise", spec, tmp_path / "supervisor.log")
     log = tmp_path / "flight.csv"
     until = time.monotonic() + 30.0

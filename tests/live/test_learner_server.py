@@ -33,7 +33,7 @@ from retrim.transport.session import FOREIGN_KEY, MISSING_KEY, UNSIGNED
 from retrim.transport.shared_key import SharedKey
 from retrim_paper.latency import free_port as unused_port
 
-SECONDS = 3.0
+SECONDS = 2.4
 KEY, OTHER = SharedKey(b"k" * 32), SharedKey(b"o" * 32)
 
 
@@ -67,7 +67,7 @@ def fly_with_loss(gap, folder, controller):  # noqa: F811
     """
     address, over = Address("zenoh", "127.0.0.1", unused_port(), shared=KEY), threading.Event()
     page = PageSpec("127.0.0.1", free_port("127.0.0.1", 18180), "drill", HOME[None].repeat(2, 0), (), 0.06, 0.19)
-    changes = {"learners": address, "seconds": SECONDS, "page": page if gap == "bridge and page" else None}
+    changes = {"learners": address, "seconds": 20.0, "page": page if gap == "bridge and page" else None}
     thread = threading.Thread(target=run_station, args=(address, over))
     thread.start()
     events, intact = LiveEvents(), True
@@ -85,7 +85,8 @@ def fly_with_loss(gap, folder, controller):  # noqa: F811
                     else:
                         drill.processes["bridge"].kill()
                         os.kill(drill.processes["page"].pid, signal.SIGSTOP)  # it hangs
-                if status.t > SECONDS:
+                is_restored = gap == "ground" or status.restarts.keys() == {"bridge", "page"}
+                if status.t > (SECONDS if is_restored else 10.0):
                     drill.land()
                 time.sleep(0.02)
             drill.finish()

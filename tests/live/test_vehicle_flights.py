@@ -20,6 +20,7 @@ from retrim.onboard.recorder import read_log
 
 LEARNERS = {"residual": "live_processes:learner", "policy": "live_processes:learner"}
 SECONDS = 1.5
+FLOOR = 0.6  # [m], far above the ground, so that landings take less than a second
 
 
 @pytest.fixture(scope="module")
@@ -27,13 +28,12 @@ def controller():
     return hover_source()
 
 
-@pytest.fixture
-def spec(tmp_path, controller):
-    start = tmp_path / "start.safetensors"
+def make_spec(folder, controller):
+    start = folder / "start.safetensors"
     start.write_bytes(b"")
     return LiveSpec(
         controller, ("residual", "policy"), start, None, Scenario(plant="fake_vehicle:point"), "small", level(HOME),
-        HOME, plan(controller).limits, DT, 1, 150, SECONDS, 0, tmp_path,
+        HOME, plan(controller, floor=FLOOR).limits, DT, 1, 150, SECONDS, 0, folder,
         mains={"plant": VEHICLE} | LEARNERS,
     )  # fmt: skip
 
@@ -59,9 +59,16 @@ def fly_once(spec, kill=None):
     return status, events.all
 
 
-def test_vehicle_flies_from_hand_over_to_landing(spec):
-    status, _ = fly_once(spec)
-    rows = read_log(spec.folder / "flight.csv")
+@pytest.fixture(scope="module")
+def sample_flight(tmp_path_factory, controller):
+    """Return the last status and the log of a flight whose vehicle needs some seconds for its landing."""
+    spec = make_spec(tmp_path_factory.mktemp("flight"), controller)
+    status, _ = fly_once(replace(spec, scenario=Scenario(plant="fake_vehicle:slow_to_land")))
+    return status, read_log(spec.folder / "flight.csv")
+
+
+def test_vehicle_flies_from_hand_over_to_landing(sample_flight):
+    status, rows = sample_flight
     assert status.end_reason == "landed"
     assert rows[0, 0] == 0
     assert rows[-1, -1] == Mode.LANDED
@@ -73,16 +80,16 @@ def test_vehicle_flies_from_hand_over_to_landing(spec):
     assert np.linalg.norm(flying[-1, 3:6] - HOME) < 0.3
 
 
-def test_slow_landing_is_not_hang(spec):
-    status, _ = fly_once(replace(spec, layers=(), scenario=Scenario(plant="fake_vehicle:slow_to_land")))
+def test_slow_landing_is_not_hang(sample_flight):
+    status, _ = sample_flight
     assert status.end_reason == "landed"
     assert not status.hangs
 
 
 @pytest.fixture
-def plain_spec(spec):
-    """Return the same specification without learners."""
-    return replace(spec, layers=())
+def plain_spec(tmp_path, controller):
+    """Return the specification of a flight without learners."""
+    return replace(make_spec(tmp_path, controller), layers=())
 
 
 def test_watchdog_lands_vehicle_without_control(plain_spec):
