@@ -65,10 +65,33 @@ def feed(loop, rows, every=7):
 
 
 @pytest.fixture(scope="module")
-def identifier(setup, rows):
-    loop = IdentifierLoop(setup.preset, BASE, bus())
+def sample_flight(setup, rows):
+    """Return an identifier after a flight, and the programs compiled in its warm-up and in flight."""
+    programs = []
+
+    def record(name, seconds, **about):
+        if name.endswith("backend_compile_duration"):
+            programs.append(about.get("fun_name"))
+
+    loop = IdentifierLoop(setup.preset, BASE, bus())  # the first one of this process
+    jax.monitoring.register_event_duration_secs_listener(record)
+    loop.warm_up()
+    before = list(programs)
     feed(loop, rows)
+    jax.monitoring.unregister_event_duration_listener(record)
+    return loop, before, programs[len(before) :]
+
+
+@pytest.fixture
+def identifier(sample_flight):
+    loop, *_ = sample_flight
     return loop
+
+
+@pytest.fixture(scope="module")
+def source(setup):
+    """Return the programs and parameters of the controller that flies the identified vehicle."""
+    return plain_source(setup, setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller)
 
 
 def parameters(loop, expected, after=0):
@@ -76,10 +99,8 @@ def parameters(loop, expected, after=0):
     return Parameters.unpack(data, expected, half=VEHICLE, base=BASE, after=after)
 
 
-def test_vehicle_is_identified(setup, identifier):
-    controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
-    expected = plain_source(setup, controller).parameters[VEHICLE]
-    result = parameters(identifier, expected)
+def test_vehicle_is_identified(setup, source, identifier):
+    result = parameters(identifier, source.parameters[VEHICLE])
     centre, half_width, gain = (np.asarray(a) for a in result.arrays.values())
     family = setup.env.family
     path = family.path(jnp.asarray(centre))
@@ -96,39 +117,31 @@ def test_identification_is_reported_after_one_and_five_seconds(identifier):
     assert all(text.startswith("thrust gain 0.") and "rate delay" in text for _, text in reports)
 
 
-def test_estimate_does_not_depend_on_length_of_messages(setup, rows, identifier):
+def test_estimate_does_not_depend_on_length_of_messages(setup, source, rows, identifier):
     other = IdentifierLoop(setup.preset, BASE, bus())
     feed(other, rows, every=50)
     (centre, width, gain), (centre_50, width_50, gain_50) = (
-        tuple(map(np.asarray, parameters(loop, _shapes(setup)).arrays.values())) for loop in (identifier, other)
+        tuple(map(np.asarray, parameters(loop, source.parameters[VEHICLE]).arrays.values()))
+        for loop in (identifier, other)
     )
     assert (np.abs(centre - centre_50) < width + width_50).all()
     assert abs(gain - gain_50) < 0.02
 
 
-def test_restarted_identifier_continues_versions(setup, rows, identifier):
+def test_restarted_identifier_continues_versions(setup, source, rows, identifier):
     before = identifier.bus.latest(f"parameters.{VEHICLE}").version
     again = IdentifierLoop(setup.preset, BASE, identifier.bus)
     again.bus.publish("flight", FlightRows(rows[-150:]).pack())
     while again.step():
         pass
-    assert parameters(again, _shapes(setup), after=before).version == before + 1
+    assert parameters(again, source.parameters[VEHICLE], after=before).version == before + 1
 
 
-def test_warm_up_compiles_all_programs(setup, rows):
+def test_warm_up_compiles_all_programs(sample_flight):
     """The supervisor would kill a process that compiles in flight, since it sends no heartbeat."""
-    loop, programs = IdentifierLoop(setup.preset, BASE, bus()), list[str]()
-
-    def record(name, seconds, **about):
-        if name.endswith("backend_compile_duration"):
-            programs.append(name)
-
-    jax.clear_caches()
-    loop.warm_up()
-    jax.monitoring.register_event_duration_secs_listener(record)
-    feed(loop, rows[:140])
-    jax.monitoring.unregister_event_duration_listener(record)
-    assert programs == []
+    _, before, in_flight = sample_flight
+    assert {"jit(_measure)", "jit(_estimate)"} <= set(before)
+    assert in_flight == []
 
 
 def test_damaged_rows_are_ignored(setup):
@@ -155,9 +168,7 @@ def test_only_identifying_controller_has_vehicle_parameters(setup):
     assert vehicle_half(setup, setup.pilot(policy, "base-do").controller) == {}
 
 
-def test_controller_follows_slowly_and_keeps_vehicle_after_restart(setup):
-    policy = setup.new_policy(jax.random.key(0))
-    source = plain_source(setup, setup.pilot(policy, "base-id").controller)
+def test_controller_follows_slowly_and_keeps_vehicle_after_restart(source):
     pilot = LivePilot(source)
     pilot.reset(AT_REST)
     steady = [pilot.act(0.02 * k, 0.0, AT_REST) for k in range(50)][-1]
@@ -171,11 +182,6 @@ def test_controller_follows_slowly_and_keeps_vehicle_after_restart(setup):
     pilot.restart()
     assert pilot.versions[VEHICLE] == 1
     assert pilot.act(2.0, 0.0, AT_REST)[0] > 1.5 * steady[0]
-
-
-def _shapes(setup):
-    controller = setup.pilot(setup.new_policy(jax.random.key(0)), "base-id").controller
-    return plain_source(setup, controller).parameters[VEHICLE]
 
 
 def test_learning_flight_of_vehicle_file_without_lag_has_numpy_form(setup):
