@@ -29,7 +29,7 @@ def fleet():
     """Return a learner, workers of two vehicles that adapted to the same push, and the vehicles' windows."""
     with jax.numpy_dtype_promotion("standard"):
         setup = Setup.from_preset(tiny_preset(adapt={"fit_steps": 100}))
-        learner, low_rank = setup.learner, setup.low_rank(setup.pretrained(), random.key(0))
+        learner, low_rank = setup.learner, setup.low_rank(setup.new_policy(random.key(3)), random.key(0))
         windows = [random_field_flight(push_model, random.key(i), n=setup.preset.adapt.window) for i in (1, 2)]
         workers = []
         for i, window in enumerate(windows):
@@ -69,7 +69,7 @@ def test_nonfinite_step_leaves_base_unchanged(fleet):
 def test_deltas_start_from_shared_base(fleet):
     _, workers, windows = fleet
     base = learn_base(workers, windows, shared_base(workers[0]), random.key(0))
-    updates = learn_together(workers, windows, base)
+    updates = learn_together([*workers, workers[0]], [*windows, windows[0]], base)
     extract = [update.state.policy.base for update in updates if isinstance(update, PolicyUpdate)]
     for each in extract:
         np.testing.assert_array_equal(each.layers[0].weight, base.policy.layers[0].weight)
@@ -111,12 +111,15 @@ def test_worker_with_overridden_computation_is_not_batched(fleet):
 
 
 def test_batched_update_equals_single_updates(fleet):
-    """Updates and random keys are equal, also for three workers, whose program has four rows."""
+    """Updates and random keys are equal, also for three workers, whose program has four rows.
+
+    The common base is their own, so that the program is also that of a shared base.
+    """
     learner, workers, windows = fleet
     make = lambda: [PolicyWorker(learner, workers[i].state, random.key(7 + k)) for k, i in enumerate((0, 1, 0))]  # noqa: E731
     some = [windows[i] for i in (0, 1, 0)]
     alone, together = make(), make()
-    updates = learn_together(together, some)
+    updates = learn_together(together, some, shared_base(workers[0]))
     for worker, window, update, other in zip(alone, some, updates, together, strict=True):
         expected = worker.learn(window)
         assert type(update) is type(expected)

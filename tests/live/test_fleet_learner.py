@@ -4,6 +4,8 @@ import pickle
 import subprocess
 import time
 from dataclasses import replace
+from functools import partial
+from operator import ne
 
 import jax
 import numpy as np
@@ -22,7 +24,7 @@ from retrim.live.processes.learner import LearnerPlan
 from retrim.onboard.messages import pack_note
 
 pytestmark = pytest.mark.usefixtures("optax_promotion")
-SEEDS = {"a": 1, "b": 2, "c": 3, "d": 4}
+SEEDS = {"a": 1, "b": 2, "c": 3, "d": 4, "e": 5, "f": 6}
 
 
 def plan_of(start, layer, seed):  # noqa: F811
@@ -68,16 +70,18 @@ def test_batched_updates_equal_separate_updates(start, vehicles, layer):  # noqa
     assert any(vehicle.bus.latest(f"parameters.{layer}") for vehicle in vehicles.values())
 
 
-def test_late_vehicle_does_not_delay_others(start, vehicles):  # noqa: F811
-    vehicles["d"] = LearnerRig(start)
+def test_late_vehicles_do_not_delay_others(start, vehicles):  # noqa: F811
+    vehicles |= {name: LearnerRig(start) for name in "def"}
     fleet = fleet_for(vehicles, start, "residual")
     for name in "acd":
         vehicles[name].fly()
     assert fleet.step() == 3
-    assert vehicles["b"].bus.latest("parameters.residual") is None
-    vehicles["b"].fly()
-    assert fleet.step() == 1
-    assert vehicles["b"].parameters("residual").version == 1
+    for name in "bef":
+        assert vehicles[name].bus.latest("parameters.residual") is None
+        vehicles[name].fly()
+    assert fleet.step() == 3
+    for name in "bef":
+        assert vehicles[name].parameters("residual").version == 1
     assert fleet.step() == 0
 
 
@@ -92,12 +96,17 @@ def test_learning_continues_after_vehicle_leaves(start, vehicles):  # noqa: F811
     assert vehicles["b"].bus.latest("parameters.residual") is None
 
 
-def test_update_of_departed_vehicle_is_not_published(start, vehicles):  # noqa: F811
+def test_updates_of_departed_vehicles_are_not_published(start, vehicles):  # noqa: F811
     fleet = FleetLearner(lambda: vehicles["a"].now)
-    fleet.add("a", plan_of(start, "residual", 1), vehicles["a"].bus, lambda: False)
-    vehicles["a"].fly()
-    assert fleet.step() == 1
-    assert vehicles["a"].bus.latest("parameters.residual") is None
+    for name, vehicle in vehicles.items():
+        fleet.add(name, plan_of(start, "residual", SEEDS[name]), vehicle.bus, partial(ne, name, "a"))
+        vehicle.fly()
+    assert fleet.step() == 3
+    assert [vehicle.bus.latest("parameters.residual") is not None for vehicle in vehicles.values()] == [
+        False,
+        True,
+        True,
+    ]
 
 
 def test_low_rank_vehicles_share_base_until_rollback(start, tmp_path):  # noqa: F811
