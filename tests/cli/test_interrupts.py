@@ -10,7 +10,10 @@ import pytest
 
 from commands import SMALL, results, retrim, run_interrupted
 from helpers import tiny_preset
-from retrim import Setup, load_policy, save_policy
+from retrim import Fleet, Setup, load_policy, save_policy
+from retrim.config import named_presets as presets
+from retrim.config.loading import overlaid
+from retrim_paper import demo
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -83,12 +86,30 @@ def test_interrupted_training_saves_policy(folder):
     retrim("fly", "--policy", "cut", "--seconds", "1", "--adapt", "none", "--out", "cut_flown", cwd=folder)
 
 
-def test_interrupted_training_does_not_replace_a_policy(folder):
+def interrupt_at(monkeypatch, place, name, *, after=False):
+    """Let Ctrl-C arrive when a function begins or, with ``after``, when it has ended."""
+    function = getattr(place, name)
+
+    def interrupted(*words, **more):
+        result = function(*words, **more) if after else None
+        signal.raise_signal(signal.SIGINT)
+        return result if after else function(*words, **more)
+
+    monkeypatch.setattr(place, name, interrupted)
+
+
+def test_interrupted_training_does_not_replace_a_policy(folder, monkeypatch):
     (folder / "again").mkdir()
     path = shutil.copy(folder / "p" / "policy.safetensors", folder / "again" / "policy.safetensors")
-    before = path.read_bytes()
-    code, out = run_interrupted((*PRETRAIN, "--updates", "100000", "--out", "again"), folder, after=b"loss ")
-    assert code == 130, out
+    before, train = path.read_bytes(), Setup.pretraining
+
+    def interrupted(*words):
+        for steps in train(*words):
+            yield steps
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Setup, "pretraining", interrupted)
+    out = retrim(*PRETRAIN, "--updates", "100000", "--out", "again", cwd=folder, code=130)
     assert path.read_bytes() == before
     assert "again/interrupted/policy.safetensors" in out
     assert results(folder / "again/interrupted")["interrupted"]
@@ -105,28 +126,28 @@ def test_interrupted_compilation_saves_nothing(folder):
     assert not (folder / "never").exists()
 
 
-def test_interruption_before_score_keeps_policy_and_results(folder):
-    path = folder / "between" / "policy.safetensors"
-    code, out = run_interrupted((*PRETRAIN, "--out", "between"), folder, after=path)
-    assert code == 130, out
-    assert "Traceback" not in out
-    result = results(folder / "between")
+@pytest.mark.parametrize(
+    ("module", "name", "after"),
+    [("retrim.runkit.outputs", "save_policy", True), ("retrim.cli.pretrain", "nominal_error", False)],
+)
+def test_interruption_before_score_keeps_policy_and_results(folder, monkeypatch, module, name, after):
+    interrupt_at(monkeypatch, importlib.import_module(module), name, after=after)
+    out = retrim(*PRETRAIN, "--out", name, cwd=folder, code=130)
+    assert "interrupted after 20 steps, which are saved" in out
+    result = results(folder / name)
     assert len(result["losses"]) == result["rows"][0]["updates"] == 20
-    assert load_policy(folder / "between")[1].name == "hover/retrim"
+    assert load_policy(folder / name)[1].name == "hover/retrim"
 
 
-def test_interruption_of_demo_before_flights_keeps_policy_and_results(folder):
-    # The demo is interrupted as soon as its policy exists; the flights do not begin.
-    small = (
-        "from retrim.config import named_presets as presets, loading\nfrom pathlib import Path\n"
-        "presets.PRESETS['hover/retrim'] = loading.overlaid(presets.PRESETS['hover/retrim'], Path('small.toml'))"
-    )
-    words = "demo", "--starts", "1", "--seconds", "3", "--out", "demo"
-    code, out = run_interrupted(words, folder, after=b"hover error in its own model", setup=small)
-    assert code == 130, out
-    assert "Traceback" not in out
-    assert len(results(folder / "demo")["losses"]) == 20
-    assert load_policy(folder / "demo")[1].pretrain.hidden_sizes == (8,)
+@pytest.mark.parametrize(("place", "name"), [(demo, "fly_all"), (Fleet, "run")])
+def test_interruption_of_demo_before_flights_keeps_policy_and_results(folder, monkeypatch, place, name):
+    small = overlaid(presets.PRESETS["hover/retrim"], folder / "small.toml")
+    monkeypatch.setitem(presets.PRESETS, "hover/retrim", small)
+    interrupt_at(monkeypatch, place, name)
+    folder_name = f"demo_{name}"
+    retrim("demo", "--starts", "1", "--seconds", "3", "--out", folder_name, cwd=folder, code=130)
+    assert len(results(folder / folder_name)["losses"]) == 20
+    assert load_policy(folder / folder_name)[1].pretrain.hidden_sizes == (8,)
 
 
 def test_interrupted_fly_saves_finished_flights(folder):
