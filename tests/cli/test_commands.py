@@ -12,6 +12,7 @@ import pytest
 
 from commands import SMALL, results, retrim
 from retrim import Fleet, load_learner_state, load_policy
+from retrim.evaluation import fleet
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
 
@@ -21,7 +22,15 @@ ROUGH = "--disturbance", "gusts", "--sensors", "mocap"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, as_a_user):
+def one_by_one():
+    """Let flights share the programs of a single flight; tests/evaluation compares them with flights in one program."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fleet, "program_of", lambda *_: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, as_a_user, one_by_one):
     """Return a folder with a small policy in p/, and the results of its flights in gusts in f/."""
     here = tmp_path_factory.mktemp("user")
     (here / "small.toml").write_text(
@@ -201,6 +210,7 @@ def test_demo_at_reduced_size(folder, monkeypatch):
     any_small = changed(presets.PRESETS["hover/any"], pretrain={"num_envs": 2, "horizon": 20, "hidden_sizes": (8,)})
     monkeypatch.setitem(presets.PRESETS, "hover/any", any_small)
     monkeypatch.setattr(demo, "UPDATES", 2)
+    monkeypatch.setattr(Fleet, "warm_up", lambda *_: None)  # it compiles a program that no flight of base-id uses
     out = retrim("demo", "--seconds", "2", "--starts", "1", "--out", "d", cwd=folder)
     assert "adapted, all weights" in out
     assert "One quadrotor with a rate loop of 100 ms" in out
