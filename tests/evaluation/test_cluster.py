@@ -61,7 +61,7 @@ def here(as_a_user):
 def fleet(as_a_user):
     preset = small()
     policy = Setup.from_preset(preset).new_policy(jax.random.key(0))
-    return Fleet(preset, policy, [Scenario("small", plant="simple")], starts=2, seconds=1.2)
+    return Fleet(preset, policy, [Scenario("gusts")], starts=2, seconds=1.2)  # the programs of the sweep
 
 
 def test_remote_flights_equal_local_flights(here, fleet):
@@ -239,12 +239,12 @@ def test_lost_job_is_resubmitted_a_limited_number_of_times(gap):
 
 def test_table_grows_by_its_command(tmp_path, monkeypatch):
     monkeypatch.setitem(named_presets.PRESETS, "hover/fast", small())
-    words = "--preset", "hover/fast", "--flights", "4", "8", "--seconds", "1"
+    words = "--preset", "hover/fast", "--flights", "8", "16", "--seconds", "1"  # in pairs, like the sweeps
     text = retrim("reproduce", "scaling", *words, "--out", "s", cwd=tmp_path)
     whole = json.loads((tmp_path / "s" / "scaling.json").read_text())
     result = whole["rows"]
     assert whole["seeds"] == [0]
-    assert [row["flights"] for row in result] == [4, 8]
+    assert [row["flights"] for row in result] == [8, 16]
     assert all(row["run_s"] > 0 and row["peak_mb"] > 50 for row in result)
     assert "flights a second" in text
     assert (tmp_path / "s" / "scaling.png").stat().st_size > 5000

@@ -86,14 +86,14 @@ def test_every_combination_is_flown_once_in_order(fleet, flights):
     assert all(flight.events == () for flight in flights.flights if flight.spec.method == "base")
 
 
-def test_one_thread_and_two_processes_give_same_flights(fleet, flights):
+def test_one_thread_and_another_process_give_same_flights(fleet, flights):
     with ThreadPoolExecutor(1) as pool:
         assert fleet.run(pool).rows() == flights.rows()
     context, part = multiprocessing.get_context("spawn"), [fleet.specs[5], fleet.specs[7]]
     assert [(spec.scenario, spec.method, spec.seed) for spec in part] == [
         (SCENARIOS[1], "base", 5), (SCENARIOS[1], "full", 5)
     ]  # fmt: skip
-    with ProcessPoolExecutor(2, mp_context=context, initializer=enable_compile_cache) as pool:
+    with ProcessPoolExecutor(1, mp_context=context, initializer=enable_compile_cache) as pool:
         elsewhere = fleet.run(pool, only=part)
     assert [flight.spec for flight in elsewhere.flights] == part
     for there, here in zip(elsewhere.flights, (flights.flights[5], flights.flights[7]), strict=True):

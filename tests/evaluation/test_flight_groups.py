@@ -7,6 +7,7 @@ import pytest
 from fake_flights import Watching
 from helpers import brief_preset
 from retrim import CheckpointError, Scenario, Setup
+from retrim.evaluation import batches
 from retrim.evaluation.flight_groups import FLIGHTS, clear_flights
 from retrim.evaluation.study import Study, fly_all
 from retrim.runkit import Run, provenance
@@ -71,6 +72,7 @@ def test_interrupted_table_is_completed_and_equal(study, whole, tmp_path):
 
 
 def test_stored_flights_are_reused_only_for_same_study(study, tmp_path, monkeypatch):
+    monkeypatch.setattr(batches, "CPU_LIMIT", 2)  # one program for any number of starts
     extract = lambda study=study, **how: fly_once(study, tmp_path, **how)[1]  # noqa: E731
     assert extract(methods=("base",)) == 0
     assert extract(methods=("indi", "base")) == 2
