@@ -236,18 +236,18 @@ def test_datt_is_trained_once_per_folder(tmp_path, monkeypatch):
     text = []
     reporter = Silent()
     reporter.say = text.append
-    run, preset = Run("test", tmp_path), load("hover/retrim")
-    first = rivals.train_datt(preset, [0, 1], run, reporter, steps=1)
-    again = rivals.train_datt(preset, [0], run, reporter, steps=1)
+    run, preset, steps = Run("test", tmp_path), load("hover/retrim"), 4 * rivals.round_steps(1)
+    first = rivals.train_datt(preset, [0, 1], run, reporter, steps=steps)
+    again = rivals.train_datt(preset, [0], run, reporter, steps=steps)
     jax.tree.map(np.testing.assert_array_equal, first[0], again[0])
     assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(first[0]), jax.tree.leaves(first[1]), strict=True))
     (file,) = tmp_path.glob("datt_*_seed0.safetensors")
     file.write_bytes(file.read_bytes()[:-100])
-    other = rivals.train_datt(preset, [0], run, reporter, steps=1)
+    other = rivals.train_datt(preset, [0], run, reporter, steps=steps)
     assert "made again" in text[0]
     jax.tree.map(np.testing.assert_array_equal, first[0], other[0])
     monkeypatch.setattr(provenance, "code", lambda: "changed")
-    rivals.train_datt(preset, [0], run, reporter, steps=1)
+    rivals.train_datt(preset, [0], run, reporter, steps=steps)
     assert len(list(tmp_path.glob("datt_*_seed0.safetensors"))) == 2
     with pytest.raises(ConfigError, match=r"DATT looks ahead in steps of 0\.06 s, which must be whole control periods"):
         rivals.check_period(changed(preset, dt=0.025))
@@ -332,7 +332,8 @@ def test_baselines_need_no_trained_policy(tmp_path, monkeypatch):
         "x", load("hover/retrim"), Scenario(plant="simple"), "x", ("indi", "datt"), levels={"none": "calm"}
     )
     document = Document(Run("test", tmp_path), "table", "Title", "Intro.", [0], Silent())
-    fly_levels(document, [section, dataclasses.replace(section, methods=())], starts=1, seconds=1.0, datt_steps=1)
+    fly_levels(document, [section, dataclasses.replace(section, methods=())], starts=1, seconds=1.0,
+               datt_steps=4 * rivals.round_steps(1))  # fmt: skip
     rows = results(tmp_path, "table.json")["rows"]
     assert [(row["method"], row["n"]) for row in rows] == [("indi", 1), ("datt", 1)]
     assert [row[0] for row in document.sections[0].rows] == ["INDI", "DATT"]
