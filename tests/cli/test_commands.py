@@ -112,6 +112,7 @@ def test_full_disk_loses_no_policy(folder):
 
 @pytest.mark.usefixtures("full_disk")
 def test_full_disk_loses_no_flight(folder):
+    """The flights equal those on a disk with space bit for bit."""
     words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--out", "full"
     out = retrim(*words, cwd=folder, code=1)
     assert "hover error, last 2 s of 2 s, 2 starts" in out
@@ -119,19 +120,17 @@ def test_full_disk_loses_no_flight(folder):
     for name in ("the learner state", "events.jsonl", "the logs", "results.json"):
         assert f"retrim: {name} cannot be written to full (No space left on device); it is in {place}" in out
     assert results(place)["rows"] == results(folder / "f")["rows"]
+    assert (place / "events.jsonl").read_text() == (folder / "f" / "events.jsonl").read_text()
     assert load_learner_state(place / "learner_state.safetensors")[1].name == "hover/retrim"
     assert len(list((place / "logs").glob("*.npz"))) == 4
     shutil.rmtree(place)
 
 
-def test_flight_repeats_bit_for_bit_and_depends_on_seed(folder):
-    words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2"
-    retrim(*words, "--out", "b", cwd=folder)
-    retrim(*words, "--seed", 7, "--adapt", "none", "--out", "c", cwd=folder)
-    first, second, other = (results(folder / name)["rows"] for name in "fbc")
-    assert first == second
+def test_flight_depends_on_seed(folder):
+    words = "fly", "--policy", "p", *ROUGH, "--seconds", "2", "--starts", "2", "--seed", "7", "--adapt", "none"
+    retrim(*words, "--out", "c", cwd=folder)
+    first, other = (results(folder / name)["rows"] for name in "fc")
     assert first[0]["errors"] != other[0]["errors"]
-    assert (folder / "f" / "events.jsonl").read_text() == (folder / "b" / "events.jsonl").read_text()
 
 
 def test_live_learns_in_real_time_and_lands(folder):
@@ -203,13 +202,14 @@ def test_adapted_policy_flies_and_default_folder_is_under_runs(folder):
 def test_demo_at_reduced_size(folder, monkeypatch):
     from retrim.config import named_presets as presets
     from retrim.config.loading import changed, overlaid
-    from retrim_paper import demo
+    from retrim_paper import demo, slow_vehicle
 
     small = overlaid(presets.PRESETS["hover/retrim"], folder / "small.toml")
     monkeypatch.setitem(presets.PRESETS, "hover/retrim", small)
     any_small = changed(presets.PRESETS["hover/any"], pretrain={"num_envs": 2, "horizon": 20, "hidden_sizes": (8,)})
     monkeypatch.setitem(presets.PRESETS, "hover/any", any_small)
     monkeypatch.setattr(demo, "UPDATES", 2)
+    monkeypatch.setattr(slow_vehicle, "SECONDS", 5.0)  # the push begins at 4 s
     monkeypatch.setattr(Fleet, "warm_up", lambda *_: None)  # it compiles a program that no flight of base-id uses
     out = retrim("demo", "--seconds", "2", "--starts", "1", "--out", "d", cwd=folder)
     assert "adapted, all weights" in out

@@ -30,14 +30,14 @@ def test_camera_preserves_lines_and_enlarges_near_objects():
 
 
 def test_animation_lasts_as_long_as_longest_flight():
-    flights = [flight(0.1, seconds=2.0), flight(3.0, terminated=True, seconds=1.0)]
+    flights = [flight(0.1, seconds=1.0), flight(3.0, terminated=True, seconds=0.5)]
     setup = Setup.from_preset(tiny_preset())
     data = animate(flights[:1], setup, flights[0].spec.scenario, "title", {})
     image, duration = Image.open(io.BytesIO(data)), 0.0
     for k in range(image.n_frames):
         image.seek(k)
         duration += image.info["duration"] / 1000.0
-    assert duration == pytest.approx(2.0 + HOLD_S, abs=0.1)
+    assert duration == pytest.approx(1.0 + HOLD_S, abs=0.1)
 
 
 def test_animation_needs_its_flights(tmp_path):
