@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from ..estimation.command_path import PathEstimate, PathEstimator, PathState
 from ..io.logs import FlightLog
@@ -26,19 +27,25 @@ def path_of_log(log: FlightLog) -> PathEstimate:
     # At ticks outside the flight, the time is made discontinuous.
     t = np.where(log.valid, log.t, log.t + 0.5 * log.dt)
     columns = (t, log.p, log.R, log.v, np.nan_to_num(log.c, nan=STANDARD_GRAVITY), np.nan_to_num(omega))
-    rows = tuple(jnp.asarray(x[:n].reshape(-1, BATCH, *x.shape[1:]), jnp.float32) for x in columns)
-    return _estimate(PathEstimator.of(log.dt, memory=MEMORY), rows)
+    room = BATCH << (n // BATCH - 1).bit_length()  # a power of two, so that logs of similar lengths share a program
+    rows = tuple(jnp.asarray(_padded(x[:n], room).reshape(-1, BATCH, *x.shape[1:]), jnp.float32) for x in columns)
+    return _estimate(PathEstimator.of(log.dt, memory=MEMORY), rows, jnp.array(n // BATCH))
+
+
+def _padded(rows: np.ndarray, n: int) -> np.ndarray:
+    """Return ``n`` rows, the last of which are zero."""
+    return np.concatenate([rows, np.zeros((n - len(rows), *rows.shape[1:]), rows.dtype)])
 
 
 @eqx.filter_jit
-def _estimate(estimator: PathEstimator, rows: tuple[jax.Array, ...]) -> PathEstimate:
+def _estimate(estimator: PathEstimator, rows: tuple[jax.Array, ...], count: Int[Array, ""]) -> PathEstimate:
     def tick(s: PathState, row: tuple[jax.Array, ...]) -> tuple[PathState, None]:
         t, p, R, v, c, omega = row
         return estimator.issue(estimator.observe(s, t, State(p, R, v)), Command(c, omega)), None
 
-    def batch(s: PathState, part: tuple[jax.Array, ...]) -> tuple[PathState, None]:
-        return estimator.estimate_path(jax.lax.scan(tick, s, part)[0]), None
+    def batch(k: Int[Array, ""], s: PathState) -> PathState:
+        return estimator.estimate_path(jax.lax.scan(tick, s, tuple(x[k] for x in rows))[0])
 
     first = State(*(row[0, 0] for row in rows[1:4]))
-    end: PathState = jax.lax.scan(batch, estimator.init(first), rows)[0]
+    end: PathState = jax.lax.fori_loop(0, count, batch, estimator.init(first))
     return end.estimate

@@ -6,12 +6,13 @@ Call :meth:`PathEstimator.update` with each measurement, then :meth:`PathEstimat
 """
 
 import dataclasses
-from functools import partial
+from functools import cache
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...physics import so3
@@ -104,15 +105,8 @@ class PathEstimator(eqx.Module):
             raise ValueError(
                 f"PathEstimator: 0 < dt < memory must hold, got dt = {dt}, memory = {memory}; set both in s"
             )
-        with jax.ensure_compile_time_eval():  # a program that contains a flight does not compute the start
-            one, no = jnp.ones(()), jnp.zeros(0)
-            rates = Prior(one, 0.15 * one, 0.05 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (9, 9, 5))
-            yaw = Prior(one, 0.15 * one, 0.08 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (5, 7, 5))
-            other = jnp.array([0.5, 20.0, 20.0])  # drag [1/s], and remaining effect of earlier commands [m/s^2]
-            thrust = Prior(
-                one, 0.3 * one, 0.04 * one, 0.8 * one, other, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
-            )
-            return cls(rates, yaw, thrust, memory * one, _start(rates, yaw, thrust, dt), dt)
+        result: PathEstimator = _estimator(dt, memory, jnp.zeros(()).dtype.name)
+        return result
 
     def init(self, x: State) -> PathState:
         """Return the memory of a vehicle that has hovered until now and is measured at ``x``."""
@@ -210,7 +204,26 @@ class PathEstimator(eqx.Module):
         return dataclasses.replace(s, history=s.history.replaced(_from_hover(u)))
 
 
-@partial(jax.jit, static_argnames="dt")
+@cache
+def _estimator(dt: float, memory: float, dtype: str) -> PathEstimator:
+    """Return an estimator; compiled ahead, since a program that contains a flight should not compute the start."""
+
+    def build(one: Float[Array, ""]) -> PathEstimator:
+        no = jnp.zeros(0)
+        rates = Prior(one, 0.15 * one, 0.05 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (9, 9, 5))
+        yaw = Prior(one, 0.15 * one, 0.08 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (5, 7, 5))
+        other = jnp.array([0.5, 20.0, 20.0])  # drag [1/s], and remaining effect of earlier commands [m/s^2]
+        thrust = Prior(
+            one, 0.3 * one, 0.04 * one, 0.8 * one, other, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
+        )
+        return PathEstimator(rates, yaw, thrust, memory * one, _start(rates, yaw, thrust, dt), dt)
+
+    one = np.ones((), dtype)
+    fast: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}  # the program runs once
+    result: PathEstimator = jax.jit(build).lower(one).compile(fast)(one)
+    return result
+
+
 def _start(rates: Prior, yaw: Prior, thrust: Prior, dt: float) -> tuple[Channels, PathEstimate]:
     """Return the sums and the estimate before the first measurement."""
     channels = Channels(
