@@ -44,11 +44,11 @@ def flight(setup, monitor, *, seconds=4.0, fault=None, later=None, model=CheapMo
 
     @eqx.filter_jit
     def fly(parts, x0):
-        start, flown = take_off(simulation, monitor, x0), []
+        start, flights = take_off(simulation, monitor, x0), []
         for controller, n in parts:
             start, ticks = fly_ticks(simulation, controller, start, n, room=n)
-            flown.append(ticks)
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *flown)
+            flights.append(ticks)
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *flights)
 
     ticks = fly(parts, setup.flight_starts(1, 4)[0])
     return ticks, np.linalg.norm(np.asarray(ticks.true.p) - np.array(setup.preset.goal), axis=1)
