@@ -76,7 +76,7 @@ def test_extensions_fly_and_learn_in_lockstep(folder):
     rows = {row["method"]: row for row in results(folder / "f")["rows"]}
     assert set(rows) == {"base", "full"}
     assert all(row["mean"] < 2.0 for row in rows.values())
-    retrim("fly", "--policy", "p", *TRUST, "--plant", "plant:toy", "--disturbance", "none", "--seconds", "1",
+    retrim("fly", "--policy", "p", *TRUST, "--plant", "plant:toy", "--disturbance", "none", "--seconds", "3",
            "--adapt", "controller:pd", "--out", "g", cwd=folder)  # fmt: skip
     assert {row["method"] for row in results(folder / "g")["rows"]} == {"base", "controller:pd"}
 

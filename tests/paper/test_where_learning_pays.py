@@ -17,8 +17,6 @@ from retrim.runtime.flight import Log, States
 from retrim_paper.regimes import fastest_lap_error, height_error_above_table
 from retrim_paper.tables.where_learning_pays import OPPONENTS, _cell, _methods, decide, regimes, where_learning_pays
 
-pytestmark = pytest.mark.usefixtures("as_a_user")  # it shares programs with other tests
-
 NONE_LOST = dict.fromkeys((*OPPONENTS, "adapted"), 0.0)
 
 
