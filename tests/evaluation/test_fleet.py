@@ -5,6 +5,7 @@ import multiprocessing
 import re
 import signal
 import threading
+import types
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
 import jax
@@ -70,6 +71,16 @@ def flights(programs):
 def test_tick_is_not_compiled_after_warm_up(programs, fleet):
     """The score of a flight is compiled once, after the first flights."""
     assert len(programs[1]) <= 3
+
+
+def test_warm_up_uses_measurements_of_plant(fleet, monkeypatch):
+    """Otherwise, a method that uses body rates compiles a second program at take-off."""
+    measurements = []
+    monkeypatch.setattr(Setup, "pilot", lambda *_, **__: types.SimpleNamespace(warm_up=measurements.append))
+    monkeypatch.setattr(fleet_module, "fly_one", lambda *_, **__: None)
+    fleet.warm_up(fleet.specs[:1])
+    assert measurements[0].omega is not None
+    assert measurements[0].a is not None
 
 
 def test_every_combination_is_flown_once_in_order(fleet, flights):

@@ -16,7 +16,6 @@ from ..config.presets import Preset
 from ..config.scenario import Scenario
 from ..config.setup import Latency, Setup
 from ..errors import ConfigError
-from ..plants.plant import Measurement
 from ..progress import show_progress
 from ..runkit.compile_cache import release_programs
 from ..runkit.flights import Flight, FlightSpec
@@ -115,7 +114,8 @@ class Fleet:
             if kind not in pilots:
                 pilots.add(kind)
                 pilot = setup.pilot(self.policies[spec.seed], spec.method, spec.key(), state=self._state)
-                pilot.warm_up(Measurement(0.0, x0))
+                with plant_of(setup, spec) as plant:  # its measurements decide which programs the flight needs
+                    pilot.warm_up(plant.reset(x0))
             if scenario not in plants:
                 plants.add(scenario)
                 fly_one(setup, self.policies[spec.seed], spec, x0, 2 * self.preset.dt, state=self._state)
