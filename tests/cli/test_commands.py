@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("as_a_user")
 
 COMMANDS = ("pretrain", "fly", "demo", "sweep", "live", "gauntlet", "bench", "reproduce", "replay", "export", "doctor")
 ROUGH = "--disturbance", "gusts", "--sensors", "mocap"
-"""What is random there comes from the seed. Flights share it, and so their programs."""
+"""Conditions of all flights, so that they share their programs; the seed determines the random numbers."""
 
 
 @pytest.fixture(scope="module")

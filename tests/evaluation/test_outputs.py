@@ -149,7 +149,7 @@ def test_failed_job_is_counted_and_not_scored():
     row = summary([gap, gap])
     assert (row["n"], row["crashes"], row["failures"], row["mean"]) == (2, 0, ["OSError: gone"] * 2, None)
     assert (row["disturbance"], row["plant"], row["metric"]) == ("none", "bem", "steady_error_m")
-    assert "reference" not in row  # a hover flight has none
+    assert "reference" not in row  # a hover flight has no reference
 
 
 def test_files_of_user_and_inputs_remain(tmp_path):

@@ -58,7 +58,7 @@ def _lines(title: str) -> Advance:
 
 def report_start(run: Run) -> Run:
     """Print a message if a run resumes or overwrites an earlier run, and return the run."""
-    if message := run.of_earlier():
+    if message := run.describe_earlier():
         console.print(message, soft_wrap=True)
     return run
 

@@ -111,7 +111,7 @@ def fly_all(
     earlier = {} if groups is None else groups.earlier
     left = [spec for spec in fleet.specs if spec not in earlier]
     if earlier:
-        reporter.say(f"{len(earlier)} of {len(fleet.specs)} flights: as an earlier run of this folder has flown them")
+        reporter.say(f"{len(earlier)} of {len(fleet.specs)} flights are taken from an earlier run in this folder")
     flights = Flights([], interrupted=bool(left))
     if left:
         with run.interruptible(), reporter.progress("flying") as advance:

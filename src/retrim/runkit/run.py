@@ -75,10 +75,10 @@ class Run:
         result.folder = folder
         return result
 
-    def of_earlier(self) -> str:
+    def describe_earlier(self) -> str:
         """Return a line on whether the run resumes or replaces earlier results; empty if the folder has none."""
         if any((self.folder / PARTS).glob("*")):
-            return f"results in {self.folder}: what the same code made there of the same things stays, the rest goes"
+            return f"results in {self.folder}: parts of the same code and settings are used again, others are replaced"
         return f"results in {self.folder} will be replaced" if any(self.folder.glob("*.json")) else ""
 
     def store(self, reporter: Reporter | None = None) -> Store:
@@ -88,7 +88,7 @@ class Run:
     def reuse(self, part: str, reporter: Reporter) -> None:
         """Count a part that an earlier run has made, and report it."""
         self.reused += 1
-        reporter.say(f"{part}: as an earlier run of this folder has made it")
+        reporter.say(f"{part}: taken from an earlier run in this folder")
 
     @property
     def interrupted(self) -> bool:
