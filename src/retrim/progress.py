@@ -1,4 +1,4 @@
-"""Progress bars for calls from Python: in a notebook or a terminal, and nowhere else."""
+"""Progress bars for calls from Python: only in a notebook or a terminal."""
 
 import sys
 import threading
@@ -16,7 +16,7 @@ INTERVAL = 0.2  # [s], shortest time between two updates of a bar
 
 
 def no_progress(title: str) -> AbstractContextManager[Advance]:
-    """Show nothing.
+    """Ignore the progress.
 
     Args:
         title: Title of the task.
@@ -26,7 +26,7 @@ def no_progress(title: str) -> AbstractContextManager[Advance]:
 
 @contextmanager
 def show_progress(title: str) -> Iterator[Advance]:
-    """Show a bar in a notebook or a terminal until the task ends; show nothing in other processes and threads.
+    """Show a bar in a notebook or a terminal until the task ends, but not in other processes and threads.
 
     Args:
         title: Title of the task.

@@ -24,7 +24,7 @@ def ending_signals() -> list[signal.Signals]:
 
 @contextlib.contextmanager
 def handle_signals(handler: Handler) -> Iterator[None]:
-    """Call a function on each signal that ends a command; outside the main thread, do nothing."""
+    """Call a function on each signal that ends a command; only in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -210,7 +210,6 @@ def test_demo_at_reduced_size(folder, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "hover/any", any_small)
     monkeypatch.setattr(demo, "UPDATES", 2)
     monkeypatch.setattr(slow_vehicle, "SECONDS", 5.0)  # the push begins at 4 s
-    monkeypatch.setattr(Fleet, "warm_up", lambda *_: None)  # it compiles a program that no flight of base-id uses
     out = retrim("demo", "--seconds", "2", "--starts", "1", "--out", "d", cwd=folder)
     assert "adapted, all weights" in out
     assert "One quadrotor with a rate loop of 100 ms" in out

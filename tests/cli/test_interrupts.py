@@ -90,12 +90,12 @@ def interrupt_at(monkeypatch, place, name, *, after=False):
     """Let Ctrl-C arrive when a function begins or, with ``after``, when it has ended."""
     function = getattr(place, name)
 
-    def interrupted(*words, **more):
+    def call(*words, **more):
         result = function(*words, **more) if after else None
         signal.raise_signal(signal.SIGINT)
         return result if after else function(*words, **more)
 
-    monkeypatch.setattr(place, name, interrupted)
+    monkeypatch.setattr(place, name, call)
 
 
 def test_interrupted_training_does_not_replace_a_policy(folder, monkeypatch):
@@ -103,12 +103,12 @@ def test_interrupted_training_does_not_replace_a_policy(folder, monkeypatch):
     path = shutil.copy(folder / "p" / "policy.safetensors", folder / "again" / "policy.safetensors")
     before, train = path.read_bytes(), Setup.pretraining
 
-    def interrupted(*words):
+    def interrupt_second_step(*words):
         for steps in train(*words):
             yield steps
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Setup, "pretraining", interrupted)
+    monkeypatch.setattr(Setup, "pretraining", interrupt_second_step)
     out = retrim(*PRETRAIN, "--updates", "100000", "--out", "again", cwd=folder, code=130)
     assert path.read_bytes() == before
     assert "again/interrupted/policy.safetensors" in out

@@ -323,21 +323,21 @@ def test_switch_that_is_on_too_early_must_be_turned_off(make):
     """The board has no valid commands before the pilot has hovered."""
     plant, board, _ = make()
     board.modes.add(msp.OVERRIDE)
-    began, remarks, off, learned = time.monotonic(), [], 1.5, []
+    began, remarks, off, hover_times = time.monotonic(), [], 1.5, []
 
     def turn():
         t = time.monotonic() - began
         remarks.append((t, plant.waits_for))
         if plant.curve.hover is not None:
-            learned.append(t)
-        is_on = t < off or (learned and t > learned[0] + 0.3)
+            hover_times.append(t)
+        is_on = t < off or (hover_times and t > hover_times[0] + 0.3)
         (board.modes.add if is_on else board.modes.discard)(msp.OVERRIDE)
         return True
 
     plant.connect()
     plant.take_off(np.array([0.0, 0.0, 1.0]), 0.0, turn)
-    assert learned[0] > off
-    assert time.monotonic() - began > learned[0] + 0.3
+    assert hover_times[0] > off
+    assert time.monotonic() - began > hover_times[0] + 0.3
     assert all("turn it off" in text for t, text in remarks if 0.5 < t < off)
     assert not any(text for t, text in remarks if t > off + 0.5)
     assert plant.curve.hover == pytest.approx((1335 - 1050) / 950)

@@ -236,7 +236,7 @@ def test_results_of_earlier_replay_are_removed_by_name(files, tmp_path, monkeypa
     ],
 )
 def test_log_that_does_not_fit_is_refused_before_work(change, text, files, brief, tmp_path, monkeypatch):
-    """Nothing is predicted, written or removed."""
+    """No prediction is made, and no file is written or removed."""
     monkeypatch.setattr(replays, "_score_predictions", lambda *calls: pytest.fail("it was refused after the work"))
     for name in ("replay.json", "replay.md", *OTHERS):
         (tmp_path / name).write_text("of an earlier replay")

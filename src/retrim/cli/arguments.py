@@ -138,7 +138,7 @@ def with_residual(preset: Preset, residual: str | None, state: LearnerState | No
 
 
 def reference_of_flight(preset: Preset, name: str | None) -> str | None:
-    """Return the reference of a tracking flight; None for other tasks.
+    """Return the reference of a tracking flight, if it is one.
 
     Args:
         preset: Preset of the policy.

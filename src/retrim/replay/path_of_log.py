@@ -28,13 +28,9 @@ def path_of_log(log: FlightLog) -> PathEstimate:
     t = np.where(log.valid, log.t, log.t + 0.5 * log.dt)
     columns = (t, log.p, log.R, log.v, np.nan_to_num(log.c, nan=STANDARD_GRAVITY), np.nan_to_num(omega))
     room = BATCH << (n // BATCH - 1).bit_length()  # a power of two, so that logs of similar lengths share a program
-    rows = tuple(jnp.asarray(_padded(x[:n], room).reshape(-1, BATCH, *x.shape[1:]), jnp.float32) for x in columns)
+    padded_columns = [np.pad(x[:n], [(0, room - n), *[(0, 0)] * (x.ndim - 1)]) for x in columns]
+    rows = tuple(jnp.asarray(x.reshape(-1, BATCH, *x.shape[1:]), jnp.float32) for x in padded_columns)
     return _estimate(PathEstimator.of(log.dt, memory=MEMORY), rows, jnp.array(n // BATCH))
-
-
-def _padded(rows: np.ndarray, n: int) -> np.ndarray:
-    """Return ``n`` rows, the last of which are zero."""
-    return np.concatenate([rows, np.zeros((n - len(rows), *rows.shape[1:]), rows.dtype)])
 
 
 @eqx.filter_jit

@@ -183,7 +183,7 @@ def _way_to(peer: str) -> str:
     """Return the address of this machine's interface that leads to a peer; empty if there is none."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((peer, 7400))  # sends nothing
+            probe.connect((peer, 7400))  # sends no packet
             return str(probe.getsockname()[0])
         except (OSError, TypeError):  # TypeError: an impossible name
             return ""

@@ -67,7 +67,7 @@ class FlightMemory:
             seed: Seed of the flight.
 
         Raises:
-            ConfigError: The method does not learn, or the residual model remembers nothing beyond a flight.
+            ConfigError: The method does not learn, or the residual model has no memory beyond a flight.
             CheckpointError: The file is damaged, or belongs to a different model or vehicle.
         """
         recall = _recall(setup)
@@ -162,8 +162,7 @@ def recall_flight(
         say: Function that receives a line about the memory and its age.
 
     Raises:
-        ConfigError: The flight resumes a learner state, learns nothing that can be remembered, or the folder cannot be
-            written.
+        ConfigError: The flight resumes a learner state or has no memory to keep, or the folder cannot be written.
         CheckpointError: The memory is damaged, or is that of another vehicle with the same name.
     """
     if folder is None:

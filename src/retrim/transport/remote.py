@@ -76,7 +76,7 @@ class Address:
 
         Args:
             capacities: Maximum length of a message, by topic [bytes].
-            listen: Whether to wait at the address for other ends; for ROS 1, the master does so; ROS 2 needs none.
+            listen: Whether to wait at the address for other ends; ROS 1 has a master for this, and ROS 2 discovery.
             writes: Topics that this end writes. Readers are connected to these topics immediately. Readers of
                 other topics are connected only by the first message, which may also be the last one.
 
