@@ -1,6 +1,7 @@
 """Flights of an identified vehicle: the inner controller receives the vehicle, thrust and rates."""
 
 import dataclasses
+import re
 
 import equinox as eqx
 import jax
@@ -18,7 +19,7 @@ from retrim.control.controller import AbstractController
 from retrim.control.excitation import Excitation
 from retrim.control.integral import IntegralAction
 from retrim.control.near_target import NearTarget
-from retrim.control.vehicle_report import VehicleEstimate
+from retrim.control.vehicle_report import VehicleEstimate, VehicleReport
 from retrim.errors import ConfigError
 from retrim.estimation.command_path import PathEstimator, ringing_of
 from retrim.physics import ActuatorResponse, Command, CommandPath, State, small
@@ -26,6 +27,7 @@ from retrim.physics.actuator_response import ActuatorState
 from retrim.physics.effects import ExternalEffects
 from retrim.physics.path_family import Member, PathBelief, PathFamily
 from retrim.physics.second_order import SecondOrderQuadrotor
+from retrim.plants.measurement_faults import Late
 from retrim.plants.sim import Simulation
 
 pytestmark = pytest.mark.usefixtures("as_a_user")
@@ -121,6 +123,20 @@ def test_vehicle_is_identified_in_flight(x0, delay, lag, gain):
     assert last.belief.half_width[0] < 0.5
     assert abs(float(last.gain) - gain) < 0.1 * gain
     assert np.all(np.asarray(memory.belief.half_width[0]) > 0.9)  # unknown at take-off
+
+
+@pytest.mark.parametrize("senses", [True, False])
+def test_late_states_count_as_delay_of_commands(x0, senses):
+    """States that are 40 ms late show the motion of a vehicle with 40 ms more delay, also beside a gyroscope."""
+    plant = dataclasses.replace(simulation(0.02, 0.06), fault=Late(2))
+    memory = identified(plant, x0, senses=senses)
+    delay = family().coordinates(jnp.array(0.06), jnp.array(0.06), ringing_of(jnp.array(1.0)), jnp.array(0.03))[0]
+    assert abs(float(memory.flight.belief.centre[-1, 0]) - float(delay)) * 0.05 < 0.005  # [s]
+    if senses:  # the gyroscope shows the delay of the vehicle alone
+        estimate = jax.tree.map(lambda leaf: leaf[-1], memory.path.estimate)
+        np.testing.assert_allclose(estimate.delay.mean, 0.02, atol=0.005)
+        note = VehicleReport(estimate, None, jax.tree.map(lambda leaf: leaf[-1], memory.lateness).value(DT)).note()
+        assert re.search(r"rate delay (1|2)\d ms, .*; measurements (3|4)\d ms older than declared$", note), note
 
 
 def test_excitation_identifies_hovering_vehicle(as_a_user):

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 
 from ..estimation.command_path import PathEstimate, PathEstimator, ringing_of
 from ..estimation.command_path import PathState as EstimatorState
+from ..estimation.latency import follows
+from ..estimation.lateness import Lateness
 from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from .caution import REPORT_LEVEL, Caution
@@ -100,6 +102,8 @@ class IdentifiedState(eqx.Module):
     """Memory of the identification and of the flight that uses its result."""
 
     path: EstimatorState
+    lateness: Lateness
+    """Estimate of the undeclared lateness of measurements; without an inertial unit, the path estimate contains it."""
     flight: BeliefState
 
 
@@ -130,40 +134,47 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
 
     def with_inertial(self, omega: Float[Array, "3"], a: Float[Array, "3"]) -> "IdentifiedFlight":
         """Return the same controller for a tick in which body rates and acceleration were measured."""
-        return dataclasses.replace(self, inner=self.inner.with_inertial(omega, a), omega=omega, a=a)
+        return dataclasses.replace(self, omega=omega, a=a)
 
     def condition(self, memory: IdentifiedState) -> Condition | None:
         """Return the condition of the flight."""
-        return self.follow(vehicle_estimate(self.family, memory.path.estimate)).condition(memory.flight)
+        return self.follow(self._estimate(memory.path, memory.lateness)).condition(memory.flight)
 
     def vehicle(self, memory: IdentifiedState) -> VehicleReport:
         """Return the present estimate of the vehicle."""
-        return VehicleReport(memory.path.estimate, self.declared)
+        return VehicleReport(memory.path.estimate, self.declared, memory.lateness.value(self.estimator.dt))
 
     def disturbance(self, memory: IdentifiedState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the disturbance that the flight expects."""
-        return self.follow(vehicle_estimate(self.family, memory.path.estimate)).disturbance(memory.flight, x, u)
+        return self.follow(self._estimate(memory.path, memory.lateness)).disturbance(memory.flight, x, u)
 
     def init(self, x: State) -> IdentifiedState:
         """Return the memory at the start of a flight."""
-        path = self.estimator.init(x)
-        return IdentifiedState(path, self.follow(vehicle_estimate(self.family, path.estimate)).init(x))
+        path, lateness = self.estimator.init(x), Lateness.start(self.estimator.dt, x.p.dtype)
+        return IdentifiedState(path, lateness, self.follow(self._estimate(path, lateness)).init(x))
 
     def __call__(self, memory: IdentifiedState, t: Float[Array, ""], x: State) -> tuple[Command, IdentifiedState]:
         """Update the identification, and return the command of the inner controller for the present estimate."""
-        path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age)
-        follower = self.follow(vehicle_estimate(self.family, path.estimate))
+        dt, lateness = self.estimator.dt, memory.lateness
+        path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age + lateness.value(dt))
+        inner = self.inner
+        if self.omega is not None and self.a is not None:
+            usable = follows(path.t, memory.path.t, dt) & path.consistency.certain
+            lateness = lateness.observe(memory.path.x, x, usable, self.omega, self.a, self.age, dt)
+            inner = inner.with_inertial(*lateness.inertial(dt))
+        follower = dataclasses.replace(self, inner=inner).follow(self._estimate(path, lateness))
         u, flight = follower(memory.flight, t, x)
         if self.excitation is not None:
             doublet = self.excitation(t, path.estimate)
             u = Command(u.c + doublet.c.astype(u.c.dtype), u.omega + doublet.omega.astype(u.omega.dtype))
             flight = follower.accept(flight, u)
-        return u, IdentifiedState(self.estimator.issue(path, u), flight)
+        return u, IdentifiedState(self.estimator.issue(path, u), lateness, flight)
 
     def accept(self, memory: IdentifiedState, u: Command) -> IdentifiedState:
         """Remember the accepted command."""
         path = self.estimator.accept(memory.path, u)
-        return IdentifiedState(path, self.follow(vehicle_estimate(self.family, path.estimate)).accept(memory.flight, u))
+        follower = self.follow(self._estimate(path, memory.lateness))
+        return IdentifiedState(path, memory.lateness, follower.accept(memory.flight, u))
 
     @property
     def identifies(self) -> bool:
@@ -177,6 +188,15 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
             estimate: Present estimate of the vehicle.
         """
         return BeliefFlight(self.inner, self.family, self.prior, estimate, self.estimator.dt, self.watches)
+
+    def _estimate(self, path: EstimatorState, lateness: Lateness) -> VehicleEstimate:
+        """Return the estimate of the vehicle from states that are as old as declared.
+
+        States that are late show the same motion as a vehicle whose commands are later by the same time.
+        """
+        late, delay = lateness.value(self.estimator.dt), path.estimate.delay
+        seen = dataclasses.replace(delay, mean=delay.mean + late, low=delay.low + late, high=delay.high + late)
+        return vehicle_estimate(self.family, dataclasses.replace(path.estimate, delay=seen))
 
 
 def vehicle_estimate(family: PathFamily, estimate: PathEstimate) -> VehicleEstimate:

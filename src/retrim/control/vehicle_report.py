@@ -8,6 +8,7 @@ from ..physics.path_family import PathBelief
 
 REPORTS = (1.0, 5.0)
 """Flight times at which the identified vehicle is reported [s]."""
+LEAST_LATENESS = 0.01  # [s], least lateness that is reported
 
 
 class VehicleEstimate(eqx.Module):
@@ -24,10 +25,13 @@ class VehicleReport(eqx.Module):
     estimate: PathEstimate
     declared: Float[Array, "2"] | None = None
     """Command delay and rate lag from the vehicle file [s]; None if the file does not state them."""
+    lateness: Float[Array, ""] | None = None
+    """Undeclared lateness of measurements [s]; None if it is not estimated."""
 
     def note(self) -> str:
         """Return a one-line description of the vehicle."""
-        if self.declared is None:
-            return describe_path(self.estimate)
-        delay, lag = (float(each) for each in self.declared)
-        return describe_path(self.estimate, (delay, lag))
+        declared = None if self.declared is None else (float(self.declared[0]), float(self.declared[1]))
+        result = describe_path(self.estimate, declared)
+        if self.lateness is None or float(self.lateness) < LEAST_LATENESS:
+            return result
+        return f"{result}; measurements {1000.0 * float(self.lateness):.0f} ms older than declared"
