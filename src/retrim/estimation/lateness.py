@@ -10,7 +10,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..physics import so3
 from ..physics.state import State, where
@@ -40,8 +40,8 @@ class Lateness(eqx.Module):
     """Mean difference between states and readings of the two sensors, e.g. from their biases."""
     variance: Float[Array, "2"]
     """Variance of this difference."""
-    ticks: Int[Array, ""]
-    """Number of readings."""
+    is_first: Bool[Array, ""]
+    """Whether the next reading is the first."""
 
     @classmethod
     def start(cls, dt: float, dtype: jnp.dtype) -> "Lateness":
@@ -54,7 +54,7 @@ class Lateness(eqx.Module):
         candidates = math.floor(LONGEST / dt) + 1
         readings = jnp.zeros((candidates + math.ceil(LONGEST_AGE / dt) + 2, 3), dtype)
         log_odds = jnp.where(jnp.arange(candidates) == 0, 0.0, -PUNCTUAL).astype(dtype)
-        return cls(readings, readings, log_odds, jnp.zeros((2, 3), dtype), jnp.array(NOISE, dtype) ** 2, jnp.array(0))
+        return cls(readings, readings, log_odds, jnp.zeros((2, 3), dtype), jnp.array(NOISE, dtype) ** 2, jnp.array(True))
 
     def value(self, dt: float) -> Float[Array, ""]:
         """Return the mean lateness [s]; zero if the states are more likely as old as declared than not.
@@ -99,7 +99,7 @@ class Lateness(eqx.Module):
         dtype = self.log_odds.dtype
         before, x, omega, a, age = jax.tree.map(lambda leaf: leaf.astype(dtype), (before, x, omega, a, age))
         omegas, accelerations = (
-            jnp.concatenate([jnp.where(_possible(new, limit), new, old[0])[None], old[:-1]])
+            self._remember(old, jnp.where(jnp.all(jnp.abs(new) < limit), new, old[0]))
             for new, old, limit in ((omega, self.omega, RATE), (a, self.a, ACCELERATION))
         )
         measured = jnp.stack([so3.log(so3.mul(before.R.T, x.R)), x.v - before.v]) / dt
@@ -118,13 +118,13 @@ class Lateness(eqx.Module):
         mean = self.mean + share * jnp.clip(off[best], -limit, limit)
         least = jnp.array(NOISE, dtype) ** 2
         estimate = (log_odds, mean, jnp.maximum(self.variance + share * (size - self.variance), least))
-        valid = usable & (self.ticks >= self.omega.shape[0]) & jnp.all(jnp.isfinite(measured))
+        valid = usable & jnp.all(jnp.isfinite(measured))
         estimate = where(valid, estimate, (self.log_odds, self.mean, self.variance))
-        return Lateness(omegas, accelerations, *estimate, self.ticks + 1)
+        return Lateness(omegas, accelerations, *estimate, jnp.array(False))
 
-
-def _possible(reading: Float[Array, "3"], limit: float) -> Bool[Array, ""]:
-    return jnp.all(jnp.abs(reading) < limit)
+    def _remember(self, readings: Float[Array, "k 3"], new: Float[Array, "3"]) -> Float[Array, "k 3"]:
+        """Return the readings after a new one; the vehicle has hovered before the first, perhaps with a bias."""
+        return jnp.where(self.is_first, new[None], jnp.concatenate([new[None], readings[:-1]]))
 
 
 def _at(readings: Float[Array, "k 3"], late: Float[Array, ""]) -> Float[Array, "3"]:
