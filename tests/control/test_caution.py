@@ -49,13 +49,24 @@ def test_oscillation_raises_and_calm_flight_lowers_caution():
     assert level.max() <= 1.0
 
 
+def test_caution_without_effect_ends_for_a_while():
+    """An oscillation that goes on has another cause than the estimate, e.g. measurements that are late."""
+    t = np.arange(0.0, 14.0, DT)
+    level = caution_levels(0.9 * np.sin(7.0 * t))
+    rises, falls = (np.flatnonzero(np.diff(np.sign(level - 0.1)) == sign) for sign in (2.0, -2.0))
+    assert len(rises) == 2
+    assert 3.0 < DT * (falls[0] - rises[0]) < 4.0
+    assert 5.0 < DT * (rises[1] - falls[0]) < 7.0
+    assert np.all(level[falls[0] + 20 : rises[1] - 5] == 0.0)
+
+
 def test_caution_only_slows_assumed_vehicle():
-    belief = PathBelief.between(jnp.array([-0.8, -0.6, -0.3, 0.1]), jnp.array([-0.7, -0.2, 0.5, 0.4]))
+    belief = PathBelief.between(jnp.array([-0.8, -0.6, -0.3, 0.1]), jnp.array([-0.7, 0.7, 0.5, 0.4]))
     none = Caution.none(State.at(jnp.zeros(3)))
     for level in (0.0, 0.4, 1.0):
         low, high = dataclasses.replace(none, level=jnp.array(level)).apply(belief).ends
         for result, before in zip((low, high), belief.ends, strict=True):
-            expected = np.array(before) + level * np.array([1.0, 1.0, 0.0, 0.0]) * (1.0 - np.array(before))
+            expected = np.minimum(np.array(before) + level * np.array([0.5, 0.5, 0.0, 0.0]), 1.0)
             np.testing.assert_allclose(result, expected, atol=1e-6)
 
 

@@ -61,10 +61,9 @@ class BeliefFlight(WrappedController[BeliefState]):
         inside = super().condition(memory)
         if inside is not None or not self.watches:
             return inside
-        cautious = memory.caution.level > REPORT_LEVEL
-        return Condition(
-            jnp.where(cautious, Stage.CAUTIOUS, Stage.ADAPTED), jnp.where(cautious, Cause.SWINGS, Cause.CALM)
-        )
+        cautious, rests = memory.caution.level > REPORT_LEVEL, memory.caution.rest > 0.0
+        cause = jnp.where(cautious, Cause.SWINGS, jnp.where(rests, Cause.NO_EFFECT, Cause.CALM))
+        return Condition(jnp.where(cautious, Stage.CAUTIOUS, Stage.ADAPTED), cause)
 
     def disturbance(self, memory: BeliefState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the disturbance that the inner controller expects, and the thrust that the thrust gain changes."""

@@ -2,7 +2,8 @@
 
 A policy that assumes a faster vehicle than the actual one turns back too late and drives the vehicle back and forth.
 The estimate of the vehicle cannot show the oscillation, since a wrong estimate may be the cause. The attitude can: the
-tilt swings by many times the amount that a push, a gust or a kick causes, and does not stop.
+tilt swings by many times the amount that a push, a gust or a kick causes, and does not stop. If the oscillation goes on
+although the policy assumes a slower vehicle, the estimate is not the cause, and the policy uses it again for a while.
 """
 
 import equinox as eqx
@@ -20,7 +21,10 @@ RISE = 3.0  # [1/s], largest rate at which the level rises
 MEMORY = 6.0  # [s], time constant of the level's decay; lasting caution makes the flight inaccurate
 REPORT_LEVEL = 0.1  # level from which the log reports the oscillation
 GAIN_SHARE = 0.5  # share by which the thrust gain may be larger than estimated
-CAUTIOUS_COORDINATES = (1.0, 1.0, 0.0, 0.0)  # coordinates that the level changes: delay and rate lag
+STEP = (0.5, 0.5, 0.0, 0.0)  # change of the coordinates; in `hover/any`, 25 ms of delay and a factor of 2.2 of rate lag
+HIGH = 0.5  # level from which caution should end the oscillation
+PATIENCE = 3.0  # [s], time in which it does; the size of the swings then falls below LARGE
+REST = 6.0  # [s], time without caution after it did not end the oscillation
 
 
 class Caution(eqx.Module):
@@ -28,12 +32,17 @@ class Caution(eqx.Module):
 
     swings: Swings
     level: Float[Array, ""]
-    """Level from 0 (the identified vehicle) to 1 (the slowest vehicle of the family)."""
+    """Level from 0 (the identified vehicle) to 1 (a slower vehicle)."""
+    strain: Float[Array, ""]
+    """Time for which the vehicle has oscillated at a high level [s]."""
+    rest: Float[Array, ""]
+    """Time until the level may rise again [s]."""
 
     @classmethod
     def none(cls, x: State) -> "Caution":
         """Return the memory for a flight that starts in the state ``x``."""
-        return cls(Swings.none(_tilt(x)), jnp.zeros_like(x.p[0]))
+        zero = jnp.zeros_like(x.p[0])
+        return cls(Swings.none(_tilt(x)), zero, zero, zero)
 
     def after(self, x: State, dt: float) -> "Caution":
         """Return the memory after a measurement.
@@ -42,15 +51,24 @@ class Caution(eqx.Module):
             x: Measured state.
             dt: Control tick [s].
         """
-        swings = self.swings.after(_tilt(x), dt)
+        swings, dtype = self.swings.after(_tilt(x), dt), self.level.dtype
+        rests = self.rest > 0.0
         rise = RISE * dt * jnp.clip((swings.size - LARGE) / (FULL - LARGE), 0.0, 1.0)
-        level = jnp.exp(-dt / MEMORY) * self.level + rise
-        return Caution(swings, jnp.minimum(level, 1.0).astype(self.level.dtype))
+        level = jnp.where(rests, self.level - RISE * dt, jnp.exp(-dt / MEMORY) * self.level + rise)
+        swings_on = (self.level > HIGH) & (swings.size > LARGE)
+        strain = jnp.where(swings_on, self.strain + dt, 0.0)
+        has_no_effect = strain > PATIENCE
+        return Caution(
+            swings,
+            jnp.clip(level, 0.0, 1.0).astype(dtype),
+            jnp.where(has_no_effect, 0.0, strain).astype(dtype),
+            jnp.where(has_no_effect, REST, jnp.maximum(self.rest - dt, 0.0)).astype(dtype),
+        )
 
     def apply(self, belief: PathBelief) -> PathBelief:
-        """Return the belief with delay and rate lag moved towards the slowest vehicle by the level of caution."""
-        share = self.level * jnp.array(CAUTIOUS_COORDINATES)
-        low, high = (end + share * (1.0 - end) for end in belief.ends)
+        """Return the belief with delay and rate lag increased by the level, at most to those of the slowest vehicle."""
+        step = self.level * jnp.array(STEP)
+        low, high = (end + jnp.minimum(step, 1.0 - end) for end in belief.ends)
         return PathBelief.between(low, high)
 
     def gain(self, gain: Float[Array, ""]) -> Float[Array, ""]:

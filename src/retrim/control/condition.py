@@ -26,6 +26,7 @@ class Cause(IntEnum):
     SWINGS = 4
     CALM = 5
     NO_GAIN = 6
+    NO_EFFECT = 7
 
 
 PARTS = {
@@ -43,6 +44,7 @@ GROUNDS = {
     Cause.SWINGS: "the vehicle swings back and forth by itself, as with a wrong estimate of its delay or lag",
     Cause.NO_GAIN: "the error is as large under the base policy alone, as with a state estimate that wanders",
     Cause.CALM: "the vehicle has not swung by itself for a while",
+    Cause.NO_EFFECT: "the vehicle swings as much if a slower vehicle is assumed, as with late measurements",
 }
 
 

@@ -54,7 +54,8 @@ class Lateness(eqx.Module):
         candidates = math.floor(LONGEST / dt) + 1
         readings = jnp.zeros((candidates + math.ceil(LONGEST_AGE / dt) + 2, 3), dtype)
         log_odds = jnp.where(jnp.arange(candidates) == 0, 0.0, -PUNCTUAL).astype(dtype)
-        return cls(readings, readings, log_odds, jnp.zeros((2, 3), dtype), jnp.array(NOISE, dtype) ** 2, jnp.array(True))
+        mean, variance = jnp.zeros((2, 3), dtype), jnp.array(NOISE, dtype) ** 2
+        return cls(readings, readings, log_odds, mean, variance, jnp.array(True))
 
     def value(self, dt: float) -> Float[Array, ""]:
         """Return the mean lateness [s]; zero if the states are more likely as old as declared than not.

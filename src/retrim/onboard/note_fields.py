@@ -12,7 +12,7 @@ LARGEST_INTEGER, LARGEST_NUMBER, LONGEST_TEXT = 2**53, 1e300, 1000
 """Limits of all readers: largest whole number, largest number, and maximum length of a text."""
 
 # Largest values of `Stage` and `Cause` in retrim.control.condition, which needs JAX; a test checks that they agree.
-LAST_STAGE, LAST_CAUSE = 4, 6
+LAST_STAGE, LAST_CAUSE = 4, 7
 
 
 def format_value(value: Any) -> str:
