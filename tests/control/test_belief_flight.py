@@ -65,6 +65,16 @@ class SlowHover(AbstractController[Command]):
         return dataclasses.replace(self, member=member)
 
 
+class TimedHover(SlowHover):
+    """The same controller; its memory is its last time."""
+
+    def init(self, x):
+        return jnp.zeros_like(x.p[0])
+
+    def __call__(self, memory, t, x):
+        return super().__call__(memory, t, x)[0], t
+
+
 class Lift(eqx.Module):
     """A lift from 1.3 s on; a leaf, so that flights with another one are the same program."""
 
@@ -102,10 +112,10 @@ def x0(as_a_user):
     return Setup.from_preset("hover/retrim").flight_starts(1, 3)[0]
 
 
-def identified(plant, x0, *, size=1.0, excites=False, senses=True):
+def identified(plant, x0, *, size=1.0, excites=False, senses=True, inner=SlowHover):
     """Return the memories of the identification after each tick of a flight; the same program flies all vehicles."""
     controller = IdentifiedFlight(
-        SlowHover(jnp.array(size)),
+        inner(jnp.array(size)),
         PathEstimator.of(DT),
         family(),
         PathBelief.unknown(),
@@ -137,6 +147,14 @@ def test_late_states_count_as_delay_of_commands(x0, senses):
         np.testing.assert_allclose(estimate.delay.mean, 0.02, atol=0.005)
         note = VehicleReport(estimate, None, jax.tree.map(lambda leaf: leaf[-1], memory.lateness).value(DT)).note()
         assert re.search(r"rate delay (1|2)\d ms, .*; measurements (3|4)\d ms older than declared$", note), note
+
+
+def test_late_states_belong_to_earlier_time_of_task(x0):
+    """Otherwise a vehicle would be ahead of its reference by the lateness of the states."""
+    plant = dataclasses.replace(simulation(0.02, 0.06), fault=Late(3))
+    t = np.asarray(identified(plant, x0, inner=TimedHover).flight.inner)
+    np.testing.assert_allclose(t[60:], DT * np.arange(TICKS)[60:] - 0.06, atol=2e-3)
+    assert np.all(np.diff(t) > -0.07)
 
 
 def test_excitation_identifies_hovering_vehicle(as_a_user):

@@ -162,7 +162,8 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
             lateness = lateness.observe(memory.path.x, x, usable, self.omega, self.a, self.age, dt)
             inner = inner.with_inertial(*lateness.inertial(dt))
         follower = dataclasses.replace(self, inner=inner).follow(self._estimate(path, lateness))
-        u, flight = follower(memory.flight, t, x)
+        # A late state belongs to an earlier time of the task; otherwise the vehicle would be ahead of its reference.
+        u, flight = follower(memory.flight, jnp.maximum(t - lateness.value(dt).astype(t.dtype), 0.0), x)
         if self.excitation is not None:
             doublet = self.excitation(t, path.estimate)
             u = Command(u.c + doublet.c.astype(u.c.dtype), u.omega + doublet.omega.astype(u.omega.dtype))
