@@ -38,8 +38,11 @@ def motion(key, size):
 
 
 @eqx.filter_jit
-def observed(key, late, age, *, size=1.0, noise=0.0, missing=None):
-    """Return the memory after each tick, for states that are ``late`` + ``age`` [s] old."""
+def observe_motion(key, late, age, *, size=1.0, noise=0.0, missing=None, gap=None):
+    """Return the memory after each tick, for states that are ``late`` + ``age`` [s] old.
+
+    The readings at the ticks ``missing`` are not finite, and the ticks before ``gap[1]`` from ``gap[0]`` on are missed.
+    """
     states, omega, a = motion(key, size)
     rows = jnp.maximum(FINE * jnp.arange(1, TICKS + 1) - 1 - jnp.round((late + age) / DT * FINE).astype(int), 0)
     x = jax.tree.map(lambda leaf: leaf[rows], states)
@@ -50,15 +53,20 @@ def observed(key, late, age, *, size=1.0, noise=0.0, missing=None):
     if missing is not None:
         omega = omega.at[missing].set(jnp.nan)
 
+    present = jnp.ones(TICKS, bool) if gap is None else (jnp.arange(TICKS) < gap[0]) | (jnp.arange(TICKS) >= gap[1])
+    order = jnp.argsort(~present, stable=True)  # missed ticks at the end, where the caller ignores them
+    x, omega, a = jax.tree.map(lambda leaf: leaf[order], (x, omega, a))
+    successive = jnp.diff(order, prepend=-1) == 1
+
     def tick(carry, row):
         memory, before = carry
-        x, omega, a = row
-        after = memory.observe(before, x, jnp.array(True), omega, a, age, DT)
-        return (after, x), (after.value(DT), after.inertial(DT))
+        x, omega, a, successive = row
+        after = memory.observe(before, x, successive, successive, omega, a, age, DT)
+        return (after, x), (after.value, after.late_readings(DT)[0], after.variance)
 
     first = jax.tree.map(lambda leaf: leaf[0], x)
-    value, inertial = lax.scan(tick, (Lateness.start(DT, x.p.dtype), first), (x, omega, a))[1]
-    return value, inertial[0], omega
+    value, rates, variance = lax.scan(tick, (Lateness.start(DT, x.p.dtype), first), (x, omega, a, successive))[1]
+    return value, rates, omega, variance
 
 
 @pytest.mark.parametrize(
@@ -69,12 +77,12 @@ def test_lateness_is_found(noise, lates, ticks, age):
     """Noise of 20 mm/s hides a lateness of one tick for longer than 1.5 s."""
     for late in lates:
         for seed in range(3):
-            value, _, _ = observed(random.key(seed), jnp.array(late), jnp.array(age), noise=jnp.array(noise))
+            value, *_ = observe_motion(random.key(seed), jnp.array(late), jnp.array(age), noise=jnp.array(noise))
             np.testing.assert_allclose(value[75:], late, atol=ticks * DT)
 
 
 def test_lateness_between_ticks_is_found_to_half_a_tick():
-    value, _, _ = observed(random.key(0), jnp.array(0.05), jnp.array(0.0))
+    value, *_ = observe_motion(random.key(0), jnp.array(0.05), jnp.array(0.0))
     np.testing.assert_allclose(value[75:], 0.05, atol=0.5 * DT + 1e-3)
 
 
@@ -82,18 +90,26 @@ def test_lateness_between_ticks_is_found_to_half_a_tick():
 def test_vehicle_at_rest_shows_no_lateness(noise):
     """Noise alone is not evidence."""
     for seed in range(5):
-        value, _, _ = observed(
+        value, *_ = observe_motion(
             random.key(seed), jnp.array(0.06), jnp.array(0.0), size=jnp.array(0.0), noise=jnp.array(noise)
         )
         assert value.max() < 1e-3
 
 
 def test_readings_become_as_late_as_states():
-    _, inertial, omega = observed(random.key(0), jnp.array(0.06), jnp.array(0.0))
-    np.testing.assert_allclose(inertial[75:], omega[72:-3], atol=0.01)
+    _, rates, omega, _ = observe_motion(random.key(0), jnp.array(0.06), jnp.array(0.0))
+    np.testing.assert_allclose(rates[75:], omega[72:-3], atol=0.01)
 
 
 def test_missing_readings_change_little():
-    value, _, _ = observed(random.key(0), jnp.array(0.06), jnp.array(0.0), missing=jnp.arange(40, TICKS, 10))
+    value, *_ = observe_motion(random.key(0), jnp.array(0.06), jnp.array(0.0), missing=jnp.arange(40, TICKS, 10))
     assert np.all(np.isfinite(value))
     np.testing.assert_allclose(value[75:], 0.06, atol=0.01)
+
+
+def test_missed_ticks_are_no_evidence():
+    """After a gap, the stored readings are older than their places in the history."""
+    value, *_, variance = observe_motion(random.key(0), jnp.array(0.06), jnp.array(0.03), gap=jnp.array([80, 90]))
+    assert np.all(variance[80:93] == variance[79])
+    assert np.all(variance[95] != variance[79])
+    np.testing.assert_allclose(value[60:140], 0.06, atol=2e-3)

@@ -107,7 +107,11 @@ class IdentifiedState(eqx.Module):
 
 
 class IdentifiedFlight(AbstractController[IdentifiedState]):
-    """Flies a controller for a family of vehicles, and identifies the vehicle."""
+    """Flies a controller for a family of vehicles, and identifies the vehicle.
+
+    Beside an inertial unit, the flight also finds states that are older than declared. The inner controller then
+    receives readings that are as late as the states.
+    """
 
     inner: AbstractController[Any]
     estimator: PathEstimator
@@ -141,7 +145,7 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
 
     def vehicle(self, memory: IdentifiedState) -> VehicleReport:
         """Return the present estimate of the vehicle."""
-        return VehicleReport(memory.path.estimate, self.declared, memory.lateness.value(self.estimator.dt))
+        return VehicleReport(memory.path.estimate, self.declared, memory.lateness.value)
 
     def disturbance(self, memory: IdentifiedState, x: State, u: Command) -> Float[Array, "3"]:
         """Return the disturbance that the flight expects."""
@@ -155,15 +159,16 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     def __call__(self, memory: IdentifiedState, t: Float[Array, ""], x: State) -> tuple[Command, IdentifiedState]:
         """Update the identification, and return the command of the inner controller for the present estimate."""
         dt, lateness = self.estimator.dt, memory.lateness
-        path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age + lateness.value(dt))
+        path = self.estimator.update(memory.path, t, x, self.omega, self.a, self.age + lateness.value)
         inner = self.inner
         if self.omega is not None and self.a is not None:
-            usable = follows(path.t, memory.path.t, dt) & path.consistency.certain
-            lateness = lateness.observe(memory.path.x, x, usable, self.omega, self.a, self.age, dt)
-            inner = inner.with_inertial(*lateness.inertial(dt))
+            successive, certain = follows(path.t, memory.path.t, dt), path.consistency.certain
+            usable = successive & certain
+            lateness = lateness.observe(memory.path.x, x, successive, usable, self.omega, self.a, self.age, dt)
+            inner = inner.with_inertial(*lateness.late_readings(dt))
         follower = dataclasses.replace(self, inner=inner).follow(self._estimate(path, lateness))
         # A late state belongs to an earlier time of the task; otherwise the vehicle would be ahead of its reference.
-        u, flight = follower(memory.flight, jnp.maximum(t - lateness.value(dt).astype(t.dtype), 0.0), x)
+        u, flight = follower(memory.flight, t - lateness.value.astype(t.dtype), x)
         if self.excitation is not None:
             doublet = self.excitation(t, path.estimate)
             u = Command(u.c + doublet.c.astype(u.c.dtype), u.omega + doublet.omega.astype(u.omega.dtype))
@@ -194,9 +199,9 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
 
         States that are late show the same motion as a vehicle whose commands are later by the same time.
         """
-        late, delay = lateness.value(self.estimator.dt), path.estimate.delay
-        seen = dataclasses.replace(delay, mean=delay.mean + late, low=delay.low + late, high=delay.high + late)
-        return vehicle_estimate(self.family, dataclasses.replace(path.estimate, delay=seen))
+        late, delay = lateness.value, path.estimate.delay
+        total_delay = dataclasses.replace(delay, mean=delay.mean + late, low=delay.low + late, high=delay.high + late)
+        return vehicle_estimate(self.family, dataclasses.replace(path.estimate, delay=total_delay))
 
 
 def vehicle_estimate(family: PathFamily, estimate: PathEstimate) -> VehicleEstimate:

@@ -23,7 +23,9 @@ REPORT_LEVEL = 0.1  # level from which the log reports the oscillation
 GAIN_SHARE = 0.5  # share by which the thrust gain may be larger than estimated
 STEP = (0.5, 0.5, 0.0, 0.0)  # change of the coordinates; in `hover/any`, 25 ms of delay and a factor of 2.2 of rate lag
 HIGH = 0.5  # level from which caution should end the oscillation
-PATIENCE = 3.0  # [s], time in which it does; the size of the swings then falls below LARGE
+PATIENCE = (
+    3.0  # [s], time in which caution ends an oscillation from a wrong estimate, and swings become smaller than LARGE
+)
 REST = 6.0  # [s], time without caution after it did not end the oscillation
 
 
@@ -33,7 +35,7 @@ class Caution(eqx.Module):
     swings: Swings
     level: Float[Array, ""]
     """Level from 0 (the identified vehicle) to 1 (a slower vehicle)."""
-    strain: Float[Array, ""]
+    oscillation_time: Float[Array, ""]
     """Time for which the vehicle has oscillated at a high level [s]."""
     rest: Float[Array, ""]
     """Time until the level may rise again [s]."""
@@ -55,13 +57,15 @@ class Caution(eqx.Module):
         rests = self.rest > 0.0
         rise = RISE * dt * jnp.clip((swings.size - LARGE) / (FULL - LARGE), 0.0, 1.0)
         level = jnp.where(rests, self.level - RISE * dt, jnp.exp(-dt / MEMORY) * self.level + rise)
-        swings_on = (self.level > HIGH) & (swings.size > LARGE)
-        strain = jnp.where(swings_on, self.strain + dt, 0.0)
-        has_no_effect = strain > PATIENCE
+        oscillates = (self.level > HIGH) & (swings.size > LARGE)
+        oscillation_time = jnp.where(
+            oscillates, self.oscillation_time + dt, jnp.maximum(self.oscillation_time - dt, 0.0)
+        )
+        has_no_effect = oscillation_time > PATIENCE
         return Caution(
             swings,
             jnp.clip(level, 0.0, 1.0).astype(dtype),
-            jnp.where(has_no_effect, 0.0, strain).astype(dtype),
+            jnp.where(has_no_effect, 0.0, oscillation_time).astype(dtype),
             jnp.where(has_no_effect, REST, jnp.maximum(self.rest - dt, 0.0)).astype(dtype),
         )
 

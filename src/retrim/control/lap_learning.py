@@ -67,7 +67,9 @@ class LapLearning(WrappedController[LapState]):
 
     def __call__(self, memory: LapState, t: Float[Array, ""], x: State) -> tuple[Command, LapState]:
         """Correct the shift by the present error, and return the command of the inner controller."""
-        shift = self._correct(memory.shift, t - self.age.astype(t.dtype), x)
+        vehicle = self.inner.vehicle(memory.inner)
+        age = self.age if vehicle is None else vehicle.age(self.age)
+        shift = self._correct(memory.shift, t - age.astype(t.dtype), x)
         u, inner = set_shift(self.inner, shift)(memory.inner, t, x)
         return u, LapState(shift, inner)
 

@@ -90,7 +90,9 @@ class PacedFlight(WrappedController[PacedState]):
         clock = memory.clock
         phase, pace = clock.phase_at(t), clock.pace_at(t)
         now = Clock(t.astype(phase.dtype), phase, pace, clock.growth)
-        error = x.p - self.reference(phase - pace * self.age.astype(phase.dtype)).p
+        vehicle = self.inner.vehicle(memory.inner)
+        age = self.age if vehicle is None else vehicle.age(self.age)
+        error = x.p - self.reference(phase - pace * age.astype(phase.dtype)).p
         decay = 1.0 - self.dt / PEAK_TAU
         peak = jnp.maximum(jnp.sqrt(jnp.sum(error * error)), decay * memory.peak)
         rate = jnp.clip(1.0 - peak / TOLERANCE, -1.0, 1.0)

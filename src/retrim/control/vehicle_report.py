@@ -26,7 +26,15 @@ class VehicleReport(eqx.Module):
     declared: Float[Array, "2"] | None = None
     """Command delay and rate lag from the vehicle file [s]; None if the file does not state them."""
     lateness: Float[Array, ""] | None = None
-    """Undeclared lateness of measurements [s]; None if it is not estimated."""
+    """Undeclared lateness of measurements [s]; zero or None without an inertial unit."""
+
+    def age(self, declared: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the age of measurements [s].
+
+        Args:
+            declared: Declared age [s].
+        """
+        return declared if self.lateness is None else declared + self.lateness.astype(declared.dtype)
 
     def note(self) -> str:
         """Return a one-line description of the vehicle."""

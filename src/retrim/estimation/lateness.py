@@ -10,7 +10,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..physics import so3
 from ..physics.state import State, where
@@ -22,7 +22,8 @@ PUNCTUAL = 8.0  # log of the prior odds of states that are as old as declared ag
 MOST_EVIDENCE = 30.0  # largest log odds, so that a change in lateness is soon found
 NOISE_TAU = 1.0  # [s], memory of the noise and of constant differences
 NOISE = (0.02, 0.1)  # [rad/s] and [m/s^2], smallest standard deviations of the differences
-MODEL_ERROR = 0.5  # error of the compared readings, as a share of the largest difference between two candidates
+MODEL_ERROR = 0.5  # error of the compared readings, as a share of the largest difference between successive candidates
+PACE = 0.4  # [-], largest rate of change of the value: the time of the states always advances, by most of a tick
 OUTLIER = 4.0  # standard deviations to which a difference is limited
 INFORMATION = 0.3  # share of the evidence that counts, since successive differences are correlated
 
@@ -40,8 +41,12 @@ class Lateness(eqx.Module):
     """Mean difference between states and readings of the two sensors, e.g. from their biases."""
     variance: Float[Array, "2"]
     """Variance of this difference."""
+    value: Float[Array, ""]
+    """Lateness in use [s], which follows the mean lateness slowly; it is zero at the start."""
     is_first: Bool[Array, ""]
     """Whether the next reading is the first."""
+    ticks: Int[Array, ""]
+    """Number of readings since a tick was missed, at most the number that is stored."""
 
     @classmethod
     def start(cls, dt: float, dtype: jnp.dtype) -> "Lateness":
@@ -55,31 +60,23 @@ class Lateness(eqx.Module):
         readings = jnp.zeros((candidates + math.ceil(LONGEST_AGE / dt) + 2, 3), dtype)
         log_odds = jnp.where(jnp.arange(candidates) == 0, 0.0, -PUNCTUAL).astype(dtype)
         mean, variance = jnp.zeros((2, 3), dtype), jnp.array(NOISE, dtype) ** 2
-        return cls(readings, readings, log_odds, mean, variance, jnp.array(True))
+        zero, full = jnp.zeros((), dtype), jnp.array(readings.shape[0])
+        return cls(readings, readings, log_odds, mean, variance, zero, jnp.array(True), full)
 
-    def value(self, dt: float) -> Float[Array, ""]:
-        """Return the mean lateness [s]; zero if the states are more likely as old as declared than not.
-
-        Args:
-            dt: Control tick [s].
-        """
-        share = jax.nn.softmax(self.log_odds)
-        mean = dt * share @ jnp.arange(share.shape[0], dtype=share.dtype)
-        return jnp.where(share[0] > 0.5, 0.0, mean)
-
-    def inertial(self, dt: float) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    def late_readings(self, dt: float) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Return the readings that are as late as the states: body rates [rad/s], acceleration, world [m/s^2].
 
         Args:
             dt: Control tick [s].
         """
-        late = self.value(dt) / dt
-        return _at(self.omega, late), _at(self.a, late)
+        ticks = self.value / dt
+        return _at(self.omega, ticks), _at(self.a, ticks)
 
     def observe(
         self,
         before: State,
         x: State,
+        successive: Bool[Array, ""],
         usable: Bool[Array, ""],
         omega: Float[Array, "3"],
         a: Float[Array, "3"],
@@ -91,6 +88,7 @@ class Lateness(eqx.Module):
         Args:
             before: State measured one tick ago.
             x: Measured state.
+            successive: Whether one tick separates the two states.
             usable: Whether the step between the two states is a possible motion.
             omega: Measured body rates [rad/s].
             a: Measured acceleration, the mean over the last tick, world [m/s^2].
@@ -103,33 +101,44 @@ class Lateness(eqx.Module):
             self._remember(old, jnp.where(jnp.all(jnp.abs(new) < limit), new, old[0]))
             for new, old, limit in ((omega, self.omega, RATE), (a, self.a, ACCELERATION))
         )
-        measured = jnp.stack([so3.log(so3.mul(before.R.T, x.R)), x.v - before.v]) / dt
-        late = jnp.clip(age, 0.0, LONGEST_AGE) / dt + jnp.arange(self.log_odds.shape[0], dtype=dtype)
-        read = jax.vmap(lambda at: jnp.stack([_at(0.5 * (omegas[:-1] + omegas[1:]), at), _at(accelerations, at)]))(late)
-        difference = measured[None] - read
-        spread = jnp.max(jnp.mean((read[1:] - read[:-1]) ** 2, axis=2), axis=0)
+        motion = jnp.stack([so3.log(so3.mul(before.R.T, x.R)), x.v - before.v]) / dt
+        ages = age / dt + jnp.arange(self.log_odds.shape[0], dtype=dtype)
+        rates = 0.5 * (omegas[:-1] + omegas[1:])
+        candidates = jax.vmap(lambda ticks: jnp.stack([_at(rates, ticks), _at(accelerations, ticks)]))(ages)
+        spread = jnp.max(jnp.mean((candidates[1:] - candidates[:-1]) ** 2, axis=2), axis=0)
         variance = self.variance + MODEL_ERROR**2 * spread
-        off = difference - self.mean[None]
-        misfit = jnp.minimum(jnp.sum(off**2, axis=2) / variance[None], OUTLIER**2)
+        deviation = motion[None] - candidates - self.mean[None]
+        misfit = jnp.minimum(jnp.sum(deviation**2, axis=2) / variance[None], OUTLIER**2)
         log_odds = self.log_odds - 0.5 * INFORMATION * jnp.sum(misfit, axis=1)
         log_odds = jnp.maximum(log_odds - jnp.max(log_odds), -MOST_EVIDENCE)
         best, share = jnp.argmax(log_odds), 1.0 - math.exp(-dt / NOISE_TAU)
         limit = OUTLIER * jnp.sqrt(variance)[:, None]
-        size = jnp.minimum(jnp.mean(off[best] ** 2, axis=1), OUTLIER**2 * variance)
-        mean = self.mean + share * jnp.clip(off[best], -limit, limit)
+        size = jnp.minimum(jnp.mean(deviation[best] ** 2, axis=1), OUTLIER**2 * variance)
+        mean = self.mean + share * jnp.clip(deviation[best], -limit, limit)
         least = jnp.array(NOISE, dtype) ** 2
         estimate = (log_odds, mean, jnp.maximum(self.variance + share * (size - self.variance), least))
-        valid = usable & jnp.all(jnp.isfinite(measured))
+        # After a missed tick, the stored readings are older than their places in the history.
+        most = omegas.shape[0]
+        ticks = jnp.where(successive | self.is_first, jnp.minimum(self.ticks + 1, most), 0)
+        valid = usable & (ticks == most) & (age <= LONGEST_AGE) & jnp.all(jnp.isfinite(motion))
         estimate = where(valid, estimate, (self.log_odds, self.mean, self.variance))
-        return Lateness(omegas, accelerations, *estimate, jnp.array(False))
+        value = self.value + jnp.clip(_mean_lateness(estimate[0], dt) - self.value, -PACE * dt, PACE * dt)
+        return Lateness(omegas, accelerations, *estimate, value, jnp.array(False), ticks)
 
     def _remember(self, readings: Float[Array, "k 3"], new: Float[Array, "3"]) -> Float[Array, "k 3"]:
         """Return the readings after a new one; the vehicle has hovered before the first, perhaps with a bias."""
         return jnp.where(self.is_first, new[None], jnp.concatenate([new[None], readings[:-1]]))
 
 
-def _at(readings: Float[Array, "k 3"], late: Float[Array, ""]) -> Float[Array, "3"]:
-    """Return the readings that are ``late`` ticks old, by linear interpolation."""
-    whole = jnp.clip(jnp.floor(late).astype(int), 0, readings.shape[0] - 2)
-    share = jnp.clip(late - whole, 0.0, 1.0).astype(readings.dtype)
+def _mean_lateness(log_odds: Float[Array, " candidates"], dt: float) -> Float[Array, ""]:
+    """Return the mean lateness [s]; zero if the states are more likely as old as declared than not."""
+    share = jax.nn.softmax(log_odds)
+    mean = dt * share @ jnp.arange(share.shape[0], dtype=share.dtype)
+    return jnp.where(share[0] > 0.5, 0.0, mean)
+
+
+def _at(readings: Float[Array, "k 3"], age: Float[Array, ""]) -> Float[Array, "3"]:
+    """Return the reading that is ``age`` ticks old, by linear interpolation."""
+    whole = jnp.clip(jnp.floor(age).astype(int), 0, readings.shape[0] - 2)
+    share = jnp.clip(age - whole, 0.0, 1.0).astype(readings.dtype)
     return (1.0 - share) * readings[whole] + share * readings[whole + 1]
