@@ -127,7 +127,7 @@ def test_vehicle_is_identified_in_flight(x0, delay, lag, gain):
 
 @pytest.mark.parametrize("senses", [True, False])
 def test_late_states_count_as_delay_of_commands(x0, senses):
-    """States that are 60 ms late show the motion of a vehicle with 60 ms more delay, also beside a gyroscope."""
+    """States that are 60 ms late show the motion of a vehicle with 60 ms more delay, with and without a gyroscope."""
     plant = dataclasses.replace(simulation(0.02, 0.06), fault=Late(3))
     memory = identified(plant, x0, senses=senses)
     delay = family().coordinates(jnp.array(0.08), jnp.array(0.06), ringing_of(jnp.array(1.0)), jnp.array(0.03))[0]

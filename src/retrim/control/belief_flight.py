@@ -57,7 +57,7 @@ class BeliefFlight(WrappedController[BeliefState]):
     tilt swings even without such an oscillation."""
 
     def condition(self, memory: BeliefState) -> Condition | None:
-        """Return the condition of the inner controller; if it has none, return that of the caution."""
+        """Return the condition of the inner controller, or that of the caution for an inner controller without one."""
         inside = super().condition(memory)
         if inside is not None or not self.watches:
             return inside
@@ -109,8 +109,8 @@ class IdentifiedState(eqx.Module):
 class IdentifiedFlight(AbstractController[IdentifiedState]):
     """Flies a controller for a family of vehicles, and identifies the vehicle.
 
-    Beside an inertial unit, the flight also finds states that are older than declared. The inner controller then
-    receives readings that are as late as the states.
+    With an inertial unit, the flight also estimates by how much the states are older than declared. The inner
+    controller then receives readings that are as late as the states.
     """
 
     inner: AbstractController[Any]
@@ -119,17 +119,17 @@ class IdentifiedFlight(AbstractController[IdentifiedState]):
     prior: PathBelief
     """Belief at take-off."""
     declared: Float[Array, "2"] | None = None
-    """Command delay and rate lag from the vehicle file [s]; None if the file does not state them."""
+    """Command delay and rate lag from the vehicle file [s], if the file states both."""
     omega: Float[Array, "3"] | None = None
-    """Measured body rates [rad/s]; None if they are not measured."""
+    """Measured body rates [rad/s], if there is an inertial unit."""
     a: Float[Array, "3"] | None = None
-    """Measured acceleration in the world frame [m/s^2]; None if it is not measured."""
+    """Measured acceleration in the world frame [m/s^2], if there is an inertial unit."""
     age: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Age of measurements [s]."""
     watches: bool = eqx.field(static=True, default=True)
     """Whether a self-induced oscillation makes the controller assume a slower vehicle; see :class:`BeliefFlight`."""
     excitation: Excitation | None = None
-    """Small command doublets until the estimate is narrow; None for no excitation."""
+    """Small command doublets until the estimate is narrow, if the preset excites the vehicle."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "IdentifiedFlight":
         """Return the same controller for measurements that are ``age`` seconds old."""

@@ -3,7 +3,7 @@
 A policy that assumes a faster vehicle than the actual one turns back too late and drives the vehicle back and forth.
 The estimate of the vehicle cannot show the oscillation, since a wrong estimate may be the cause. The attitude can: the
 tilt swings by many times the amount that a push, a gust or a kick causes, and does not stop. If the oscillation goes on
-although the policy assumes a slower vehicle, the estimate is not the cause, and the policy uses it again for a while.
+although the policy assumes a slower vehicle, the estimate is probably not the cause, and the policy uses it again.
 """
 
 import equinox as eqx
@@ -23,9 +23,7 @@ REPORT_LEVEL = 0.1  # level from which the log reports the oscillation
 GAIN_SHARE = 0.5  # share by which the thrust gain may be larger than estimated
 STEP = (0.5, 0.5, 0.0, 0.0)  # change of the coordinates; in `hover/any`, 25 ms of delay and a factor of 2.2 of rate lag
 HIGH = 0.5  # level from which caution should end the oscillation
-PATIENCE = (
-    3.0  # [s], time in which caution ends an oscillation from a wrong estimate, and swings become smaller than LARGE
-)
+PATIENCE = 3.0  # [s], time in which caution ends an oscillation that is caused by a wrong estimate
 REST = 6.0  # [s], time without caution after it did not end the oscillation
 
 

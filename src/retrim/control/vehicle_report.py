@@ -24,9 +24,9 @@ class VehicleReport(eqx.Module):
 
     estimate: PathEstimate
     declared: Float[Array, "2"] | None = None
-    """Command delay and rate lag from the vehicle file [s]; None if the file does not state them."""
+    """Command delay and rate lag from the vehicle file [s], if the file states both."""
     lateness: Float[Array, ""] | None = None
-    """Undeclared lateness of measurements [s]; zero or None without an inertial unit."""
+    """Undeclared lateness of measurements [s], if the flight has an inertial unit."""
 
     def age(self, declared: Float[Array, ""]) -> Float[Array, ""]:
         """Return the age of measurements [s].

@@ -77,7 +77,7 @@ def list_of(*reads: Read, length: int | None = None) -> Read:
 
     Args:
         *reads: Reader of all items, or one reader for each item.
-        length: Number of items, if there is a single reader; None for any number.
+        length: Number of items, if there is a single reader; by default, any number.
     """
     exact = length if len(reads) == 1 else len(reads)
 
