@@ -79,13 +79,13 @@ def test_caution_reduces_thrust_commands():
 class StiffHover(AbstractController[None]):
     """A hover controller with a stiffness for the assumed vehicle; it is unstable on a much slower vehicle."""
 
-    lateness: jnp.ndarray = dataclasses.field(default_factory=lambda: jnp.array(0.1))
+    response_time: jnp.ndarray = dataclasses.field(default_factory=lambda: jnp.array(0.1))
 
     def init(self, x):
         del x
 
     def __call__(self, memory, t, x):
-        bandwidth = 0.35 / self.lateness  # [rad/s] of the attitude
+        bandwidth = 0.35 / self.response_time  # [rad/s] of the attitude
         wish = -((0.3 * bandwidth) ** 2) * x.p - 0.6 * bandwidth * x.v
         wish = wish * jnp.minimum(1.0, 8.0 / jnp.linalg.norm(wish + 1e-9))
         axis = jnp.array([0.0, 0.0, 1.0]) + wish * jnp.array([1.0, 1.0, 0.0]) / 9.81
@@ -93,7 +93,7 @@ class StiffHover(AbstractController[None]):
         return Command(9.81 + wish[2], bandwidth * (x.R.T @ error)), None
 
     def with_vehicle(self, member):
-        return dataclasses.replace(self, lateness=member.lateness)
+        return dataclasses.replace(self, response_time=member.response_time)
 
 
 @pytest.mark.parametrize("watches", [False, True])

@@ -93,8 +93,8 @@ class BeliefFlight(WrappedController[BeliefState]):
 
     def _flying(self, belief: PathBelief) -> AbstractController[Any]:
         slowest = self.family.path(belief.ends[1])
-        lateness = slowest.delay + slowest.response.rate_lag[0]
-        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, lateness))
+        response_time = slowest.delay + slowest.response.rate_lag[0]
+        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, response_time))
 
 
 class IdentifiedState(eqx.Module):

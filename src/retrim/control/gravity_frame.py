@@ -25,7 +25,7 @@ from ..physics.state import Command, State
 from .controller import AbstractController, PolicyController
 from .slung_load import LoadCompensation, LoadMemory
 
-SHARE_OF_LATENESS = 0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
+SHARE_OF_RESPONSE_TIME = 0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
 FASTEST, SLOWEST = 0.015, 0.05  # [s], limits of this time constant
 
 
@@ -82,8 +82,8 @@ class GravityFrame(AbstractController[GravityFrameState]):
         """
         observer = dataclasses.replace(self.observer, path=member.path)
         lead = lead_of(member.path, observer.nominal.dt).astype(self.lead.dtype)
-        if member.lateness is not None:
-            tau = jnp.clip(SHARE_OF_LATENESS * member.lateness, FASTEST, SLOWEST)
+        if member.response_time is not None:
+            tau = jnp.clip(SHARE_OF_RESPONSE_TIME * member.response_time, FASTEST, SLOWEST)
             observer = dataclasses.replace(observer, tau=tau.astype(self.observer.tau.dtype))
         return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer, lead=lead)
 

@@ -12,19 +12,19 @@ TICKS = 12  # shorter flights contain too little data on thrust and rates
 DELAY_TOLERANCE = 0.06  # [s], delay of rates beyond that in training; the fit of a fast loop is about this uncertain
 
 
-def likely_cause(log: Log, lateness: float) -> str | None:
+def likely_cause(log: Log, response_time: float) -> str | None:
     """Return the first known cause that a log shows, or None.
 
     Args:
         log: A flight that was terminated.
-        lateness: Delay plus lag of the body rates in the training model [s].
+        response_time: Delay plus lag of the body rates in the training model [s].
     """
     return next(
-        (result for cause in (_clock, _numbers, _motion, _rates, _limit) for result in cause(log, lateness)), None
+        (result for cause in (_clock, _numbers, _motion, _rates, _limit) for result in cause(log, response_time)), None
     )
 
 
-def _clock(log: Log, lateness: float) -> Iterator[str]:
+def _clock(log: Log, response_time: float) -> Iterator[str]:
     ticks = np.diff(log.t)
     if len(ticks) and np.all(ticks == 0.0):
         yield "the plant's clock does not advance: Measurement.t must grow with every tick"
@@ -32,7 +32,7 @@ def _clock(log: Log, lateness: float) -> Iterator[str]:
         yield f"measurements are {np.median(ticks):.3g} s apart by the plant's clock, and its tick is {log.dt:g} s"
 
 
-def _numbers(log: Log, lateness: float) -> Iterator[str]:
+def _numbers(log: Log, response_time: float) -> Iterator[str]:
     p, R, v = log.measured
     bad = [~np.isfinite(part.reshape(len(part), -1)).all(axis=1) for part in (p, R, v, log.u)]
     if any(map(np.any, bad)):
@@ -47,7 +47,7 @@ def _numbers(log: Log, lateness: float) -> Iterator[str]:
         yield f"the attitude is not a rotation: R' R differs from 1 by {off:.2g}, and its determinant is {det:.2g}"
 
 
-def _motion(log: Log, lateness: float) -> Iterator[str]:
+def _motion(log: Log, response_time: float) -> Iterator[str]:
     """Compare velocities with positions, and accelerations with commanded thrust."""
     if len(log.t) < TICKS:
         return
@@ -72,7 +72,7 @@ def _motion(log: Log, lateness: float) -> Iterator[str]:
         yield f"the thrust is {gain:.2f} times what is commanded: look at mass, thrust_max and the thrust map"
 
 
-def _rates(log: Log, lateness: float) -> Iterator[str]:
+def _rates(log: Log, response_time: float) -> Iterator[str]:
     """Compare roll and pitch rates with their commands, behind delays and lags."""
     if len(log.t) < TICKS:
         return
@@ -88,16 +88,16 @@ def _rates(log: Log, lateness: float) -> Iterator[str]:
         yield f"the vehicle turns against its command ({numbers}): look at the signs of roll and pitch"
     elif abs(match) < 0.3:
         yield f"the body rates do not follow their commands ({numbers}, correlation {match:.2f})"
-    elif late > lateness + DELAY_TOLERANCE:
+    elif late > response_time + DELAY_TOLERANCE:
         yield (
-            f"the vehicle turned with {numbers}, and the policy was trained for {lateness:.2f} s: give its rate_lag "
+            f"the vehicle turned with {numbers}, and the policy was trained for {response_time:.2f} s: give its rate_lag "
             f"and command_delay in the vehicle file, or fly a policy of hover/any, which identifies them"
         )
     elif gain > 1.4:
         yield f"the vehicle turned with {numbers}: its rate loop oscillates, or the rates are in another unit"
 
 
-def _limit(log: Log, lateness: float) -> Iterator[str]:
+def _limit(log: Log, response_time: float) -> Iterator[str]:
     largest = log.u[:, 0].max()
     share = float(np.mean(log.u[1:, 0] > 0.99 * largest)) if len(log.t) > TICKS else 0.0
     if share > 0.5 and largest > 1.2 * STANDARD_GRAVITY:

@@ -65,7 +65,7 @@ class Member(eqx.Module):
 
     path: CommandPath
     belief: PathBelief
-    lateness: Float[Array, ""] | None = None
+    response_time: Float[Array, ""] | None = None
     """Largest sum of delay and rate lag within the belief [s]; None outside a flight."""
 
 
