@@ -63,10 +63,11 @@ def random_vehicles(rng, n):
     return Vehicles(delay, lag, damping, np.clip(2.0 * lag, 0.03, 0.3), gain, rng.uniform(0.015, 0.08, n))
 
 
-def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.inf):
+def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.inf, push=None, goal=None):
     """Fly from a random point 1 m away; ``excitation`` maps the time to an addition to each command.
 
-    From ``change`` [s] on, the vehicles are those of ``later``.
+    From ``change`` [s] on, the vehicles are those of ``later``. ``push`` maps the time to an acceleration, and ``goal``
+    maps the time to the goal and its velocity.
     """
     n, ticks = len(vehicles.delay), round(seconds / DT)
     loops, late = _loops(vehicles), np.round(vehicles.delay / H).astype(int)
@@ -95,7 +96,7 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
         omega, a = w + sensors.gyro * rng.normal(size=(n, 3)), a_mean + sensors.accelerometer * rng.normal(size=(n, 3))
         if rows:
             with_push += 0.08 * (a - (rows[-1][5][:, :1] * last[1][:, :, 2] - [0, 0, G]) - with_push)
-        u = _pd(last, with_push, slow)
+        u = _pd(last if goal is None else _from_goal(last, *goal(k * DT)), with_push, slow)
         if excitation is not None:
             u = u + excitation(k * DT)
         rows.append((*last, omega, a, u))
@@ -110,6 +111,8 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
             w, wd = shift[:, :, 0] + message[:, 1:], shift[:, :, 1]
             f_new = f + (vehicles.thrust_gain * message[:, 0] - f) * (1.0 - np.exp(-H / vehicles.thrust_lag))
             acceleration = 0.5 * (f + f_new)[:, None] * R[:, :, 2] - 0.3 * v - [0, 0, G]
+            if push is not None:
+                acceleration = acceleration + push((k * PER + i) * H)
             R = R @ Rotation.from_rotvec(0.5 * H * (before + w)).as_matrix()
             p, v, f = p + H * v + 0.5 * H**2 * acceleration, v + H * acceleration, f_new
             a_mean = a_mean + acceleration / PER
@@ -117,6 +120,10 @@ def fly(rng, vehicles, sensors, seconds, excitation=None, later=None, change=np.
                 half = sample(half)
     p, R, v, omega, a, u = (np.stack(column, axis=1) for column in zip(*rows, strict=True))
     return Flights(p, R, v, omega, a, u, 0.5 * DT if sensors.late else 0.0)
+
+
+def _from_goal(x, p, v):
+    return x[0] - p, x[1], x[2] - v
 
 
 def _pd(x, with_push, slow):

@@ -15,6 +15,7 @@ from retrim.control.excitation import Excitation
 from retrim.estimation.command_path import PathEstimator, describe_path, noise, posterior
 from retrim.estimation.command_path.channel import Sample
 from retrim.estimation.command_path.history import CommandHistory
+from retrim.estimation.command_path.prior import coefficients_before
 from retrim.estimation.command_path.response import mean_step_response, ringing_of
 from retrim.physics.state import Command, State
 
@@ -90,7 +91,7 @@ def test_step_response_solves_its_differential_equation(lag, damping, width):
 channel_before = jax.jit(posterior.channel_before, static_argnums=(0, 2))
 log_likelihood = jax.jit(posterior.log_likelihood, static_argnums=3)
 path_posterior = jax.jit(lambda channel, prior: posterior.path_posterior(channel, prior, None, DT))
-predicted = jax.jit(lambda channel, prior: channel.predict(path_posterior(channel, prior)))
+predicted = jax.jit(lambda channel, prior: channel.predict(path_posterior(channel, prior), coefficients_before(prior)))
 responses = jax.jit(lambda cells, hover: posterior.responses(cells, jnp.zeros(()), jnp.zeros(()), hover, DT))
 yaw_features = jax.jit(lambda history: history.features(DT)[3:])
 issue = jax.jit(CommandHistory.issue)
@@ -100,7 +101,7 @@ issue = jax.jit(CommandHistory.issue)
 def observe(channel, features, value, kinds):
     zero = jnp.zeros(())
     sample = Sample(value[None], jnp.zeros((1, 0)), jnp.array(True), kinds, zero, zero)
-    return channel.observe(features, sample, jnp.ones(()), DT, may_jump=True)
+    return channel.observe(features, sample, jnp.ones(()), DT, jumping=0)
 
 
 def _linear_channel(kind, kinds, sigma, n=60):
@@ -109,12 +110,13 @@ def _linear_channel(kind, kinds, sigma, n=60):
     channel, history = channel_before(1, prior, DT), CommandHistory.at_hover(DT)
     cell = jnp.array([[0.03, np.log(0.07), ringing_of(0.8)]])
     h = np.asarray(responses(cell, prior.hover))[0]
-    rows, values, e_old = [], [], rng.normal()
+    mu, wander, phi = kinds[kind]
+    rows, values, e_old, disturbance, step = [], [], rng.normal(), 0.2, 0.0
     for k in range(n):
         features = np.append(np.asarray(yaw_features(history)), 0.0)
         e = rng.normal()
-        value = 1.1 * features @ h + 0.2 + sigma * (e - kinds[kind][0] * e_old)
-        e_old = e
+        value = 1.1 * features @ h + disturbance + sigma * (e - mu * e_old)
+        e_old, disturbance, step = e, disturbance + step, phi * step + sigma * np.sqrt(wander) * rng.normal()
         rows.append(features)
         values.append(value)
         channel = observe(channel, jnp.array(features[None]), jnp.array(value), jnp.array(kinds))
@@ -127,9 +129,10 @@ def _linear_channel(kind, kinds, sigma, n=60):
 
 def _brute_force(cells, kind, channel, prior, rows, values):
     """Return the log likelihood of each cell by the dense covariance of all measurements, in double precision."""
-    n, (mu, wander) = len(values), kind
-    step = np.minimum.outer(np.arange(n), np.arange(n))
-    dense = noise.DIFFUSE + wander * step + (1.0 + mu**2) * np.eye(n) - mu * (np.eye(n, k=1) + np.eye(n, k=-1))
+    n, (mu, wander, phi) = len(values), kind
+    # The step s_k is a sum of w_j with the factor phi^(k-1-j), and the disturbance b_k is the sum of earlier steps.
+    step = np.array([[sum(phi ** (i - 1 - j) for i in range(j + 1, k)) for j in range(n)] for k in range(n)])
+    dense = noise.DIFFUSE + wander * step @ step.T + (1.0 + mu**2) * np.eye(n) - mu * (np.eye(n, k=1) + np.eye(n, k=-1))
     h = np.asarray(responses(cells, prior.hover))
     y = rows @ h.T
     left = values[:, None] - float(prior.gain) * y
@@ -143,7 +146,9 @@ def _brute_force(cells, kind, channel, prior, rows, values):
     return -half_log - 0.5 * (n + posterior.FREEDOM) * np.log(square)
 
 
-@pytest.mark.parametrize(("kinds", "kind", "sigma"), [(noise.DIRECT, 0, 0.05), (noise.DIFFERENCE, 0, 0.1)])
+@pytest.mark.parametrize(
+    ("kinds", "kind", "sigma"), [(noise.DIRECT, 0, 0.05), (noise.DIRECT, 5, 0.05), (noise.DIFFERENCE, 0, 0.1)]
+)
 def test_posterior_of_linear_vehicle_is_exact(kinds, kind, sigma):
     channel, prior, rows, values = _linear_channel(kind, kinds, sigma)
     result = path_posterior(channel, prior)
@@ -231,6 +236,35 @@ def test_vehicle_at_rest_is_not_informative(inertial):
         assert not getattr(result, name).excited[-1], name
     assert result.thrust_gain.deviation[-1] > 0.1
     assert "not excited" in describe_path(jax.tree.map(lambda leaf: leaf[-1], result))
+
+
+def on_circle(t):
+    """Return the point and the velocity on a circle of 1 m, which begins at the start of a flight."""
+    turn, speed = 1.8 * t, 1.8
+    return (
+        np.array([np.cos(turn) - 1.0, np.sin(turn), 0.3 * np.sin(turn)]),
+        speed * np.array([-np.sin(turn), np.cos(turn), 0.3 * np.cos(turn)]),
+    )
+
+
+@pytest.mark.parametrize(("inertial", "begin"), [(True, 0.0), (False, 3.0)])
+def test_push_does_not_change_thrust_gain(inertial, begin):
+    """A vehicle that leans into a push changes its thrust together with the part of the push along the thrust."""
+
+    def push(t):
+        return np.array([2.0, -2.0, 2.0]) * (t >= begin)
+
+    rng = np.random.default_rng(9)
+    vehicles = random_vehicles(rng, 6)
+    flights = fly(rng, vehicles, LEVELS["mocap"], 7.0, push=push, goal=on_circle)
+    gains = [estimate(flights, i, inertial=inertial).thrust_gain for i in range(6)]
+    for seconds, limit in ((5.0, 0.025), (7.0, 0.01)):
+        mean, low, high = (
+            np.array([getattr(each, name)[round(seconds / DT) - 1] for each in gains])
+            for name in ("mean", "low", "high")
+        )
+        assert np.abs(mean / vehicles.thrust_gain - 1.0).max() < limit
+        assert np.mean((low <= vehicles.thrust_gain) & (vehicles.thrust_gain <= high)) > 0.8
 
 
 def test_wrong_measurements_do_not_change_estimate():

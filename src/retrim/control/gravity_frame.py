@@ -25,7 +25,9 @@ from ..physics.state import Command, State
 from .controller import AbstractController, PolicyController
 from .slung_load import LoadCompensation, LoadMemory
 
-SHARE_OF_RESPONSE_TIME = 0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
+SHARE_OF_RESPONSE_TIME = (
+    0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
+)
 FASTEST, SLOWEST = 0.015, 0.05  # [s], limits of this time constant
 
 

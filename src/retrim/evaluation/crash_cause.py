@@ -90,8 +90,8 @@ def _rates(log: Log, response_time: float) -> Iterator[str]:
         yield f"the body rates do not follow their commands ({numbers}, correlation {match:.2f})"
     elif late > response_time + DELAY_TOLERANCE:
         yield (
-            f"the vehicle turned with {numbers}, and the policy was trained for {response_time:.2f} s: give its rate_lag "
-            f"and command_delay in the vehicle file, or fly a policy of hover/any, which identifies them"
+            f"the vehicle turned with {numbers}, and the policy was trained for {response_time:.2f} s: give its "
+            f"rate_lag and command_delay in the vehicle file, or fly a policy of hover/any, which identifies them"
         )
     elif gain > 1.4:
         yield f"the vehicle turned with {numbers}: its rate loop oscillates, or the rates are in another unit"

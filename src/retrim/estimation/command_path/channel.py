@@ -1,9 +1,10 @@
 """Compute recursive sums for one channel of the command path: roll and pitch rates, yaw rate, or thrust.
 
 A measurement is z = g h(theta) . f + D n + noise, with the features f of the commands, the response h from delay, lag
-and damping (theta), the gain g, and further features n. Sums of products of whitened features and measurements are
-sufficient for every theta at once, so a grid does not need to be stored. Measurements enter as differences from
-the present prediction, because single precision cannot represent the small difference between large sums.
+and damping (theta), the gain g, and further features n, for example the directions of a push. Sums of products of
+whitened features and measurements are sufficient for every theta at once, so a grid does not need to be stored.
+Measurements enter as differences from the present prediction, because single precision cannot represent the small
+difference between large sums.
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .noise import KINDS, Whitening
 
 GATE = 6.0  # standard deviations of the prediction beyond which a measurement does not count
+JUMP = 10.0  # [m/s^2], standard deviation of the change in each component of a push that jumps
 DOUBT_TAU, DOUBT_SHARE = 0.3, 0.5  # [s], and share of recent measurements beyond GATE that shows a wrong prediction
 
 
@@ -27,12 +29,20 @@ class Sample(eqx.Module):
     other: Float[Array, "axes n"]
     """Features in addition to those of the commands."""
     usable: Bool[Array, ""]
-    kinds: Float[Array, "kinds 2"]
+    kinds: Float[Array, "kinds 3"]
     """Possible kinds of noise."""
     age: Float[Array, ""]
     """Time since the end of the averaging interval [s]."""
     width: Float[Array, ""]
     """Length of the averaging interval [s]; zero for an instantaneous value."""
+
+
+class Coefficients(NamedTuple):
+    """Normal distribution of the coefficients of other features."""
+
+    mean: Float[Array, " n"]
+    information: Float[Array, "n n"]
+    """Inverse of the covariance."""
 
 
 class Region(eqx.Module):
@@ -76,6 +86,10 @@ class Channel(eqx.Module):
     """Gain times response of the present estimate."""
     spread: Float[Array, "m m"]
     """Covariance of ``response``."""
+    other: Float[Array, "axes n"]
+    """Coefficients of the other features in the present estimate."""
+    other_spread: Float[Array, "axes n n"]
+    """Covariance of ``other``."""
     noise: Float[Array, ""]
     """Standard deviation of the white noise."""
     kind: Int[Array, ""]
@@ -91,7 +105,7 @@ class Channel(eqx.Module):
     def start(
         cls,
         axes: int,
-        others: int,
+        others: Float[Array, " n"],
         response: Float[Array, " m"],
         spread: Float[Array, "m m"],
         noise: Float[Array, ""],
@@ -101,20 +115,23 @@ class Channel(eqx.Module):
 
         Args:
             axes: Number of axes that share all parameters except for their disturbances.
-            others: Number of features in addition to those of the commands.
+            others: Standard deviations of the coefficients of the other features.
             response: Mean of gain times response before any flight.
             spread: Covariance of ``response``.
             noise: Standard deviation of the noise before any flight.
             region: Region of the prior.
         """
-        columns, zero = response.shape[0] + others + 1, jnp.zeros(())
+        n, zero = others.shape[0], jnp.zeros(())
+        columns = response.shape[0] + n + 1
+        other_spread = jnp.tile(jnp.diag(others**2), (axes, 1, 1))
         return cls(
             Whitening.start(axes, columns), jnp.zeros((KINDS, axes, columns, columns)), jnp.zeros(KINDS),
-            zero, zero, response, spread, zero + noise, jnp.array(0), zero, zero, zero, region,
+            zero, zero, response, spread, jnp.zeros((axes, n)), other_spread,
+            zero + noise, jnp.array(0), zero, zero, zero, region,
         )  # fmt: skip
 
     def observe(
-        self, features: Float[Array, "axes m"], sample: Sample, keep: Float[Array, ""], dt: float, *, may_jump: bool
+        self, features: Float[Array, "axes m"], sample: Sample, keep: Float[Array, ""], dt: float, *, jumping: int
     ) -> "Channel":
         """Return the channel after one tick.
 
@@ -123,7 +140,8 @@ class Channel(eqx.Module):
             sample: The measurement; if it is not usable, only the time advances.
             keep: Remaining weight of earlier measurements.
             dt: Control tick [s].
-            may_jump: Whether the disturbance of the channel may jump, as a push does.
+            jumping: Number of leading other features whose coefficients jump with the disturbance, as the components of
+                a push do; zero if the disturbance of the channel cannot jump.
         """
         row = jnp.concatenate([features, sample.other, sample.value[:, None]], axis=1)
         innovation, variance = self.whitening.innovation(row, sample.kinds)
@@ -132,29 +150,45 @@ class Channel(eqx.Module):
         expected = variance[:, None] * self.noise**2 + jnp.einsum(
             "kai,ij,kaj->ka", innovation[..., :m], self.spread, innovation[..., :m]
         )
-        far = jnp.any(misfit[self.kind] ** 2 > GATE**2 * expected[self.kind])
+        others = innovation[self.kind, :, m:-1]
+        left = misfit[self.kind] - jnp.sum(others * self.other, axis=1)
+        allowed = expected[self.kind] + jnp.einsum("ai,aij,aj->a", others, self.other_spread, others)
+        far = jnp.any(left**2 > GATE**2 * allowed)
         doubt = self.doubt + dt / DOUBT_TAU * (far.astype(keep.dtype) - self.doubt)
         doubt = jnp.where(sample.usable, doubt, self.doubt)
         counts = sample.usable & (~far | (self.doubt > DOUBT_SHARE))
         # The beginning of a push is not a property of the vehicle, so the disturbance is estimated again.
-        jumps = sample.usable & ~counts & may_jump
+        jumps = sample.usable & ~counts & (jumping > 0)
         weight = counts.astype(keep.dtype)
         column = jnp.concatenate([innovation[..., :-1], misfit[..., None]], axis=2)
         column = jnp.where(counts, column, 0.0) / jnp.sqrt(variance)[:, None, None]
-        axes = row.shape[0]
+        axes, products, other_spread = row.shape[0], keep * self.products, self.other_spread
+        for i in range(jumping):
+            products = jnp.where(jumps, integrate_out(products, m + i, (self.noise / JUMP) ** 2), products)
+            other_spread = other_spread.at[:, i, i].add(jnp.where(jumps, JUMP**2, 0.0))
         return Channel(
             self.whitening.after(innovation, sample.kinds, counts, jumps),
-            keep * self.products + column[..., :, None] * column[..., None, :],
+            products + column[..., :, None] * column[..., None, :],
             keep * self.half_log + weight * 0.5 * axes * jnp.log(variance),
             keep * self.count + weight * axes,
             keep**2 * self.squares + weight * axes,
-            self.response, self.spread, self.noise, self.kind, doubt,
+            self.response, self.spread, self.other, other_spread, self.noise, self.kind, doubt,
             jnp.where(sample.usable, sample.age, self.age), jnp.where(sample.usable, sample.width, self.width),
             self.region,
         )  # fmt: skip
 
-    def predict(self, posterior: PathPosterior) -> "Channel":
-        """Return the channel with a new prediction, and with its sums relative to that prediction."""
+    @property
+    def temper(self) -> Float[Array, ""]:
+        """Factor on the sums that corrects the information for forgetting: old measurements count only in part."""
+        return self.count / jnp.maximum(self.squares, 1.0)
+
+    def predict(self, posterior: PathPosterior, others: Coefficients) -> "Channel":
+        """Return the channel with a new prediction, and with its sums relative to that prediction.
+
+        Args:
+            posterior: Posterior of the channel.
+            others: Distribution of the coefficients of the other features without the sums.
+        """
         m = self.response.shape[0]
         change = posterior.response - self.response
         misfit = self.products[..., -1] - self.products[..., :m] @ change
@@ -162,8 +196,13 @@ class Channel(eqx.Module):
         side = misfit[..., :-1, None]
         below = jnp.concatenate([misfit[..., :-1], last], axis=-1)[..., None, :]
         products = jnp.concatenate([jnp.concatenate([self.products[..., :-1, :-1], side], axis=-1), below], axis=-2)
+        n = others.mean.shape[0]
+        sums = with_coefficients(self.temper * products[posterior.kind], others, posterior.noise)[:, m:, m:]
+        other_spread = jnp.linalg.inv(sums[:, :n, :n] / posterior.noise**2)
         return dataclasses.replace(
             self,
+            other=jnp.einsum("aij,aj->ai", other_spread, sums[:, :n, -1]) / posterior.noise**2,
+            other_spread=other_spread,
             products=products,
             response=posterior.response,
             spread=posterior.spread,
@@ -171,3 +210,37 @@ class Channel(eqx.Module):
             kind=posterior.kind,
             region=posterior.region,
         )
+
+
+def with_coefficients(
+    products: Float[Array, "*parts columns columns"], others: Coefficients, noise: Float[Array, ""]
+) -> Float[Array, "*parts columns columns"]:
+    """Return the sums with the information about the coefficients of the other features.
+
+    Args:
+        products: Sums of products.
+        others: Distribution of the coefficients.
+        noise: Standard deviation of the white noise, the unit of the sums.
+    """
+    n = others.mean.shape[0]
+    middle = slice(products.shape[-1] - 1 - n, products.shape[-1] - 1)
+    alike = noise**2 * others.information
+    side = alike @ others.mean
+    products = products.at[..., middle, middle].add(alike)
+    products = products.at[..., middle, -1].add(side).at[..., -1, middle].add(side)
+    return products.at[..., -1, -1].add(others.mean @ side)
+
+
+def integrate_out(
+    products: Float[Array, "*parts columns columns"], i: int, before: Float[Array, ""] | float = 0.0
+) -> Float[Array, "*parts columns columns"]:
+    """Return the sums without the information about the coefficient of column ``i``.
+
+    Args:
+        products: Sums of products.
+        i: Column of the feature.
+        before: Information about the coefficient in addition to the sums, in units of the sums.
+    """
+    row = products[..., i, :]
+    pivot = row[..., i] + before
+    return products - row[..., :, None] * row[..., None, :] / pivot[..., None, None]

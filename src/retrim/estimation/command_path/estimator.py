@@ -22,9 +22,10 @@ from ..latency import follows
 from .channel import Channel, Sample
 from .estimate import PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
 from .history import CommandHistory
+from .lateral import LateralPush
 from .noise import DIFFERENCE, DIRECT
 from .posterior import channel_before, path_posterior
-from .prior import Prior, delay_belief, full_belief
+from .prior import Prior, coefficients_before, delay_belief, full_belief
 
 SETTLING = 0.1  # [s], beginning of a flight, during which the thrust depends on earlier commands
 FADING = (0.03, 0.08)  # [s], time constants with which the remaining effect of these commands fades
@@ -47,7 +48,7 @@ class Reading(NamedTuple):
 
     value: Float[Array, " axes"]
     usable: Bool[Array, ""]
-    kinds: tuple[tuple[float, float], ...]
+    kinds: tuple[tuple[float, float, float], ...]
     """Possible kinds of noise."""
     age: Float[Array, ""]
     """Age of the reading [s]."""
@@ -74,6 +75,7 @@ class PathState(eqx.Module):
     """Time since the start [s]."""
     consistency: Consistency
     channels: Channels
+    lateral: LateralPush
     estimate: PathEstimate
 
 
@@ -112,8 +114,8 @@ class PathEstimator(eqx.Module):
         """Return the memory of a vehicle that has hovered until now and is measured at ``x``."""
         x = jax.tree.map(lambda leaf: leaf.astype(self.memory.dtype), x)
         zero, (channels, estimate) = jnp.zeros(()), self.start
-        consistency = Consistency.start(x)
-        return PathState(CommandHistory.at_hover(self.dt), x, zero - jnp.inf, zero, consistency, channels, estimate)
+        history, lateral = CommandHistory.at_hover(self.dt), LateralPush.start()
+        return PathState(history, x, zero - jnp.inf, zero, Consistency.start(x), channels, lateral, estimate)
 
     def update(
         self,
@@ -166,18 +168,18 @@ class PathEstimator(eqx.Module):
             turn_reading = Reading(omega, jnp.all(jnp.abs(omega) < RATE), DIRECT, jnp.zeros_like(age), 0.0)
             turning = omega
         now = s.channels
-        rates = now.rates.observe(features[1:3], turn_reading.sample(slice(0, 2), none[1:3]), keep, dt, may_jump=False)
-        yaw = now.yaw.observe(features[3:], turn_reading.sample(slice(2, 3), none[3:]), keep, dt, may_jump=False)
+        rates = now.rates.observe(features[1:3], turn_reading.sample(slice(0, 2), none[1:3]), keep, dt, jumping=0)
+        yaw = now.yaw.observe(features[3:], turn_reading.sample(slice(2, 3), none[3:]), keep, dt, jumping=0)
 
         has_settled = certain & (s.elapsed > SETTLING)
         up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype)
         axis = 0.5 * (s.x.R + x.R)[:, 2]
         drag = -0.5 * jnp.sum(axis * (s.x.v + x.v))
         fading = jnp.exp(-s.elapsed / jnp.array(FADING, dtype))
-        other = jnp.concatenate([drag[None], fading])[None]
+        other = jnp.concatenate([axis, drag[None], fading])[None]
         lift = jnp.sum(axis * ((x.v - s.x.v) / dt + up)) - STANDARD_GRAVITY
         lift_sample = Reading(lift[None], has_settled, DIFFERENCE, age, dt).sample(slice(0, 1), other)
-        thrust = now.thrust.observe(features[:1], lift_sample, keep, dt, may_jump=True)
+        thrust = now.thrust.observe(features[:1], lift_sample, keep, dt, jumping=3)
         force = now.force
         if a is not None:
             # The accelerometer has no latency, even if the attitude does.
@@ -186,13 +188,17 @@ class PathEstimator(eqx.Module):
             lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
             usable = has_settled & jnp.all(jnp.abs(a) < ACCELERATION)
             now_read = Reading(lift[None], usable, DIRECT, jnp.zeros_like(age), dt)
-            force = force.observe(features[:1], now_read.sample(slice(0, 1), other), keep, dt, may_jump=True)
+            force = force.observe(features[:1], now_read.sample(slice(0, 1), other), keep, dt, jumping=3)
+        middle = so3.mul(s.x.R, so3.exp(0.5 * so3.log(so3.mul(s.x.R.T, x.R))))
+        acceleration = (x.v - s.x.v) / dt if a is None else a
+        usable = certain & jnp.all(jnp.abs(acceleration) < ACCELERATION)
+        lateral = s.lateral.observe(middle, 0.5 * (s.x.v + x.v), acceleration + up, usable, dt)
         channels = Channels(rates, yaw, thrust, force)
-        return PathState(history, x, t, s.elapsed + dt, consistency, channels, s.estimate)
+        return PathState(history, x, t, s.elapsed + dt, consistency, channels, lateral, s.estimate)
 
     def estimate_path(self, s: PathState) -> PathState:
         """Return the memory with a new estimate."""
-        channels, estimate = _estimate(s.channels, self.rates, self.yaw, self.thrust, self.dt)
+        channels, estimate = _estimate(s.channels, s.lateral, self.rates, self.yaw, self.thrust, self.dt)
         return dataclasses.replace(s, channels=channels, estimate=estimate)
 
     def issue(self, s: PathState, u: Command) -> PathState:
@@ -212,7 +218,8 @@ def _estimator(dt: float, memory: float, dtype: str) -> PathEstimator:
         no = jnp.zeros(0)
         rates = Prior(one, 0.15 * one, 0.05 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (9, 9, 5))
         yaw = Prior(one, 0.15 * one, 0.08 * one, 1.0 * one, no, 0.03 * one, 0.003 * one, 0.0 * one, (5, 7, 5))
-        other = jnp.array([0.5, 20.0, 20.0])  # drag [1/s], and remaining effect of earlier commands [m/s^2]
+        # Push [m/s^2], drag [1/s], and remaining effect of earlier commands [m/s^2].
+        other = jnp.array([3.0, 3.0, 3.0, 0.5, 20.0, 20.0])
         thrust = Prior(
             one, 0.3 * one, 0.04 * one, 0.8 * one, other, 0.2 * one, 0.02 * one, STANDARD_GRAVITY * one, (7, 9, 1)
         )
@@ -232,18 +239,22 @@ def _start(rates: Prior, yaw: Prior, thrust: Prior, dt: float) -> tuple[Channels
         channel_before(1, thrust, dt),
         channel_before(1, thrust, dt),
     )
-    return _estimate(channels, rates, yaw, thrust, dt)
+    return _estimate(channels, LateralPush.start(), rates, yaw, thrust, dt)
 
 
-def _estimate(channels: Channels, rates: Prior, yaw: Prior, thrust: Prior, dt: float) -> tuple[Channels, PathEstimate]:
+def _estimate(
+    channels: Channels, lateral: LateralPush, rates: Prior, yaw: Prior, thrust: Prior, dt: float
+) -> tuple[Channels, PathEstimate]:
     """Return the sums relative to a new prediction, and the estimate.
 
-    The rates determine the delay for all channels, and the accelerations provide a prior for the velocities.
+    The rates determine the delay for all channels, the accelerations provide a prior for the velocities, and the
+    accelerations perpendicular to the thrust provide a prior for the push.
     """
+    others = coefficients_before(thrust, lateral.push())
     of_rates = path_posterior(channels.rates, rates, None, dt)
     of_yaw = path_posterior(channels.yaw, yaw, delay_belief(of_rates, yaw), dt)
-    of_force = path_posterior(channels.force, thrust, delay_belief(of_rates, thrust), dt)
-    of_thrust = path_posterior(channels.thrust, thrust, full_belief(of_force), dt)
+    of_force = path_posterior(channels.force, thrust, delay_belief(of_rates, thrust), dt, others)
+    of_thrust = path_posterior(channels.thrust, thrust, full_belief(of_force), dt, others)
     estimate = PathEstimate(
         delay_estimate(of_rates),
         lag_estimate(of_rates, rates.lag_spread),
@@ -255,10 +266,10 @@ def _estimate(channels: Channels, rates: Prior, yaw: Prior, thrust: Prior, dt: f
         gain_estimate(of_thrust, thrust.gain_spread),
     )
     result = Channels(
-        channels.rates.predict(of_rates),
-        channels.yaw.predict(of_yaw),
-        channels.thrust.predict(of_thrust),
-        channels.force.predict(of_force),
+        channels.rates.predict(of_rates, coefficients_before(rates)),
+        channels.yaw.predict(of_yaw, coefficients_before(yaw)),
+        channels.thrust.predict(of_thrust, others),
+        channels.force.predict(of_force, others),
     )
     return result, estimate
 

@@ -1,9 +1,14 @@
 """Model the noise of a rate or thrust: a wandering disturbance, plus white noise or the difference of white noise.
 
-The residual of a channel is r_k = b_k + e_k - mu e_(k-1), where the disturbance b is a random walk. A gyroscope has
-mu = 0; the difference of two noisy attitudes has mu = 1. The Kalman filter of (b, e) turns residuals into innovations,
-which are independent. The filter is linear, so it is applied to both commands and measurements before they are
-compared. See Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), sections 3.2 and 4.2.
+The residual of a channel is r_k = b_k + e_k - mu e_(k-1). The disturbance b moves by a step s in each tick, and
+s_(k+1) = phi s_k + w_k: b is a random walk if phi is 0, and smooth if phi is near 1. A gyroscope has mu = 0; the
+difference of two noisy attitudes has mu = 1. The Kalman filter of (b, s, e) turns residuals into innovations, which are
+independent. The filter is linear, so it is applied to both commands and measurements before they are compared.
+
+A controller answers the disturbance, so a wrong model of the disturbance biases the gain: the innovations would contain
+a predictable part, to which the commands are related (Ljung, System Identification, 1999, section 13.4). For the
+filter and for trends with damped slopes, see Harvey, Forecasting, Structural Time Series Models and the Kalman Filter
+(1989), chapter 2 and sections 3.2 and 4.2.
 """
 
 import equinox as eqx
@@ -11,9 +16,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 DIFFUSE = 1e4  # variance of the first disturbance, in units of the white noise: a diffuse prior
-DIRECT = ((0.0, 0.0), (0.0, 1e-3), (0.0, 3e-2), (0.0, 0.5))
-"""Kinds of noise of a measured value: mu, and the increase of the disturbance's variance per tick, in units of e."""
-DIFFERENCE = ((1.0, 0.0), (1.0, 1e-3), (0.8, 0.0), (0.8, 3e-2))
+SMOOTH = 0.9  # phi of a smooth disturbance
+DIRECT = (
+    (0.0, 0.0, 0.0),
+    (0.0, 1e-3, 0.0),
+    (0.0, 3e-2, 0.0),
+    (0.0, 0.5, 0.0),
+    (0.0, 1e-2, SMOOTH),
+    (0.0, 0.3, SMOOTH),
+)
+"""Kinds of noise of a measured value: mu, the variance of w in units of e, and phi."""
+DIFFERENCE = (
+    (1.0, 0.0, 0.0),
+    (1.0, 1e-3, 0.0),
+    (0.8, 0.0, 0.0),
+    (0.8, 3e-2, 0.0),
+    (0.8, 1e-2, SMOOTH),
+    (0.0, 0.3, SMOOTH),
+)
 """Kinds of noise of a difference of measured values; white process noise makes mu smaller than 1."""
 KINDS = len(DIRECT)
 
@@ -21,20 +41,20 @@ KINDS = len(DIRECT)
 class Whitening(eqx.Module):
     """Memory of the Kalman filters for all kinds of noise; all columns share the covariance."""
 
-    disturbance: Float[Array, "kinds axes columns"]
-    error: Float[Array, "kinds axes columns"]
-    """Estimate of e_(k-1)."""
-    spread: Float[Array, "kinds 3"]
-    """Variance of the disturbance, its covariance with -e_(k-1), and the variance of e_(k-1)."""
+    mean: Float[Array, "kinds axes columns 3"]
+    """Estimates of the disturbance b, its step s, and e_(k-1) of each column."""
+    covariance: Float[Array, "kinds 3 3"]
+    """Covariance of b, s and e_(k-1), in units of the white noise."""
 
     @classmethod
     def start(cls, axes: int, columns: int) -> "Whitening":
         """Return the memory before the first measurement."""
-        zero = jnp.zeros((KINDS, axes, columns))
-        return cls(zero, zero, jnp.tile(jnp.array([DIFFUSE, 0.0, 1.0]), (KINDS, 1)))
+        return cls(
+            jnp.zeros((KINDS, axes, columns, 3)), jnp.tile(jnp.diag(jnp.array([DIFFUSE, 0.0, 1.0])), (KINDS, 1, 1))
+        )
 
     def innovation(
-        self, row: Float[Array, "axes columns"], kinds: Float[Array, "kinds 2"]
+        self, row: Float[Array, "axes columns"], kinds: Float[Array, "kinds 3"]
     ) -> tuple[Float[Array, "kinds axes columns"], Float[Array, " kinds"]]:
         """Return the innovation of each column, and its variance in units of the white noise.
 
@@ -42,15 +62,14 @@ class Whitening(eqx.Module):
             row: Commands, other features and the measurement of each axis.
             kinds: :data:`DIRECT` or :data:`DIFFERENCE`.
         """
-        mu = kinds[:, 0]
-        b, cross, error = self.spread.T
-        expected = self.disturbance - mu[:, None, None] * self.error
-        return row[None] - expected, b + 2.0 * mu * cross + mu**2 * error + 1.0
+        reading = _reading(kinds)
+        expected = jnp.einsum("kacs,ks->kac", self.mean, reading)
+        return row[None] - expected, 1.0 + jnp.einsum("ks,kst,kt->k", reading, self.covariance, reading)
 
     def after(
         self,
         innovation: Float[Array, "kinds axes columns"],
-        kinds: Float[Array, "kinds 2"],
+        kinds: Float[Array, "kinds 3"],
         counts: Bool[Array, ""],
         jumps: Bool[Array, ""],
     ) -> "Whitening":
@@ -62,19 +81,36 @@ class Whitening(eqx.Module):
             counts: Whether the row counts; otherwise only the time advances.
             jumps: Whether the disturbance has jumped, and is therefore unknown.
         """
-        mu, wander = kinds.T
-        b, cross, error = self.spread.T
-        cross, error = mu * cross, mu**2 * error
-        total = b + 2.0 * cross + error + 1.0
-        gain = (b + cross) / total
-        # Variance of b times that of the other terms, less the squared covariance, to avoid a difference of large
-        # numbers.
-        left = (b * (error + 1.0) - cross**2) / total
-        gains = jnp.stack([left + wander, gain, 1.0 - 1.0 / total], axis=1)
-        carry = jnp.stack([b + wander, jnp.zeros_like(b), jnp.ones_like(b)], axis=1)
-        unknown = jnp.stack([jnp.full_like(b, DIFFUSE), jnp.zeros_like(b), jnp.ones_like(b)], axis=1)
-        return Whitening(
-            self.disturbance + jnp.where(counts, gain, 0.0)[:, None, None] * innovation,
-            jnp.where(counts, 1.0 / total, 0.0)[:, None, None] * innovation,
-            jnp.where(jumps, unknown, jnp.where(counts, gains, carry)),
+        reading = _reading(kinds)
+        across = jnp.einsum("kst,kt->ks", self.covariance, reading)
+        total = 1.0 + jnp.einsum("ks,ks->k", reading, across)
+        gain = across / total[:, None]
+        # Joseph's form avoids the difference of large numbers. The last entry becomes e_k, whose gain is 1 / total and
+        # whose covariance with the others is minus their gain.
+        keep = jnp.eye(3)[None] - gain[:, :, None] * reading[:, None, :]
+        left = keep @ self.covariance @ keep.mT + gain[:, :, None] * gain[:, None, :]
+        left = _with_last(left, -gain[:, :2], 1.0 - 1.0 / total)
+        gain = jnp.concatenate([gain[:, :2], 1.0 / total[:, None]], axis=1)
+        carry = _with_last(self.covariance, jnp.zeros_like(gain[:, :2]), jnp.ones_like(total))
+        unknown = _with_last(
+            jnp.zeros_like(carry).at[:, 0, 0].set(DIFFUSE), jnp.zeros_like(gain[:, :2]), jnp.ones_like(total)
         )
+        old = self.mean.at[..., 2].set(0.0)
+        mean = old + jnp.where(counts, gain, 0.0)[:, None, None, :] * innovation[..., None]
+        covariance = jnp.where(jumps, unknown, jnp.where(counts, left, carry))
+        motion = jnp.tile(jnp.eye(3), (kinds.shape[0], 1, 1)).at[:, 0, 1].set(1.0).at[:, 1, 1].set(kinds[:, 2])
+        covariance = (motion @ covariance @ motion.mT).at[:, 1, 1].add(kinds[:, 1])
+        return Whitening(jnp.einsum("kst,kact->kacs", motion, mean), covariance)
+
+
+def _reading(kinds: Float[Array, "kinds 3"]) -> Float[Array, "kinds 3"]:
+    """Return the factors of b, s and e_(k-1) in a residual."""
+    one = jnp.ones_like(kinds[:, 0])
+    return jnp.stack([one, 0.0 * one, -kinds[:, 0]], axis=1)
+
+
+def _with_last(
+    covariance: Float[Array, "kinds 3 3"], across: Float[Array, "kinds 2"], last: Float[Array, " kinds"]
+) -> Float[Array, "kinds 3 3"]:
+    """Return the covariance with the last row and column replaced."""
+    return covariance.at[:, 2, :2].set(across).at[:, :2, 2].set(across).at[:, 2, 2].set(last)

@@ -13,16 +13,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .channel import Channel, PathPosterior, Region
+from .channel import Channel, Coefficients, PathPosterior, Region, with_coefficients
 from .grid import cholesky, coarse_grid, moments, unit_grid
 from .history import ages
-from .prior import MOST_RINGING, Belief, GainPrior, Prior, gain_prior, log_prior
+from .prior import MOST_RINGING, Belief, GainPrior, Prior, coefficients_before, gain_prior, log_prior
 from .response import mean_step_response
 
 TEMPER = 0.03  # share of the information that a coarse grid uses
 MOVE_EXCESS = 2.0  # excess of the log posterior outside the grid at which the grid moves there
 COVARIANCE_FACTOR = 1.2  # factor on the covariance for the next grid, since a posterior may also widen
 LEAST_DEVIATION = 0.35  # smallest deviation of the next grid, as a share of the spacing of the present one
+SHARE = 8  # one of so many cells is used to choose the kind of noise; no factor in common with the numbers of cells
 GAINS = (0.2, 5.0)  # range in which a gain is linearised
 FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the noise variance
 
@@ -47,7 +48,9 @@ class _Fit(NamedTuple):
     variance: Float[Array, " cells"]
 
 
-def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: float) -> PathPosterior:
+def path_posterior(
+    channel: Channel, prior: Prior, belief: Belief | None, dt: float, others: Coefficients | None = None
+) -> PathPosterior:
     """Return the posterior of a channel.
 
     Args:
@@ -55,8 +58,9 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
         prior: Prior before any flight.
         belief: Information from other channels; None if this channel is the first.
         dt: Control tick [s].
+        others: Distribution of the coefficients of the other features; by default, that before any flight.
     """
-    sums = _without_others(channel, prior)
+    sums = _without_others(channel, coefficients_before(prior) if others is None else others)
     grid, step = (jnp.asarray(x, channel.response.dtype) for x in unit_grid(prior.cells))
 
     def likelihood_of(cells: Float[Array, "cells 3"], one: _Sums) -> tuple[_Fit, Float[Array, "cells m"]]:
@@ -74,11 +78,12 @@ def path_posterior(channel: Channel, prior: Prior, belief: Belief | None, dt: fl
         return Region(mean, COVARIANCE_FACTOR * covariance + least)
 
     cells, least = around(channel.region)
-    h = responses(cells, channel.age, channel.width, prior.hover, dt)
-    fits = _fits(sums, h, channel, prior, gain_prior(cells, prior, belief))
-    kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + log_prior(cells, prior, belief)[None], axis=1))
+    some = cells[::SHARE]
+    h = responses(some, channel.age, channel.width, prior.hover, dt)
+    fits = _fits(sums, h, channel, prior, gain_prior(some, prior, belief))
+    kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + log_prior(some, prior, belief)[None], axis=1))
     one = _Sums(sums.uu[kind], sums.uz[kind], sums.zz[kind], sums.half_log[kind], sums.total)
-    fit: _Fit = jax.tree.map(lambda leaf: leaf[kind], fits)
+    fit, _ = likelihood_of(cells, one)
     region = region_of(cells, fit, 1.0, least)
     coarse, within = coarse_grid(prior, belief)
     far, _ = likelihood_of(coarse, one)
@@ -103,7 +108,10 @@ def log_likelihood(
     channel: Channel, prior: Prior, cells: Float[Array, "cells 3"], dt: float
 ) -> Float[Array, "kinds cells"]:
     """Return the log likelihood of cells for each kind of noise, up to a constant; see :func:`path_posterior`."""
-    sums, h = _without_others(channel, prior), responses(cells, channel.age, channel.width, prior.hover, dt)
+    sums, h = (
+        _without_others(channel, coefficients_before(prior)),
+        responses(cells, channel.age, channel.width, prior.hover, dt),
+    )
     return _fits(sums, h, channel, prior, gain_prior(cells, prior, None)).log_likelihood
 
 
@@ -116,7 +124,7 @@ def channel_before(axes: int, prior: Prior, dt: float) -> Channel:
     off = prior.gain * h - response[None]
     spread = (weight[:, None] * off).T @ off + prior.gain_spread**2 * jnp.outer(response, response)
     mean, covariance = moments(cells, weight)
-    return Channel.start(axes, prior.other.shape[0], response, spread, prior.noise, Region(mean, covariance + within))
+    return Channel.start(axes, prior.other, response, spread, prior.noise, Region(mean, covariance + within))
 
 
 def responses(
@@ -141,16 +149,13 @@ def responses(
     return jnp.concatenate([mean_step_response(t, width, lag, ringing), ones, hover * ones], axis=1)
 
 
-def _without_others(channel: Channel, prior: Prior) -> _Sums:
-    """Integrate over the coefficients of the other features, one after another, and add the axes."""
-    m = channel.response.shape[0]
-    # The sum of squared weights corrects the information for forgetting, since old measurements count only in part.
-    temper = channel.count / jnp.maximum(channel.squares, 1.0)
-    products = temper * channel.products
-    for i in range(prior.other.shape[0]):
-        row = products[..., m + i, :]
-        pivot = row[..., m + i] + (channel.noise / prior.other[i]) ** 2
-        products -= row[..., :, None] * row[..., None, :] / pivot[..., None, None]
+def _without_others(channel: Channel, others: Coefficients) -> _Sums:
+    """Integrate over the coefficients of the other features, and add the axes."""
+    m, n, temper = channel.response.shape[0], others.mean.shape[0], channel.temper
+    products = with_coefficients(temper * channel.products, others, channel.noise)
+    if n > 0:
+        rows = products[..., m : m + n, :]
+        products -= rows.mT @ jnp.linalg.solve(rows[..., m : m + n], rows)
     products = jnp.sum(products, axis=1)
     return _Sums(
         products[:, :m, :m],

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .channel import PathPosterior
+from .channel import Coefficients, PathPosterior
 
 LONGEST_DELAY = 0.12  # [s]
 LAGS = (0.005, 0.5)  # [s]
@@ -56,6 +56,20 @@ class GainPrior(NamedTuple):
 
     mean: Float[Array, " cells"]
     spread: Float[Array, ""]
+
+
+def coefficients_before(prior: Prior, push: Coefficients | None = None) -> Coefficients:
+    """Return the distribution of the coefficients of other features.
+
+    Args:
+        prior: Prior of the channel.
+        push: Distribution of the first coefficients from other measurements, if there is one.
+    """
+    mean, information = jnp.zeros_like(prior.other), jnp.diag(prior.other**-2)
+    if push is None:
+        return Coefficients(mean, information)
+    n = push.mean.shape[0]
+    return Coefficients(mean.at[:n].set(push.mean), information.at[:n, :n].set(push.information))
 
 
 def delay_belief(posterior: PathPosterior, prior: Prior) -> Belief:
