@@ -131,7 +131,14 @@ class Channel(eqx.Module):
         )  # fmt: skip
 
     def observe(
-        self, features: Float[Array, "axes m"], sample: Sample, keep: Float[Array, ""], dt: float, *, jumping: int
+        self,
+        features: Float[Array, "axes m"],
+        sample: Sample,
+        keep: Float[Array, ""],
+        dt: float,
+        *,
+        jumping: int = 0,
+        jumped: Bool[Array, ""] | bool = False,
     ) -> "Channel":
         """Return the channel after one tick.
 
@@ -142,6 +149,7 @@ class Channel(eqx.Module):
             dt: Control tick [s].
             jumping: Number of leading other features whose coefficients jump with the disturbance, as the components of
                 a push do; zero if the disturbance of the channel cannot jump.
+            jumped: Whether other measurements show that the disturbance has jumped in this tick.
         """
         row = jnp.concatenate([features, sample.other, sample.value[:, None]], axis=1)
         innovation, variance = self.whitening.innovation(row, sample.kinds)
@@ -158,7 +166,7 @@ class Channel(eqx.Module):
         doubt = jnp.where(sample.usable, doubt, self.doubt)
         counts = sample.usable & (~far | (self.doubt > DOUBT_SHARE))
         # The beginning of a push is not a property of the vehicle, so the disturbance is estimated again.
-        jumps = sample.usable & ~counts & (jumping > 0)
+        jumps = jumped | (sample.usable & ~counts & (jumping > 0))
         weight = counts.astype(keep.dtype)
         column = jnp.concatenate([innovation[..., :-1], misfit[..., None]], axis=2)
         column = jnp.where(counts, column, 0.0) / jnp.sqrt(variance)[:, None, None]

@@ -168,31 +168,40 @@ class PathEstimator(eqx.Module):
             turn_reading = Reading(omega, jnp.all(jnp.abs(omega) < RATE), DIRECT, jnp.zeros_like(age), 0.0)
             turning = omega
         now = s.channels
-        rates = now.rates.observe(features[1:3], turn_reading.sample(slice(0, 2), none[1:3]), keep, dt, jumping=0)
-        yaw = now.yaw.observe(features[3:], turn_reading.sample(slice(2, 3), none[3:]), keep, dt, jumping=0)
+        rates = now.rates.observe(features[1:3], turn_reading.sample(slice(0, 2), none[1:3]), keep, dt)
+        yaw = now.yaw.observe(features[3:], turn_reading.sample(slice(2, 3), none[3:]), keep, dt)
 
         has_settled = certain & (s.elapsed > SETTLING)
         up = jnp.array([0.0, 0.0, STANDARD_GRAVITY], dtype)
-        axis = 0.5 * (s.x.R + x.R)[:, 2]
-        drag = -0.5 * jnp.sum(axis * (s.x.v + x.v))
+        R, v = 0.5 * (s.x.R + x.R), 0.5 * (s.x.v + x.v)
         fading = jnp.exp(-s.elapsed / jnp.array(FADING, dtype))
-        other = jnp.concatenate([axis, drag[None], fading])[None]
-        lift = jnp.sum(axis * ((x.v - s.x.v) / dt + up)) - STANDARD_GRAVITY
-        lift_sample = Reading(lift[None], has_settled, DIFFERENCE, age, dt).sample(slice(0, 1), other)
-        thrust = now.thrust.observe(features[:1], lift_sample, keep, dt, jumping=3)
-        force = now.force
-        if a is not None:
+
+        def lift(R: Float[Array, "3 3"], a: Float[Array, "3"]) -> tuple[Float[Array, "1"], Float[Array, "1 n"]]:
+            """Return the acceleration along the thrust as a difference from hover, and its features."""
+            axis = R[:, 2]
+            other = jnp.concatenate([axis, -jnp.sum(axis * v)[None], fading])
+            return jnp.sum(axis * (a + up))[None] - STANDARD_GRAVITY, other[None]
+
+        difference = (x.v - s.x.v) / dt
+        value, other = lift(R, difference)
+        lift_sample = Reading(value, has_settled, DIFFERENCE, age, dt).sample(slice(0, 1), other)
+        if a is None:
+            lateral = s.lateral.observe(R, v, difference + up, certain, keep)
+        else:
             # The accelerometer has no latency, even if the attitude does.
             turn = so3.exp(age * turning)
-            axis = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))[:, 2]
-            lift = jnp.sum(axis * (a + up)) - STANDARD_GRAVITY
-            usable = has_settled & jnp.all(jnp.abs(a) < ACCELERATION)
-            now_read = Reading(lift[None], usable, DIRECT, jnp.zeros_like(age), dt)
-            force = force.observe(features[:1], now_read.sample(slice(0, 1), other), keep, dt, jumping=3)
-        middle = so3.mul(s.x.R, so3.exp(0.5 * so3.log(so3.mul(s.x.R.T, x.R))))
-        acceleration = (x.v - s.x.v) / dt if a is None else a
-        usable = certain & jnp.all(jnp.abs(acceleration) < ACCELERATION)
-        lateral = s.lateral.observe(middle, 0.5 * (s.x.v + x.v), acceleration + up, usable, dt)
+            R = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))
+            is_plausible = jnp.all(jnp.abs(a) < ACCELERATION)
+            lateral = s.lateral.observe(R, v, a + up, certain & is_plausible, keep)
+        jumped = lateral.jumped
+        thrust = now.thrust.observe(features[:1], lift_sample, keep, dt, jumping=3, jumped=jumped)
+        force = now.force
+        if a is not None:
+            value, other = lift(R, a)
+            sample = Reading(value, has_settled & is_plausible, DIRECT, jnp.zeros_like(age), dt).sample(
+                slice(0, 1), other
+            )
+            force = force.observe(features[:1], sample, keep, dt, jumping=3, jumped=jumped)
         channels = Channels(rates, yaw, thrust, force)
         return PathState(history, x, t, s.elapsed + dt, consistency, channels, lateral, s.estimate)
 

@@ -10,12 +10,13 @@ from jaxtyping import Array, Bool, Float
 
 from .channel import Coefficients
 
-MEMORY = 2.0  # [s], time constant of forgetting
 PUSH, DRAG = 3.0, 0.5  # standard deviations of a push [m/s^2] and of the drag [1/s] before any flight
+FLOOR = 0.05  # [m/s^2], standard deviation of unmodelled effects in one reading
+BIAS = 0.02  # [m/s^2], standard deviation of unmodelled effects that last
 WEIGHT = 0.1  # number of readings that weigh as much as the prior of the variance
-FLOOR = 0.05  # [m/s^2], standard deviation of unmodelled effects
 SLOWEST = 0.98  # largest correlation between successive residuals
-GATE = 6.0  # standard deviations of two successive residuals beyond which the push has jumped
+GATE = 6.0  # standard deviations beyond which a residual does not count, and two successive ones show a jump
+RIDGE = 1e-4  # relative error of the sums in single precision
 
 
 class LateralPush(eqx.Module):
@@ -26,14 +27,19 @@ class LateralPush(eqx.Module):
     count: Float[Array, ""]
     """Sum of the weights of the readings."""
     residual: Float[Array, "2"]
-    """Residuals of the last tick [m/s^2]."""
+    """Residuals of the last reading that counts [m/s^2]."""
     squares: Float[Array, "2"]
     """Sums of squared residuals, and of products of successive residuals [m^2/s^4]."""
+    far: Bool[Array, ""]
+    """Whether the last reading was beyond :data:`GATE`."""
+    jumped: Bool[Array, ""]
+    """Whether the push has jumped in the last tick."""
 
     @classmethod
     def start(cls) -> "LateralPush":
         """Return the sums before the first reading."""
-        return cls(jnp.zeros((5, 5)), jnp.zeros(()), jnp.zeros(2), jnp.zeros(2))
+        no = jnp.array(False)
+        return cls(jnp.zeros((5, 5)), jnp.zeros(()), jnp.zeros(2), jnp.zeros(2), no, no)
 
     def observe(
         self,
@@ -41,7 +47,7 @@ class LateralPush(eqx.Module):
         v: Float[Array, "3"],
         force: Float[Array, "3"],
         usable: Bool[Array, ""],
-        dt: float,
+        keep: Float[Array, ""],
     ) -> "LateralPush":
         """Return the sums after one tick.
 
@@ -50,42 +56,46 @@ class LateralPush(eqx.Module):
             v: Mean velocity during the tick, world [m/s].
             force: Mean specific force during the tick, world [m/s^2].
             usable: Whether the reading counts; otherwise only the time advances.
-            dt: Control tick [s].
+            keep: Remaining weight of earlier readings.
         """
         directions = R[:, :2].T
         rows = jnp.concatenate([directions, -directions @ v[:, None], directions @ force[:, None]], axis=1)
         usable &= jnp.all(jnp.isfinite(rows))
         rows = jnp.where(usable, rows, 0.0)
-        mean, _ = self._fit()
-        residual = rows[:, -1] - rows[:, :-1] @ mean
-        limit = GATE * jnp.sqrt(self._variance())
-        jumps = jnp.any((jnp.abs(residual) > limit) & (jnp.abs(self.residual) > limit))
-        keep = jnp.where(jumps, 0.0, jnp.exp(jnp.asarray(-dt / MEMORY, v.dtype)))
-        squares = keep * self.squares + jnp.stack([residual @ residual, residual @ self.residual])
+        residual = rows[:, -1] - rows[:, :-1] @ self.push_and_drag().mean
+        far = jnp.any(jnp.abs(residual) > GATE * jnp.sqrt(self._variance()))
+        jumps = usable & far & self.far
+        rows = jnp.where(far & ~jumps, 0.0, rows)
+        counts = usable & ~far
+        keep = jnp.where(jumps, 0.0, keep)
+        squares = jnp.stack([residual @ residual, residual @ self.residual])
         return LateralPush(
             keep * self.products + rows.T @ rows,
-            keep * self.count + 2.0 * usable.astype(v.dtype),
-            jnp.where(jumps, 0.0, residual),
-            jnp.where(jumps, 0.0, squares),
+            keep * self.count + 2.0 * (counts | jumps).astype(keep.dtype),
+            jnp.where(counts, residual, 0.0),
+            keep * self.squares + jnp.where(counts, squares, 0.0),
+            jnp.where(usable, far & ~jumps, self.far),
+            jumps,
         )
 
     def push(self) -> Coefficients:
-        """Return the distribution of the push [m/s^2].
+        """Return the distribution of the push, world [m/s^2]."""
+        result = self.push_and_drag()
+        return Coefficients(result.mean[:3], jnp.linalg.inv(jnp.linalg.inv(result.information)[:3, :3]))
+
+    def push_and_drag(self) -> Coefficients:
+        """Return the distribution of the push, world [m/s^2], and of the drag coefficient [1/s].
 
         Residuals of a push that changes are related in time, so they contain less information than their number.
         """
-        mean, information = self._fit()
         relation = jnp.clip(self.squares[1] / jnp.maximum(self.squares[0], FLOOR**2), 0.0, SLOWEST)
-        covariance = jnp.linalg.inv(information * (1.0 - relation) / (1.0 + relation))
-        return Coefficients(mean[:3], jnp.linalg.inv(covariance[:3, :3]))
+        variance = self._variance() * (1.0 + relation) / (1.0 - relation) + self.count * BIAS**2
+        products = self.products / variance
+        before = jnp.array([PUSH, PUSH, PUSH, DRAG], products.dtype) ** -2
+        # Without the ridge, rounding errors of the sums could exceed the prior where directions and drag are alike.
+        information = products[:-1, :-1] + jnp.diag(before + RIDGE * jnp.diagonal(products)[:-1])
+        return Coefficients(jnp.linalg.solve(information, products[:-1, -1]), information)
 
     def _variance(self) -> Float[Array, ""]:
         """Return the variance of a residual; without readings, that of a push."""
         return FLOOR**2 + (self.squares[0] + WEIGHT * PUSH**2) / (self.count + WEIGHT)
-
-    def _fit(self) -> tuple[Float[Array, "4"], Float[Array, "4 4"]]:
-        """Return the push and the drag coefficient, and their information for independent residuals."""
-        products = self.products / self._variance()
-        before = jnp.array([PUSH, PUSH, PUSH, DRAG], products.dtype) ** -2
-        information = products[:-1, :-1] + jnp.diag(before)
-        return jnp.linalg.solve(information, products[:-1, -1]), information

@@ -95,8 +95,8 @@ class Whitening(eqx.Module):
         unknown = _with_last(
             jnp.zeros_like(carry).at[:, 0, 0].set(DIFFUSE), jnp.zeros_like(gain[:, :2]), jnp.ones_like(total)
         )
-        old = self.mean.at[..., 2].set(0.0)
-        mean = old + jnp.where(counts, gain, 0.0)[:, None, None, :] * innovation[..., None]
+        mean = self.mean.at[..., 2].set(0.0) + gain[:, None, None, :] * jnp.where(counts, innovation, 0.0)[..., None]
+        mean = jnp.where(jumps, mean.at[..., 1].set(0.0), mean)
         covariance = jnp.where(jumps, unknown, jnp.where(counts, left, carry))
         motion = jnp.tile(jnp.eye(3), (kinds.shape[0], 1, 1)).at[:, 0, 1].set(1.0).at[:, 1, 1].set(kinds[:, 2])
         covariance = (motion @ covariance @ motion.mT).at[:, 1, 1].add(kinds[:, 1])

@@ -23,7 +23,7 @@ TEMPER = 0.03  # share of the information that a coarse grid uses
 MOVE_EXCESS = 2.0  # excess of the log posterior outside the grid at which the grid moves there
 COVARIANCE_FACTOR = 1.2  # factor on the covariance for the next grid, since a posterior may also widen
 LEAST_DEVIATION = 0.35  # smallest deviation of the next grid, as a share of the spacing of the present one
-SHARE = 8  # one of so many cells is used to choose the kind of noise; no factor in common with the numbers of cells
+SHARE = 4  # one of so many cells is used to choose the kind of noise; no factor in common with the sides of the grids
 GAINS = (0.2, 5.0)  # range in which a gain is linearised
 FREEDOM = 2.0  # twice the shape of the inverse gamma prior of the noise variance
 
@@ -78,7 +78,7 @@ def path_posterior(
         return Region(mean, COVARIANCE_FACTOR * covariance + least)
 
     cells, least = around(channel.region)
-    some = cells[::SHARE]
+    some = cells[(cells.shape[0] // 2) % SHARE :: SHARE]
     h = responses(some, channel.age, channel.width, prior.hover, dt)
     fits = _fits(sums, h, channel, prior, gain_prior(some, prior, belief))
     kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + log_prior(some, prior, belief)[None], axis=1))
@@ -153,15 +153,19 @@ def _without_others(channel: Channel, others: Coefficients) -> _Sums:
     """Integrate over the coefficients of the other features, and add the axes."""
     m, n, temper = channel.response.shape[0], others.mean.shape[0], channel.temper
     products = with_coefficients(temper * channel.products, others, channel.noise)
+    half_log = temper * channel.half_log
     if n > 0:
         rows = products[..., m : m + n, :]
-        products -= rows.mT @ jnp.linalg.solve(rows[..., m : m + n], rows)
+        factors = jax.scipy.linalg.lu_factor(rows[..., m : m + n])
+        products -= rows.mT @ jax.scipy.linalg.lu_solve(factors, rows)
+        pivots = jnp.diagonal(factors[0], axis1=-2, axis2=-1)
+        half_log += 0.5 * jnp.sum(jnp.log(jnp.abs(pivots)), axis=(1, 2))
     products = jnp.sum(products, axis=1)
     return _Sums(
         products[:, :m, :m],
         products[:, :m, -1],
         products[:, -1, -1],
-        temper * channel.half_log,
+        half_log,
         temper * channel.count,
     )
 
