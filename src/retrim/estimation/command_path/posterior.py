@@ -63,44 +63,42 @@ def path_posterior(
     sums = _without_others(channel, coefficients_before(prior) if others is None else others)
     grid, step = (jnp.asarray(x, channel.response.dtype) for x in unit_grid(prior.cells))
 
-    def likelihood_of(cells: Float[Array, "cells 3"], one: _Sums) -> tuple[_Fit, Float[Array, "cells m"]]:
-        h = responses(cells, channel.age, channel.width, prior.hover, dt)
-        return _fit(one, h, channel, prior, gain_prior(cells, prior, belief)), h
-
     def around(region: Region) -> tuple[Float[Array, "cells 3"], Float[Array, "3 3"]]:
         factor = cholesky(region.covariance)
         least = (factor * (LEAST_DEVIATION * step[None]) ** 2) @ factor.T
         return region.mean[None] + grid @ factor.T, least
 
-    def region_of(cells: Float[Array, "cells 3"], fit: _Fit, temper: float, least: Float[Array, "3 3"]) -> Region:
-        weight = _weight(fit.log_likelihood, cells, prior, belief, temper)
+    def region_of(
+        cells: Float[Array, "cells 3"], likelihood: Float[Array, " cells"], temper: float, least: Float[Array, "3 3"]
+    ) -> Region:
+        weight = _weight(likelihood, cells, prior, belief, temper)
         mean, covariance = moments(cells, weight)
         return Region(mean, COVARIANCE_FACTOR * covariance + least)
 
     cells, least = around(channel.region)
-    some = cells[(cells.shape[0] // 2) % SHARE :: SHARE]
-    h = responses(some, channel.age, channel.width, prior.hover, dt)
-    fits = _fits(sums, h, channel, prior, gain_prior(some, prior, belief))
-    kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + log_prior(some, prior, belief)[None], axis=1))
-    one = _Sums(sums.uu[kind], sums.uz[kind], sums.zz[kind], sums.half_log[kind], sums.total)
-    fit, _ = likelihood_of(cells, one)
-    region = region_of(cells, fit, 1.0, least)
     coarse, within = coarse_grid(prior, belief)
-    far, _ = likelihood_of(coarse, one)
-    best, result = (
-        jnp.max(each.log_likelihood + log_prior(at, prior, belief)) for each, at in ((far, coarse), (fit, cells))
-    )
-    restart = region_of(coarse, far, TEMPER, within)
-    region = jax.tree.map(lambda new, old: jnp.where(best > result + MOVE_EXCESS, new, old), restart, region)
+    n, both = cells.shape[0], jnp.concatenate([cells, coarse])
+    h, gain = responses(both, channel.age, channel.width, prior.hover, dt), gain_prior(both, prior, belief)
+    before = log_prior(both, prior, belief)
+    some = slice((n // 2) % SHARE, n, SHARE)
+    fits = _fits(sums, h[some], channel, prior, GainPrior(gain.mean[some], gain.spread))
+    kind = jnp.argmax(jax.nn.logsumexp(fits.log_likelihood + before[some][None], axis=1))
+    one = _Sums(sums.uu[kind], sums.uz[kind], sums.zz[kind], sums.half_log[kind], sums.total)
+    likelihood = _fit(one, h, channel, prior, gain).log_likelihood
+    region = region_of(cells, likelihood[:n], 1.0, least)
+    restart = region_of(coarse, likelihood[n:], TEMPER, within)
+    restarts = jnp.max((likelihood + before)[n:]) > jnp.max((likelihood + before)[:n]) + MOVE_EXCESS
+    region = jax.tree.map(lambda new, old: jnp.where(restarts, new, old), restart, region)
     cells, least = around(region)
-    fit, h = likelihood_of(cells, one)
+    h = responses(cells, channel.age, channel.width, prior.hover, dt)
+    fit = _fit(one, h, channel, prior, gain_prior(cells, prior, belief))
     weight = _weight(fit.log_likelihood, cells, prior, belief, 1.0)
     cell_responses = fit.gain[:, None] * h
     response = weight @ cell_responses
     off, middle = cell_responses - response[None], weight @ h
     spread = (weight[:, None] * off).T @ off + (weight @ fit.gain_variance) * jnp.outer(middle, middle)
     noise = jnp.sqrt(weight @ fit.variance)
-    region = region_of(cells, fit, 1.0, least)
+    region = region_of(cells, fit.log_likelihood, 1.0, least)
     return PathPosterior(cells, weight, fit.gain, fit.gain_variance, response, spread, noise, kind, region)
 
 
@@ -108,10 +106,8 @@ def log_likelihood(
     channel: Channel, prior: Prior, cells: Float[Array, "cells 3"], dt: float
 ) -> Float[Array, "kinds cells"]:
     """Return the log likelihood of cells for each kind of noise, up to a constant; see :func:`path_posterior`."""
-    sums, h = (
-        _without_others(channel, coefficients_before(prior)),
-        responses(cells, channel.age, channel.width, prior.hover, dt),
-    )
+    sums = _without_others(channel, coefficients_before(prior))
+    h = responses(cells, channel.age, channel.width, prior.hover, dt)
     return _fits(sums, h, channel, prior, gain_prior(cells, prior, None)).log_likelihood
 
 
