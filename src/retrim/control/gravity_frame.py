@@ -25,9 +25,7 @@ from ..physics.state import Command, State
 from .controller import AbstractController, PolicyController
 from .slung_load import LoadCompensation, LoadMemory
 
-SHARE_OF_RESPONSE_TIME = (
-    0.25  # time constant of the observer for an identified vehicle, as a share of delay plus rate lag
-)
+SHARE_OF_RESPONSE_TIME = 0.25  # time constant of the observer as a share of an identified delay plus rate lag
 FASTEST, SLOWEST = 0.015, 0.05  # [s], limits of this time constant
 
 
@@ -39,7 +37,7 @@ class GravityFrameState(eqx.Module):
     frame: EffectiveGravityFrame
     """Frame of the last command."""
     load: LoadMemory | None = None
-    """Memory of the compensation of a load; None without it."""
+    """Memory of the compensation of a load, if a load is expected."""
 
 
 class GravityFrame(AbstractController[GravityFrameState]):
@@ -60,17 +58,17 @@ class GravityFrame(AbstractController[GravityFrameState]):
     trust_residual: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(1.0))
     """Share of the learned residual and of the learned rate bias that is used."""
     actuators: ActuatorState | None = None
-    """Present thrust and body rates; None if the last command acts."""
+    """Present thrust and body rates; by default, those of the last command."""
     place: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None
     """Learned acceleration as a function of position, world [m/s^2]. The frame uses its value at the position at which
-    the command acts, since an estimate of this value would be late; None if the residual does not depend on
-    position."""
+    the command acts, since an estimate of this value would be late. By default, the residual does not depend
+    on position."""
     lead: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Time from a measurement that is not late until the thrust has followed a command [s]."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Disturbance that turns the frame in addition to the estimated one, in the world frame [m/s^2]."""
     load: LoadCompensation | None = None
-    """Compensation of a load on a cable; None if no load is expected."""
+    """Compensation of a load on a cable, if a load is expected."""
 
     def with_age(self, age: float | Float[Array, ""]) -> "GravityFrame":
         """Return the same controller for measurements that are ``age`` seconds old."""
@@ -164,7 +162,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
     ) -> tuple[ObserverState, LoadMemory | None, Float[Array, "3"]]:
         """Return the memory of the observer, that of the load, and the pull of the load on the vehicle [m/s^2].
 
-        The observer estimates what remains of the disturbance without the pull.
+        The observer estimates the disturbance without the pull.
         """
         before, load, dt = memory.observer, memory.load, observer.nominal.dt
         if self.load is None or load is None:
@@ -237,7 +235,7 @@ class StateDependentResidual(eqx.Module):
     share: Float[Array, ""]
     """Share of these parts that is used."""
     place: Callable[[Float[Array, "3"]], Float[Array, "3"]] | None = None
-    """Part that depends on position; None if there is none."""
+    """Part that depends on position, if there is one."""
 
     def __call__(self, x: State, u: Command) -> Float[Array, "3"]:
         """Return this part of the residual acceleration in the world frame [m/s^2]."""

@@ -13,7 +13,7 @@ DELAY_TOLERANCE = 0.06  # [s], delay of rates beyond that in training; the fit o
 
 
 def likely_cause(log: Log, response_time: float) -> str | None:
-    """Return the first known cause that a log shows, or None.
+    """Return the first known cause that a log shows, if it shows one.
 
     Args:
         log: A flight that was terminated.

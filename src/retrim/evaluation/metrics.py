@@ -34,7 +34,7 @@ EFFORT = ("rates_rms", "rates_change_rms")
 
 
 def record(flight: Flight) -> dict[str, Any]:
-    """Return one flight's figures; the errors of a terminated flight are None."""
+    """Return one flight's figures; a terminated flight has no errors."""
     has_crashed = flight.log.terminated
     effort = (
         flight.effort if find_method(flight.spec.method).on_board is None else (np.nan, np.nan)
@@ -57,7 +57,7 @@ def record(flight: Flight) -> dict[str, Any]:
 
 
 def failed_record(spec: FlightSpec, vehicle: str, metric: str, why: str) -> dict[str, Any]:
-    """Return the record of a flight whose job failed, with its conditions and the reason; all figures are None.
+    """Return the record of a flight whose job failed, with its conditions and the reason, and without figures.
 
     Args:
         spec: Specification of the flight.
@@ -100,7 +100,7 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
     """Return one row for flights under the same conditions.
 
     The mean is over the flights that were not terminated. In the median and the maximum, a terminated flight's error is
-    infinite (written as None), so that they do not hide a crash. A flight whose job failed gives no information about
+    infinite (null in JSON), so that a crash remains visible. A flight whose job failed gives no information about
     the method. It counts in ``n``, and is listed in ``failures``.
 
     Args:
@@ -141,7 +141,7 @@ def summary(records: Sequence[Mapping[str, Any]], keys: Sequence[str] = CONDITIO
 
 
 def interval(records: Sequence[Mapping[str, Any]], draws: int = 2000) -> list[float] | None:
-    """Return the 95 % bootstrap interval of the mean error [m]; None if every flight was terminated.
+    """Return the 95 % bootstrap interval of the mean error [m], if at least one flight was complete.
 
     Training seeds are drawn first, with replacement, and then flights from each seed. Flights with the same seed are
     correlated; this order keeps their correlation from narrowing the interval.
@@ -232,7 +232,7 @@ def with_counts(row: Mapping[str, Any], text: str) -> str:
 
 
 def _finite(value: float) -> float | None:
-    """Return a finite value unchanged, otherwise None; JSON cannot represent infinity."""
+    """Return a value for JSON, which cannot represent infinity: null instead of a value that is not finite."""
     return value if np.isfinite(value) else None
 
 

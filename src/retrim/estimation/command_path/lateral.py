@@ -14,7 +14,7 @@ PUSH, DRAG = 3.0, 0.5  # standard deviations of a push [m/s^2] and of the drag [
 FLOOR = 0.05  # [m/s^2], standard deviation of unmodelled effects in one reading
 BIAS = 0.02  # [m/s^2], standard deviation of unmodelled effects that last
 WEIGHT = 0.1  # number of readings that weigh as much as the prior of the variance
-SLOWEST = 0.98  # largest correlation between successive residuals
+LARGEST_CORRELATION = 0.98  # largest correlation between successive residuals
 GATE = 6.0  # standard deviations beyond which a residual does not count, and two successive ones show a jump
 RIDGE = 1e-4  # relative error of the sums in single precision
 
@@ -86,10 +86,11 @@ class LateralPush(eqx.Module):
     def push_and_drag(self) -> Coefficients:
         """Return the distribution of the push, world [m/s^2], and of the drag coefficient [1/s].
 
-        Residuals of a push that changes are related in time, so they contain less information than their number.
+        Residuals of a push that changes are correlated in time, so they contain less information than independent ones.
         """
-        relation = jnp.clip(self.squares[1] / jnp.maximum(self.squares[0], FLOOR**2), 0.0, SLOWEST)
-        variance = self._variance() * (1.0 + relation) / (1.0 - relation) + self.count * BIAS**2
+        correlation = self.squares[1] / jnp.maximum(self.squares[0], FLOOR**2)
+        correlation = jnp.clip(correlation, 0.0, LARGEST_CORRELATION)
+        variance = self._variance() * (1.0 + correlation) / (1.0 - correlation) + self.count * BIAS**2
         products = self.products / variance
         before = jnp.array([PUSH, PUSH, PUSH, DRAG], products.dtype) ** -2
         # Without the ridge, rounding errors of the sums could exceed the prior where directions and drag are alike.

@@ -5,10 +5,10 @@ s_(k+1) = phi s_k + w_k: b is a random walk if phi is 0, and smooth if phi is ne
 difference of two noisy attitudes has mu = 1. The Kalman filter of (b, s, e) turns residuals into innovations, which are
 independent. The filter is linear, so it is applied to both commands and measurements before they are compared.
 
-A controller answers the disturbance, so a wrong model of the disturbance biases the gain: the innovations would contain
-a predictable part, to which the commands are related (Ljung, System Identification, 1999, section 13.4). For the
-filter and for trends with damped slopes, see Harvey, Forecasting, Structural Time Series Models and the Kalman Filter
-(1989), chapter 2 and sections 3.2 and 4.2.
+A controller reacts to the disturbance, so a wrong model of the disturbance biases the gain: the innovations would
+contain a predictable part, with which the commands are correlated (Ljung, System Identification, 1999, section 13.4).
+For the filter and for trends with damped slopes, see Harvey, Forecasting, Structural Time Series Models and the Kalman
+Filter (1989), chapter 2 and sections 3.2 and 4.2.
 """
 
 import equinox as eqx
