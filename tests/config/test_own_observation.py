@@ -16,8 +16,8 @@ from retrim.config.learners import check_frame
 from retrim.config.methods import MethodRequest
 from retrim.control.baselines import BASELINES
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import PoseFrame
 from retrim.control.pose_filtered import PoseFilteredController
+from retrim.control.pose_frame import PoseFrame
 from retrim.errors import ConfigError
 from retrim.evaluation.figures import picture
 from retrim.learn.encoder import pretrain_encoder

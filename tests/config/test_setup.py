@@ -25,10 +25,11 @@ from retrim.config.vehicles import make_vehicle
 from retrim.control.actuator_tracking import ActuatorTracking
 from retrim.control.belief_flight import IdentifiedFlight
 from retrim.control.controller import PolicyController
-from retrim.control.gravity_frame import GravityFrame, PoseFrame
+from retrim.control.gravity_frame import GravityFrame
 from retrim.control.lap_learning import LapLearning
 from retrim.control.monitor import Monitor
 from retrim.control.near_target import NearTarget
+from retrim.control.pose_frame import PoseFrame
 from retrim.learn import policy_loss
 from retrim.physics.actuators import LaggedModel
 from retrim.physics.dynamics import PointMass

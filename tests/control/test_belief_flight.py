@@ -15,6 +15,7 @@ from retrim.config import Setup, changed, load
 from retrim.config.families import prior_belief
 from retrim.control.actuator_tracking import ActuatorTracking
 from retrim.control.belief_flight import IdentifiedFlight
+from retrim.control.caution import Caution
 from retrim.control.controller import AbstractController
 from retrim.control.excitation import Excitation
 from retrim.control.integral import IntegralAction
@@ -231,18 +232,23 @@ def test_past_commands_must_cover_delays_of_family():
         changed(load("hover/any"), command_history=4)
 
 
-def test_observer_time_constant_follows_vehicle(as_a_user):
+def test_observer_and_prediction_follow_vehicle(as_a_user):
+    """The observer is as fast as the vehicle, and a change is predicted only for a known vehicle without caution."""
     setup = Setup.from_preset(changed(load("hover/any"), pretrain=SHORT))
     flight = setup.pilot(setup.new_policy(random.key(0)), "base-id").controller
+    calm = Caution.none(State.at(jnp.zeros(3)))
 
-    def tau(low, high):
+    def frame(low, high, level=0.0):
         belief = PathBelief.between(jnp.array(low), jnp.array(high))
-        result = flight.follow(VehicleEstimate(belief, jnp.array(1.0)))._flying(belief)
-        return float(result.inner.observer.tau)
+        caution = dataclasses.replace(calm, level=jnp.array(level))
+        return flight.follow(VehicleEstimate(belief, jnp.array(1.0)))._flying(belief, caution).inner
 
-    fast, slow = [-1.0] * 4, [1.0] * 4
-    assert tau(fast, fast) == pytest.approx(0.015)
-    assert tau(slow, slow) == pytest.approx(0.05)
-    assert tau(fast, slow) == pytest.approx(0.05)  # an unknown vehicle may be slow
-    middle = tau([0.0] * 4, [0.0] * 4)  # 50 ms of delay and of lag
-    assert middle == pytest.approx(0.25 * 0.1, rel=1e-3)
+    fast, middle, slow = [-1.0] * 4, [0.0] * 4, [1.0] * 4  # middle: 50 ms of delay and of lag
+    taus = [float(frame(*ends).observer.tau) for ends in ((fast, fast), (slow, slow), (fast, slow), (middle, middle))]
+    assert taus == pytest.approx([0.015, 0.05, 0.05, 0.25 * 0.1], rel=1e-3)  # an unknown vehicle may be slow
+    assert float(frame(middle, middle).certainty) == pytest.approx(1.0, abs=1e-3)
+    assert float(frame(fast, slow).certainty) == 0.0
+    assert [float(frame(middle, middle, level).certainty) for level in (0.5, 1.0)] == pytest.approx(
+        [0.5, 0.0], abs=1e-3
+    )
+    np.testing.assert_allclose(frame(middle, middle).horizon[:2], 2.5 * 0.1, rtol=1e-3)

@@ -13,13 +13,16 @@ from helpers import GOAL, first_order, hover_env, hover_task, random_command, ra
 from retrim.adapt.views import GravityView, RestView, WorldView
 from retrim.control import Policy
 from retrim.control.controller import AbstractController, PolicyController
-from retrim.control.gravity_frame import GravityFrame, PoseFrame, StateDependentResidual
+from retrim.control.gravity_frame import GravityFrame, StateDependentResidual
+from retrim.control.pose_frame import PoseFrame
 from retrim.estimation.disturbance_observer import DisturbanceObserver
 from retrim.learn import Env, FittedResidual, rollout
 from retrim.learn.residuals import RegressionModel
 from retrim.physics import ActuatorState, Command, Hybrid, PointMass, State, small, so3
 from retrim.physics.actuators import LaggedModel, RateBiasedModel
+from retrim.physics.command_path import CommandPath
 from retrim.physics.effective_gravity import EffectiveGravityFrame
+from retrim.physics.path_family import Member, PathBelief
 from retrim.tasks import (
     Keypoints,
     L2Track,
@@ -451,3 +454,64 @@ def test_map_is_evaluated_at_predicted_position():
     _, memory = frame(frame.init(x), jnp.array(0.0), x)
     there = x.p + 0.08 * x.v
     np.testing.assert_allclose(memory.frame.d - memory.observer.d_hat, force(there), atol=1e-6)
+
+
+def test_frame_leads_a_smooth_disturbance():
+    """The frame is that of the disturbance at the end of the horizon, which the observer has not seen."""
+    h, dt = 0.1, 0.02
+    observer = DisturbanceObserver(PointMass(dt), jnp.array(0.005), LIMIT, jnp.array(jnp.inf))
+    frame = GravityFrame(HoverInAnyFrame(), observer)
+    leads = dataclasses.replace(frame, horizon=jnp.full(3, h), certainty=jnp.array(1.0))
+    t = dt * np.arange(500)
+    late, early = (_frames_under_sinusoid(each, t) for each in (frame, leads))
+    true = np.asarray(jax.vmap(_sinusoid)(jnp.asarray(t + h)))
+    error = [np.sqrt(np.mean((each - true)[250:] ** 2)) for each in (late, early)]
+    assert error[1] < 0.5 * error[0]
+
+
+def _sinusoid(t):
+    return jnp.sin(2.0 * jnp.pi * t / 3.0 + jnp.array([0.0, 1.0, 2.0]))
+
+
+@eqx.filter_jit
+def _frames_under_sinusoid(frame, times):
+    """The disturbance of the frame at each time under a sinusoidal push."""
+
+    def tick(carry, t):
+        memory, x = carry
+        u, memory = frame(memory, t, x)
+        return (memory, PointMass(0.02).step(x, u, _sinusoid(t))), memory.frame.d
+
+    x = State.at(jnp.array([0.0, 0.0, 1.0]))
+    return lax.scan(tick, (frame.init(x), x), jnp.asarray(times))[1]
+
+
+def test_horizon_follows_the_identified_vehicle():
+    """Without a certainty, as in training, the frame is that of the present estimate."""
+    path = CommandPath.of(0.03, first_order(0.05))
+    belief = PathBelief(jnp.zeros(4), jnp.zeros(4))
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.02), LIMIT, jnp.array(1.0))
+    frame = GravityFrame(HoverInAnyFrame(), observer)
+    assert frame.with_vehicle(Member(path, belief)).certainty == 0.0
+    known = frame.with_vehicle(Member(path, belief, jnp.array(0.08), jnp.array(0.7)))
+    tilt, thrust = 2.5 * (0.03 + 0.05), 0.03 + 0.05 + 0.01
+    np.testing.assert_allclose(known.horizon, [tilt, tilt, thrust], atol=1e-6)
+    np.testing.assert_allclose(known.certainty, 0.7, atol=1e-6)
+
+
+def test_contradictory_measurements_predict_no_change():
+    """While velocities contradict positions, the estimate decays, and this decay is not a trend of the disturbance."""
+    observer = DisturbanceObserver(PointMass(0.02), jnp.array(0.005), LIMIT, jnp.array(jnp.inf))
+    frame = GravityFrame(HoverInAnyFrame(), observer, horizon=jnp.full(3, 0.1), certainty=jnp.array(1.0))
+    x = State.at(jnp.array([0.0, 0.0, 1.0]))
+    memory, step = frame.init(x), eqx.filter_jit(frame)
+    for k in range(100):
+        u, memory = step(memory, jnp.array(0.02 * k), x)
+        x = PointMass(0.02).step(x, u, _sinusoid(0.02 * k))
+    assert jnp.abs(memory.frame.d - memory.observer.d_hat).max() > 0.05
+    before = memory.trend
+    for k in range(100, 110):
+        wrong = State(x.p + 50.0 * (1 + k % 2), x.R, x.v)
+        u, memory = step(memory, jnp.array(0.02 * k), wrong)
+        np.testing.assert_allclose(memory.frame.d, memory.observer.d_hat, atol=1e-9)
+    np.testing.assert_array_equal(memory.trend.square, before.square)

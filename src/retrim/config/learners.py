@@ -16,10 +16,11 @@ from ..adapt.trim import NoTrim, RestTrim
 from ..adapt.vehicles import IdentifiedVehicle, OwnVehicle
 from ..adapt.views import AbstractView, GravityView, RestView, WorldView
 from ..control.controller import AbstractController, PolicyController
-from ..control.gravity_frame import GravityFrame, PoseFrame, lead_of
+from ..control.gravity_frame import GravityFrame, lead_of
 from ..control.lap_learning import LapLearning
 from ..control.monitor import Monitor
 from ..control.policy import AbstractPolicy
+from ..control.pose_frame import PoseFrame
 from ..control.slung_load import LoadCompensation
 from ..errors import ConfigError, FrameError
 from ..estimation.command_path import PathEstimator

@@ -17,6 +17,7 @@ from ..estimation.command_path import PathEstimate, PathEstimator, ringing_of
 from ..estimation.command_path import PathState as EstimatorState
 from ..estimation.latency import follows
 from ..estimation.lateness import Lateness
+from ..physics.command_path import CommandPath
 from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from .caution import REPORT_LEVEL, Caution
@@ -72,7 +73,8 @@ class BeliefFlight(WrappedController[BeliefState]):
 
     def init(self, x: State) -> BeliefState:
         """Return the memory at the start of a flight."""
-        return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior).init(x), Caution.none(x))
+        caution = Caution.none(x)
+        return BeliefState(self.prior, jnp.ones_like(x.p[0]), self._flying(self.prior, caution).init(x), caution)
 
     def __call__(self, memory: BeliefState, t: Float[Array, ""], x: State) -> tuple[Command, BeliefState]:
         """Return the command of the inner controller for the present belief about the vehicle."""
@@ -81,20 +83,28 @@ class BeliefFlight(WrappedController[BeliefState]):
         caution = memory.caution.after(x, dt) if self.watches else memory.caution
         level = caution.gain(self.estimate.gain.astype(x.p.dtype))
         gain = memory.gain + jnp.clip(level - memory.gain, -GAIN_PACE * dt, GAIN_PACE * dt)
-        u, inner = self._flying(caution.apply(belief))(memory.inner, t, x)
+        u, inner = self._flying(belief, caution)(memory.inner, t, x)
         return Command(u.c / gain, u.omega), BeliefState(belief, gain, inner, caution)
 
     def accept(self, memory: BeliefState, u: Command) -> BeliefState:
         """Remember the accepted command."""
-        inner = self._flying(memory.caution.apply(memory.belief)).accept(
-            memory.inner, Command(u.c * memory.gain, u.omega)
-        )
+        flying = self._flying(memory.belief, memory.caution)
+        inner = flying.accept(memory.inner, Command(u.c * memory.gain, u.omega))
         return dataclasses.replace(memory, inner=inner)
 
-    def _flying(self, belief: PathBelief) -> AbstractController[Any]:
-        slowest = self.family.path(belief.ends[1])
-        response_time = slowest.delay + slowest.response.rate_lag[0]
-        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, response_time))
+    def _flying(self, belief: PathBelief, caution: Caution) -> AbstractController[Any]:
+        """Return the inner controller for the belief, which the caution changes."""
+        middle, slowest = (_response_time(self.family.path(end)) for end in (belief.centre, belief.ends[1]))
+        # The assumed vehicle of a cautious flight is not an estimate.
+        certainty = (1.0 - caution.level) * jnp.clip(2.0 - slowest / (middle + 1e-6), 0.0, 1.0)
+        belief = caution.apply(belief)
+        time = _response_time(self.family.path(belief.ends[1]))
+        return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, time, certainty))
+
+
+def _response_time(path: CommandPath) -> Float[Array, ""]:
+    """Return the sum of delay and lag of the roll rate [s]."""
+    return path.delay + path.response.rate_lag[0]
 
 
 class IdentifiedState(eqx.Module):

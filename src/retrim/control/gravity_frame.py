@@ -2,7 +2,8 @@
 
 A constant disturbance tilts and scales gravity (:mod:`retrim.physics.effective_gravity`). In the frame of this
 effective gravity, the vehicle is undisturbed, so a controller performs its task under a constant push without further
-inputs or training. A disturbance that changes with state and command is treated as if its present value were constant.
+inputs or training. A disturbance that changes is treated as if it were constant: with its present value or, for an
+identified vehicle, with the value predicted for the time at which the command acts (:mod:`retrim.estimation.trend`).
 """
 
 import dataclasses
@@ -16,17 +17,19 @@ from jaxtyping import Array, Float
 
 from ..estimation.disturbance_observer import DisturbanceObserver, ObserverState
 from ..estimation.latency import ahead
+from ..estimation.trend import Trend
 from ..physics.actuator_response import ActuatorState
 from ..physics.command_path import CommandPath, CommandQueue
 from ..physics.dynamics import Hybrid, Residual
 from ..physics.effective_gravity import EffectiveGravityFrame
 from ..physics.path_family import Member
-from ..physics.state import Command, State
-from .controller import AbstractController, PolicyController
+from ..physics.state import Command, State, where
+from .controller import AbstractController
 from .slung_load import LoadCompensation, LoadMemory
 
 SHARE_OF_RESPONSE_TIME = 0.25  # time constant of the observer as a share of an identified delay plus rate lag
 FASTEST, SLOWEST = 0.015, 0.05  # [s], limits of this time constant
+TILT_TIME = 2.5  # time in which a policy tilts the thrust, as a multiple of delay plus rate lag
 
 
 class GravityFrameState(eqx.Module):
@@ -36,6 +39,8 @@ class GravityFrameState(eqx.Module):
     inner: Any
     frame: EffectiveGravityFrame
     """Frame of the last command."""
+    trend: Trend
+    """Recent course of the estimated disturbance."""
     load: LoadMemory | None = None
     """Memory of the compensation of a load, if a load is expected."""
 
@@ -65,6 +70,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
     on position."""
     lead: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
     """Time from a measurement that is not late until the thrust has followed a command [s]."""
+    horizon: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
+    """Time until the vehicle has compensated a change in each component of the disturbance [s], for a measurement that
+    is not late."""
+    certainty: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(0.0))
+    """Share of the predicted change in the disturbance that is used. It is zero unless the belief about the vehicle is
+    narrow, since a prediction for a wrong time can sustain an oscillation."""
     steady: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
     """Disturbance that turns the frame in addition to the estimated one, in the world frame [m/s^2]."""
     load: LoadCompensation | None = None
@@ -77,15 +88,21 @@ class GravityFrame(AbstractController[GravityFrameState]):
     def with_vehicle(self, member: Member) -> "GravityFrame":
         """Return the same controller for an identified vehicle.
 
-        The observer uses the vehicle's delay and thrust lag. The observer is as fast as the vehicle permits, since the
-        frame must not turn much faster than the vehicle can follow.
+        The observer uses the vehicle's delay and thrust lag, and it is as fast as the vehicle permits, since the frame
+        must not turn much faster than the vehicle can follow. The less certain the response time is, the less of the
+        predicted change in the disturbance is used.
         """
         observer = dataclasses.replace(self.observer, path=member.path)
         lead = lead_of(member.path, observer.nominal.dt).astype(self.lead.dtype)
         if member.response_time is not None:
             tau = jnp.clip(SHARE_OF_RESPONSE_TIME * member.response_time, FASTEST, SLOWEST)
             observer = dataclasses.replace(observer, tau=tau.astype(self.observer.tau.dtype))
-        return dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer, lead=lead)
+        result = dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer, lead=lead)
+        if member.certainty is None:
+            return result
+        tilt_time = TILT_TIME * (member.path.delay + member.path.response.rate_lag[0])
+        horizon = jnp.stack([tilt_time, tilt_time, lead]).astype(self.horizon.dtype)
+        return dataclasses.replace(result, horizon=horizon, certainty=member.certainty.astype(self.certainty.dtype))
 
     def with_actuators(self, actuators: ActuatorState) -> "GravityFrame":
         """Return the same controller for a tick in which thrust and body rates are known."""
@@ -114,12 +131,12 @@ class GravityFrame(AbstractController[GravityFrameState]):
         )
         observer_state = dataclasses.replace(observer_state, commands=commands)
         load = None if self.load is None else self.load.init(x)
-        return GravityFrameState(
-            observer_state, self.inner.init(x), EffectiveGravityFrame.of(observer_state.d_hat), load
-        )
+        d = observer_state.d_hat
+        trend = Trend.start(d, self.observer.nominal.dt)
+        return GravityFrameState(observer_state, self.inner.init(x), EffectiveGravityFrame.of(d), trend, load)
 
     def __call__(self, memory: GravityFrameState, t: Float[Array, ""], x: State) -> tuple[Command, GravityFrameState]:
-        """Return the command of the inner controller, in the frame of the present effective gravity."""
+        """Return the command of the inner controller, in the frame of the effective gravity when it will act."""
         observer, disturbance, unsteady = self.observer, jnp.zeros_like(x.p), None
         if self.known_residual is not None:
             unsteady = StateDependentResidual(self.known_residual, self.trust_residual, self.place)
@@ -137,20 +154,20 @@ class GravityFrame(AbstractController[GravityFrameState]):
             share, sway = self.trust_residual.astype(x.p.dtype), load.sway
             disturbance = disturbance + share * (pull - sway.a)
             now = State(x.p - share * sway.p, x.R, x.v - share * sway.v)
-        disturbance = self.trust_estimate.astype(x.p.dtype) * (observer_state.d_hat + disturbance)
-        disturbance = disturbance + self.steady.astype(x.p.dtype)
-        frame = EffectiveGravityFrame.of(limit_norm(disturbance, observer.limit))
+        trend, change = self._predict(memory, observer_state)
+        present = self._limited(observer_state.d_hat + disturbance)
+        frame = EffectiveGravityFrame.of(self._limited(observer_state.d_hat + change + disturbance))
         bias, last = self._bias(x.p.dtype), observer.arrival(memory.observer)
         acting, flying = Command(last.c, last.omega + bias), self.inner
         if unsteady is not None:
             flying = flying.with_residual(unsteady)
         if self.actuators is not None:
             acting, flying = self.actuators.command, flying.with_actuators(frame.actuators(self.actuators))
-        x = ahead(now, acting, frame.d, self.age.astype(x.p.dtype))
+        x = ahead(now, acting, present, self.age.astype(x.p.dtype))
         u, inner = flying.in_frame(frame)(memory.inner, t, frame.state(x))
         u = frame.world_command(u)
         u = Command(u.c, u.omega - bias)
-        return u, GravityFrameState(observer.issue(observer_state, u), inner, frame, load)
+        return u, GravityFrameState(observer.issue(observer_state, u), inner, frame, trend, load)
 
     def _observe(
         self,
@@ -183,49 +200,26 @@ class GravityFrame(AbstractController[GravityFrameState]):
         """Remember the accepted command in the observer and, transformed to the frame, in the inner controller."""
         observer = self.observer.accept(memory.observer, u)
         command = memory.frame.command(Command(u.c, u.omega + self._bias(u.omega.dtype)))
-        return GravityFrameState(observer, self.inner.accept(memory.inner, command), memory.frame, memory.load)
+        return dataclasses.replace(memory, observer=observer, inner=self.inner.accept(memory.inner, command))
+
+    def _predict(self, memory: GravityFrameState, observed: ObserverState) -> tuple[Trend, Float[Array, "3"]]:
+        """Return the trend, and the change in the disturbance until the command has acted [m/s^2].
+
+        While measurements contradict each other, no change is predicted, since the estimate decays.
+        """
+        horizon, dt = self.horizon + self.age, self.observer.nominal.dt
+        valid = jnp.any(observed.innovation != memory.observer.innovation)  # the observer holds it otherwise
+        trend = where(valid, memory.trend.after(observed.d_hat, horizon, dt), memory.trend)
+        change = self.certainty.astype(observed.d_hat.dtype) * trend.change(horizon)
+        return trend, jnp.where(observed.consistency.certain, change, 0.0)
+
+    def _limited(self, d: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Return the disturbance that turns the frame, for an estimated disturbance ``d`` [m/s^2]."""
+        d = self.trust_estimate.astype(d.dtype) * d + self.steady.astype(d.dtype)
+        return limit_norm(d, self.observer.limit)
 
     def _bias(self, dtype: Any) -> Float[Array, "3"]:
         return (self.trust_residual * self.rate_bias).astype(dtype)
-
-
-class PoseFrame(AbstractController[tuple[Any, Command]]):
-    """A policy whose observation has a state estimator, in the frame of the effective gravity that it estimates.
-
-    The policy does not need the measured state.
-    """
-
-    inner: PolicyController
-    limit: Float[Array, ""]
-    """Largest norm of the disturbance that turns the frame [m/s^2]."""
-
-    def __check_init__(self) -> None:
-        """Raise ``ValueError`` if the observation does not estimate the disturbance."""
-        observation = self.inner.observation
-        if observation.state_estimator is None:
-            raise ValueError(
-                f"PoseFrame: the observation must have a state_estimator, got {type(observation).__name__}, which has "
-                "none"
-            )
-
-    def init(self, x: State) -> tuple[Any, Command]:
-        """Return the memory at the start of a flight."""
-        return self.inner.init(x)
-
-    def __call__(
-        self, memory: tuple[Any, Command], t: Float[Array, ""], x: State
-    ) -> tuple[Command, tuple[Any, Command]]:
-        """Return the command of the inner controller, in the frame of the effective gravity one tick ago."""
-        (pose, last), estimator = memory, self.inner.observation.state_estimator
-        assert estimator is not None
-        frame = EffectiveGravityFrame.of(limit_norm(estimator(pose).d, self.limit))
-        u, (pose, _) = self.inner.in_frame(frame)((pose, frame.command(last)), t, frame.state(x))
-        u = frame.world_command(u)
-        return u, (pose, u)
-
-    def accept(self, memory: tuple[Any, Command], u: Command) -> tuple[Any, Command]:
-        """Remember the accepted command."""
-        return memory[0], u
 
 
 class StateDependentResidual(eqx.Module):

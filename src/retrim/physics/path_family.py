@@ -67,6 +67,8 @@ class Member(eqx.Module):
     belief: PathBelief
     response_time: Float[Array, ""] | None = None
     """Largest sum of delay and rate lag within the belief [s]; None outside a flight."""
+    certainty: Float[Array, ""] | None = None
+    """Share from 0 to 1 that decreases with the width of the belief about this sum; None outside a flight."""
 
 
 class PathFamily(eqx.Module):
