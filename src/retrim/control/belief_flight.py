@@ -17,7 +17,6 @@ from ..estimation.command_path import PathEstimate, PathEstimator, ringing_of
 from ..estimation.command_path import PathState as EstimatorState
 from ..estimation.latency import follows
 from ..estimation.lateness import Lateness
-from ..physics.command_path import CommandPath
 from ..physics.path_family import Member, PathBelief, PathFamily
 from ..physics.state import Command, State
 from .caution import REPORT_LEVEL, Caution
@@ -94,17 +93,12 @@ class BeliefFlight(WrappedController[BeliefState]):
 
     def _flying(self, belief: PathBelief, caution: Caution) -> AbstractController[Any]:
         """Return the inner controller for the belief, which the caution changes."""
-        middle, slowest = (_response_time(self.family.path(end)) for end in (belief.centre, belief.ends[1]))
+        middle, slowest = (self.family.path(end).response_time for end in (belief.centre, belief.ends[1]))
         # The assumed vehicle of a cautious flight is not an estimate.
         certainty = (1.0 - caution.level) * jnp.clip(2.0 - slowest / (middle + 1e-6), 0.0, 1.0)
         belief = caution.apply(belief)
-        time = _response_time(self.family.path(belief.ends[1]))
+        time = self.family.path(belief.ends[1]).response_time
         return self.inner.with_vehicle(Member(self.family.path(belief.centre), belief, time, certainty))
-
-
-def _response_time(path: CommandPath) -> Float[Array, ""]:
-    """Return the sum of delay and lag of the roll rate [s]."""
-    return path.delay + path.response.rate_lag[0]
 
 
 class IdentifiedState(eqx.Module):

@@ -100,7 +100,7 @@ class GravityFrame(AbstractController[GravityFrameState]):
         result = dataclasses.replace(self, inner=self.inner.with_vehicle(member), observer=observer, lead=lead)
         if member.certainty is None:
             return result
-        tilt_time = TILT_TIME * (member.path.delay + member.path.response.rate_lag[0])
+        tilt_time = TILT_TIME * member.path.response_time
         horizon = jnp.stack([tilt_time, tilt_time, lead]).astype(self.horizon.dtype)
         return dataclasses.replace(result, horizon=horizon, certainty=member.certainty.astype(self.certainty.dtype))
 

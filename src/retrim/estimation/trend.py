@@ -10,8 +10,6 @@ the earlier slope during the last seconds,
 between 0 and 1, with the horizon h. For noise, an increase is followed by a decrease, and the share is zero.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -65,7 +63,7 @@ class Trend(eqx.Module):
         change = (d - jnp.sum(weights * estimates, axis=0)) / (age * dt)
         product = self.product + _part(dt, MEMORY) * (earlier * change - self.product)
         square = self.square + _part(dt, MEMORY) * (earlier * earlier - self.square)
-        return dataclasses.replace(self, estimates=estimates, slopes=slopes, product=product, square=square)
+        return Trend(estimates, slopes, product, square)
 
     def change(self, horizon: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return the predicted change in the disturbance over the ``horizon`` of each component [m/s^2]."""

@@ -254,9 +254,8 @@ def _crashes(method: str, crashed: Sequence[Flight], n: int, preset: Preset) -> 
     """Return a line about a method's first crash, with its likely cause."""
     first = min(crashed, key=lambda flight: float(flight.log.t[-1]))
     path = declared_path(preset, make_vehicle(preset.vehicle))
-    response_time = float(path.delay + path.response.rate_lag[0])
     which = f"start {first.spec.start}"
     which = which if len(crashed) == 1 else f"{len(crashed)} of {n} starts, {which}"
-    cause = likely_cause(first.log, response_time)
+    cause = likely_cause(first.log, float(path.response_time))
     message = f"crashed: {method}, {which}, after {first.log.t[-1]:.2f} s: {first.events[-1].note}"
     return message if cause is None else f"{message}; likely because {cause}"

@@ -137,6 +137,11 @@ class CommandPath(eqx.Module):
         """
         return cls(strong_array(delay), ActuatorResponse.of() if response is None else response)
 
+    @property
+    def response_time(self) -> Float[Array, ""]:
+        """Sum of the delay and the lag of the roll rate [s]."""
+        return self.delay + self.response.rate_lag[0]
+
     def init(self, u: Command, dt: float, *, longest: float = LONGEST_DELAY) -> PathState:
         """Return the state of a vehicle that has always been commanded ``u``; see :meth:`CommandQueue.of`."""
         return PathState(CommandQueue.of(u, dt, longest=longest), ActuatorState.at(u))
