@@ -132,6 +132,17 @@ def test_time_on_ground_is_not_flight(unit, lift, tmp_path):
         assert G[2] / log.full_thrust == pytest.approx(0.5, rel=0.04)
 
 
+@pytest.mark.parametrize("value", [1e3, 1e12, -1e4])
+def test_few_damaged_thrusts_do_not_decide_about_ground(value, tmp_path):
+    """The rest of the flight stays a flight, and the time on the ground stays on the ground."""
+    table = columns(with_ground(fly_once(8.0), 2.0, 0.4))
+    plan = read_map(write_map(tmp_path / "m.toml"))
+    intact = read_flight_log(write_csv(tmp_path / "intact.csv", table), plan)
+    table["c"][300:305] = value
+    log = read_flight_log(write_csv(tmp_path / "damaged.csv", table), plan)
+    np.testing.assert_array_equal(log.valid, intact.valid)
+
+
 def test_hover_is_not_ground(tmp_path):
     """At rest in the air the thrust equals that of hover for any thrust scale."""
     n = 800

@@ -13,9 +13,10 @@ from .body_agreement import check_body_log
 from .body_log import BodyLog
 from .body_map import BodyMap
 from .collective import share_of
+from .ground import mark_idle
 from .marks import landed_at
 from .on_one_clock import COMMAND_HELD, MOTORS
-from .resampling import mark_known, mean_between, mean_of_steps, period, smooth
+from .resampling import mark_known, mean_between, mean_of_steps, period
 from .series import Series
 
 SHORTEST_TICK, LONGEST_TICK = 0.002, 0.052  # [s]: shortest tick, and slowest rates from which a lag can be identified
@@ -23,7 +24,6 @@ LONGEST_S = 180.0  # [s]: longer flights are not needed to identify a vehicle
 SHORT_GAP = 0.02  # [s]: a shorter gap between samples is bridged
 LEAST_S = 1.0  # [s]: shortest flight
 FILTER = "acceleration filter"  # series of one sample: the lag of the accelerometer's filter [s]
-FLIGHT_THRUST = 0.3  # share of the largest thrusts below which a vehicle is not in the air
 
 
 @np.errstate(all="ignore")  # ticks with numbers that overflow are excluded later
@@ -108,11 +108,10 @@ def _on_ground(path: Path, motors: np.ndarray, valid: np.ndarray, dt: float) -> 
     """Return where the motors only idle."""
     if not valid.any():
         return np.zeros(len(motors), dtype=bool)
-    thrust = smooth(np.nan_to_num(motors.mean(axis=1)), max(1, round(0.5 / dt)))
-    high = float(np.percentile(thrust[valid], 95))
-    if high <= 0.0:
+    thrust = motors.mean(axis=1)
+    if not np.any(thrust[valid] > 0.0):
         raise LogError(f"{path}: thrust is never above zero; thrust.fields must name the command that is in use")
-    return np.asarray(thrust <= FLIGHT_THRUST * high)
+    return mark_idle(thrust, valid, max(1, round(0.5 / dt)))
 
 
 def _check_widths(path: Path, series: Mapping[str, Series]) -> None:

@@ -19,8 +19,7 @@ LEAST_FLIGHT = 2.0  # flight time that is sufficient to determine hover thrust [
 
 def on_ground(ticks: Ticks) -> np.ndarray:
     """Return a mask of the ticks at which the vehicle is not in the air, (n,)."""
-    thrust = smooth(ticks.thrust, max(1, round(1.0 / ticks.dt)))
-    idle = thrust <= FLIGHT_THRUST * np.percentile(thrust[ticks.known], 95)
+    idle = mark_idle(ticks.thrust, ticks.known, max(1, round(1.0 / ticks.dt)))
     rows = max(1, round(AVERAGING_TIME / ticks.dt))
     speed, push, turn = (
         np.linalg.norm(np.stack([smooth(column, rows) for column in x.T], axis=1), axis=1)
@@ -37,6 +36,20 @@ def on_ground(ticks: Ticks) -> np.ndarray:
             height = float(np.median(z[part][contact[part]]))
             contact[part] |= np.abs(z[part] - height) < PLACE
     return np.asarray(idle | contact)
+
+
+def mark_idle(thrust: np.ndarray, known: np.ndarray, rows: int) -> np.ndarray:
+    """Return where the mean thrust over ``rows`` rows is below that of a flight, whatever single samples are.
+
+    Args:
+        thrust: Upward thrust in any unit, (n,).
+        known: Ticks at which it is known, (n,); at least one.
+        rows: Number of rows.
+    """
+    positive = thrust[known & (thrust > 0.0)]
+    largest = np.percentile(positive, 95) if positive.size else 0.0  # a few damaged samples must not decide
+    mean = smooth(np.clip(np.nan_to_num(thrust), 0.0, largest), rows)
+    return np.asarray(mean <= FLIGHT_THRUST * np.percentile(mean[known], 95))
 
 
 def _hover(ticks: Ticks, candidates: np.ndarray, speed: np.ndarray) -> float:
