@@ -20,6 +20,7 @@ from .npz_file import read_npz
 from .ros_bag import read_bag
 from .series import Clock, LogReader, Series
 from .smoothing import slope_of
+from .spikes import leave_out_spikes
 from .times import in_order
 from .ulog_file import read_ulog
 
@@ -42,6 +43,7 @@ CONVERTERS = {
     ".parquet": "pandas makes a CSV of it",
 }
 QUANTITIES = ("position", "velocity", "attitude", "thrust", "rates", "measured_rates", "acceleration")
+COMMANDS_AND_SENSORS = ("thrust", "rates", "measured_rates", "acceleration")
 FLAGS = ("valid", "resets")
 
 
@@ -80,6 +82,9 @@ def read_quantities(
             continue
         series[name], more = in_order(each, name, path)
         notes += more
+        if name in COMMANDS_AND_SENSORS:
+            series[name], more = leave_out_spikes(series[name], name, getattr(used_map, name))
+            notes += more
     if isinstance(used_map, BodyMap):
         if "measured_rates" not in series:
             raise LogError(f"{path}: the gyroscope measures nothing: measured_rates are 0 or not finite throughout")
