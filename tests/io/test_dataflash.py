@@ -1,6 +1,7 @@
 """Dataflash logs of ArduPilot, intact and damaged: the flight in retrim's frames, or one line."""
 
 import contextlib
+import re
 import struct
 
 import numpy as np
@@ -121,6 +122,30 @@ def test_restarted_clock_begins_new_flight(tmp_path):
     data[at : at + 8] = struct.pack("<Q", 10**12)
     log = read_flight_log(write(tmp_path, bytes(data)))
     assert log.seconds > 5.0
+
+
+@pytest.mark.parametrize("events", [True, False])
+@pytest.mark.parametrize("value", [0, 10**12, 2**63 - 1])
+def test_damaged_times_are_not_flights(events, value, tmp_path):
+    """Neighbouring messages in the middle of the log, and the last ones, have impossible times."""
+    data = bytearray(dataflash(flight_messages(FLIGHT, events=events)))
+    places = [each.start() for each in re.finditer(re.escape(HEAD + b"\x43"), data)]
+    for at in (*places[200:202], places[300], places[-1]):
+        data[at + 3 : at + 11] = struct.pack("<Q", value)
+    path = write(tmp_path, bytes(data))
+    with pytest.raises(LogError, match=r"the flights in this file are 1 of [69]\.0 s$"):
+        read_log(path, flight=7)
+    log, intact = read_flight_log(path), read_flight_log(write(tmp_path, LOG))
+    assert log.seconds > 5.8
+    assert np.isclose(log.command, intact.command).all(axis=1).mean() > 0.98
+
+
+def test_signalling_nan_is_left_out(tmp_path):
+    data = bytearray(LOG)
+    at = data.index(HEAD + b"\x43", len(data) // 2) + 11
+    data[at : at + 4] = b"\x01\x00\xa0\x7f"
+    log = read_flight_log(write(tmp_path, bytes(data)))
+    assert any("1 of 601 samples are not finite" in note for note in log.notes)
 
 
 def damage(data):

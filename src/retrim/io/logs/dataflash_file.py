@@ -23,6 +23,7 @@ MICROSECOND = 1e-6
 TIME = "TimeUS"
 INSTANCES = ("I", "C", "Instance", "Core")  # fields that count the instances of a message
 RESTART_US = 1_000_000  # step back of the time that means a restart [us]
+NEIGHBOURS = 5  # number of messages before and after a time that show whether it is damaged
 ARMED, DISARMED = 10, 11  # events
 MOST_MESSAGES = 50_000_000
 CODES: Mapping[str, tuple[str, float]] = {
@@ -53,6 +54,7 @@ class Contents:
     """Bytes that belong to no message."""
 
 
+@np.errstate(invalid="ignore")  # a damaged number may be a signalling NaN
 def read_dataflash(
     path: Path,
     request: Mapping[str, Sequence[str]],
@@ -203,14 +205,23 @@ def _boots(data: np.ndarray, contents: Contents) -> Iterator[tuple[np.ndarray, n
         return
     order = np.argsort(np.concatenate([at for at, _ in parts]))
     at, t = (np.concatenate(each)[order] for each in zip(*parts, strict=True))
-    steps = np.diff(t)
-    lone = (
-        np.flatnonzero((np.abs(steps[:-1]) > RESTART_US) & (np.abs(t[2:] - t[:-2]) < RESTART_US)) + 1
-    )  # a damaged time
-    at, t = np.delete(at, lone), np.delete(t, lone)
+    out = _damaged(t)
+    at, t = at[~out], t[~out]
     starts = np.flatnonzero(np.diff(t) < -RESTART_US) + 1
     for first, last in zip([0, *starts], [*starts, len(t)], strict=True):
         yield at[first:last], t[first:last]
+
+
+def _damaged(t: np.ndarray) -> np.ndarray:
+    """Return a mask of the times that are later, or earlier, than those of the messages before and after them."""
+    from scipy.ndimage import median_filter  # local, because it takes as long to import as all of retrim
+
+    none = np.full(NEIGHBOURS, -np.inf)  # the first and the last time are damaged if they are too late
+    medians = median_filter(np.concatenate([none, t, none]), NEIGHBOURS)
+    reach = NEIGHBOURS // 2
+    before, after = (medians[k : k + len(t)] for k in (NEIGHBOURS - reach - 1, NEIGHBOURS + reach + 1))
+    too_late, too_early = t - RESTART_US, t + RESTART_US
+    return np.asarray(((too_late > before) & (too_late > after)) | ((too_early < before) & (too_early < after)))
 
 
 def _arming(data: np.ndarray, contents: Contents, first: int, last: int) -> list[tuple[int, bool]]:

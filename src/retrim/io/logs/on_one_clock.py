@@ -32,6 +32,7 @@ ROUNDING = 0.045  # relative deviation of a logger that is set to ten samples pe
 LONGEST = 5_000_000  # maximum number of ticks; times that span more do not belong to one flight
 MOTORS = 4  # smallest number of motors
 PERIOD_TOLERANCE = 0.02  # relative difference up to which the log's period and the control period count as equal
+SAMPLED_SHARE = 0.95  # share of ticks with a sample; single samples may have been left out
 COMMAND_HELD = 0.5  # [s]: some autopilots publish a command only when it changes
 
 
@@ -166,7 +167,7 @@ def _speed(log_map: LogMap) -> float:
 
 def _sample_command(command: Series, grid: Grid) -> np.ndarray:
     """Return a command at each tick: its sample, or its mean over the tick if the command has its own times."""
-    samples = grid.sampled and np.array_equal(np.intersect1d(command.t, grid.t), grid.t)
+    samples = grid.sampled and np.mean(np.isin(grid.t, command.t)) > SAMPLED_SHARE
     return hold_last(command, grid.t) if samples else mean_of_steps(command, grid.t, grid.dt)
 
 
