@@ -7,6 +7,7 @@ from ..config.setup import Setup
 from ..errors import LogError
 from ..io.logs import BodyLog
 from ..runkit.document import Document, TableSection
+from ..runkit.interrupts import interrupts_only_set
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
 from .body_identification import BodyIdentification, identify_body
@@ -62,11 +63,13 @@ def replay_body(
     document = Document(run, "replay", f"Replay of {path.name}", intro, [seed], reporter)
     document.more["agreement"] = dict(log.agreement)
     document.more["identified"] = _figures(result)
-    document.add(agreement_section(log))
-    document.add(body_section(log, result))
-    if identify and result.known:
-        write_vehicle(document, result.vehicle, setup, path.name, remark=REMARK)
-    document.write()
+    with run.interruptible():
+        document.add(agreement_section(log))
+        document.add(body_section(log, result))
+        if identify and result.known:
+            write_vehicle(document, result.vehicle, setup, path.name, remark=REMARK)
+    with interrupts_only_set(run.stop):
+        document.write()
     return document
 
 

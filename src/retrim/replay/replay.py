@@ -19,6 +19,7 @@ from ..io.logs import BodyLog, FlightLog, read_log, read_map
 from ..io.policies import load_policy
 from ..learn.residuals.targets import Targets
 from ..runkit.document import Document, TableSection
+from ..runkit.interrupts import interrupts_only_set
 from ..runkit.outputs import write_state
 from ..runkit.reporter import Reporter
 from ..runkit.run import Run
@@ -138,26 +139,31 @@ def replay(path: Path, request: Replay, run: Run, reporter: Reporter) -> Documen
     document = Document(run, "replay", f"Replay of {path.name}", intro,
                         [request.seed], reporter)  # fmt: skip
     document.more["agreement"] = dict(log.agreement)
-    document.add(agreement_section(log))
-    document.add(residual_section(log, rows))
-    result = _score_predictions(request, protocol, setup, log, rows, reporter, run)
-    if result:
-        picture_path = picture(log, rows, result, protocol, run.folder)[0]
-        section = dataclasses.replace(prediction_section(result, protocol), picture=picture_path)
-        document.add(section, [dataclasses.asdict(each) for each in result])
-    if request.identify and not run.interrupted:
-        with reporter.progress("identifying") as advance:
-            advance(0.0, "delays and lags")
-            vehicle = identify(log, seed=request.seed)
-            advance(1.0, "done")
-        document.more["identified"] = tree.map(float, dataclasses.asdict(vehicle))
-        document.add(identified_section(vehicle))
-        if vehicle.known:
-            write_vehicle(document, vehicle, setup, path.name)
-    if policy is not None and request.adapt != "none" and not run.interrupted:
-        document.add(_adapt(request, setup, policy, rows, document))
-    document.write()
+    with run.interruptible():
+        document.add(agreement_section(log))
+        document.add(residual_section(log, rows))
+        if result := _score_predictions(request, protocol, setup, log, rows, reporter, run):
+            picture_path = picture(log, rows, result, protocol, run.folder)[0]
+            section = dataclasses.replace(prediction_section(result, protocol), picture=picture_path)
+            document.add(section, [dataclasses.asdict(each) for each in result])
+        if request.identify and not run.interrupted:
+            _identify(log, path.name, setup, request.seed, document)
+        if policy is not None and request.adapt != "none" and not run.interrupted:
+            document.add(_adapt(request, setup, policy, rows, document))
+    with interrupts_only_set(run.stop):
+        document.write()
     return document
+
+
+def _identify(log: FlightLog, name: str, setup: Setup, seed: int, document: Document) -> None:
+    with document.reporter.progress("identifying") as advance:
+        advance(0.0, "delays and lags")
+        vehicle = identify(log, seed=seed)
+        advance(1.0, "done")
+    document.more["identified"] = tree.map(float, dataclasses.asdict(vehicle))
+    document.add(identified_section(vehicle))
+    if vehicle.known:
+        write_vehicle(document, vehicle, setup, name)
 
 
 def _check_log(request: Replay, protocol: Protocol, setup: Setup, log: FlightLog, rows: Targets) -> None:
