@@ -14,7 +14,7 @@ from .flight_part import ENDS, flight_part
 from .log_map import LogMap
 from .marks import marks_of
 from .named_maps import AnyMap
-from .on_one_clock import Ticks, grid_of, on_one_clock
+from .on_one_clock import PAUSE_END, Ticks, grid_of, on_one_clock
 from .other_maps import Other
 from .plausibility import check_plausible
 from .quantities import read_quantities
@@ -27,7 +27,7 @@ class FlightLog:
     """A flight on one clock, with world axes east-north-up and body axes forward-left-up."""
 
     t: np.ndarray
-    """Times from the beginning [s], (n,), one tick apart."""
+    """Times from the beginning [s], (n,), one tick apart; long pauses in the samples are shortened."""
     p: np.ndarray
     """Position in the world frame [m], (n, 3)."""
     R: np.ndarray
@@ -118,11 +118,17 @@ def _flight_log_of(path: Path, used_map: LogMap, series: dict[str, Series], note
     scores, warnings = check_plausible(path, used_map, ticks, read, valid)
     c, full, more = normalise_thrust(path, used_map.thrust, ticks, valid)
     notes += more
-    if gaps := int(np.sum(~ticks.known[ENDS:-ENDS])):
-        notes.append(f"{gaps * ticks.dt:.2f} s have gaps in the samples, and are left out")
+    elapsed = grid.elapsed
+    pauses = float(grid.t[-1] - grid.t[0] - elapsed[-1])
+    if gaps := float(np.sum(~ticks.known[ENDS:-ENDS]) * ticks.dt) + pauses:
+        notes.append(f"{gaps:.2f} s have gaps in the samples, and are left out")
+    if pauses:
+        notes.append(
+            f"pauses are shortened to {2.0 * PAUSE_END:g} s; the times after them are {pauses:.2f} s earlier in all"
+        )
     if len(warnings) and np.ptp(ticks.thrust[valid]) == 0.0:
         notes.insert(0, f"thrust is {ticks.thrust[valid][0]:g} throughout")
     return FlightLog(
-        ticks.t - grid.t[0], ticks.p, ticks.R, ticks.v, ticks.a, c, ticks.rates, ticks.command, valid, ticks.dt, full,
+        elapsed, ticks.p, ticks.R, ticks.v, ticks.a, c, ticks.rates, ticks.command, valid, ticks.dt, full,
         (*warnings, *notes), scores, warnings,
     )  # fmt: skip

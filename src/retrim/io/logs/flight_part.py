@@ -77,6 +77,7 @@ def _moves(path: Path, ticks: Ticks, airborne: np.ndarray, marks: Marks) -> tupl
     """Return where positions neither jump nor freeze."""
     notes, dt = list[str](), ticks.dt
     steps = np.diff(ticks.p, axis=0) - 0.5 * dt * (ticks.v[1:] + ticks.v[:-1])
+    steps[np.diff(ticks.t) > 2.0 * dt] = 0.0  # a pause
     jumps = np.concatenate([[False], np.linalg.norm(steps, axis=1) > JUMP * dt + 0.05])
     still = np.concatenate([[False], np.all(np.diff(ticks.p, axis=0) == 0.0, axis=1)])
     frozen = runs(still, max(2, round(FROZEN / dt))) & airborne

@@ -29,7 +29,8 @@ STATES = ("position", "velocity", "attitude")
 LONGEST_TICK = 0.1  # [s]: slower states do not determine accelerations, and no preset has such a tick
 SHORTEST = 2e-5  # [s]: states never arrive that often
 ROUNDING = 0.045  # relative deviation of a logger that is set to ten samples per second
-LONGEST = 5_000_000  # maximum number of ticks; times that span more do not belong to one flight
+LONGEST = 5_000_000  # maximum number of ticks
+LONGEST_PAUSE, PAUSE_END = 12.0, 5.0  # [s]: of a longer pause, only this long an end to each side has ticks
 MOTORS = 4  # smallest number of motors
 PERIOD_TOLERANCE = 0.02  # relative difference up to which the log's period and the control period count as equal
 SAMPLED_SHARE = 0.95  # share of ticks with a sample; single samples may have been left out
@@ -66,6 +67,13 @@ class Grid:
     sampled: bool
     """Whether the grid's times are the original times of the states."""
 
+    @property
+    def elapsed(self) -> np.ndarray:
+        """Times from the first tick [s], in which the part of a pause without ticks lasts one tick."""
+        steps = np.diff(self.t)
+        pauses = np.where(steps > 2.0 * self.dt, steps - self.dt, 0.0)
+        return np.asarray(self.t - self.t[0] - np.concatenate([[0.0], np.cumsum(pauses)]))
+
 
 def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -> Grid:
     """Return the clock on which a log is read.
@@ -92,14 +100,24 @@ def grid_of(path: Path, series: dict[str, Series], part: maps.Part, dt: float) -
     if last - first < 4.0 * tick:
         spans = "; ".join(f"{name} {s.t[0]:.2f} to {s.t[-1]:.2f} s" for name, s in required.items())
         raise LogError(f"{path}: the quantities have no time in common: {spans}")
-    if (last - first) / tick > LONGEST:
-        raise LogError(f"{path}: it lasts {last - first:.3g} s with a sample every {own:.3g} s; are the times right?")
     stamps = series["velocity"].t
+    parts = _parts_between_pauses(stamps[(stamps >= first) & (stamps <= last)], first, last, tick)
+    if (count := int(np.sum(parts[:, 1] - parts[:, 0]))) > LONGEST:
+        raise LogError(f"{path}: it has {count} ticks of {tick:.3g} s, more than {LONGEST}; are the times right?")
     alike = all(np.array_equal(series[name].t, stamps) for name in states)
     steps = np.diff(stamps)
     if alike and abs(own - tick) <= PERIOD_TOLERANCE * tick and np.all(np.abs(steps - own) < 0.25 * own):
         return Grid(stamps[(stamps >= first) & (stamps <= last)], own, True)
-    return Grid(first + tick * np.arange(int((last - first) / tick + 1e-9) + 1), tick, False)
+    return Grid(first + tick * np.concatenate([np.arange(*part) for part in parts.tolist()]), tick, False)
+
+
+def _parts_between_pauses(stamps: np.ndarray, first: float, last: float, tick: float) -> np.ndarray:
+    """Return the first tick of each part and the tick after its last one; the middle of a pause has no ticks."""
+    t = np.concatenate([[first], stamps, [last]])
+    pauses = np.flatnonzero(np.diff(t) > LONGEST_PAUSE)
+    begins = np.ceil((t[pauses + 1] - PAUSE_END - first) / tick)
+    ends = np.concatenate([t[pauses] + PAUSE_END, [last]]) - first
+    return np.stack([np.concatenate([[0.0], begins]), np.floor(ends / tick + 1e-9) + 1.0], axis=1).astype(int)
 
 
 def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: Grid) -> Ticks:
@@ -130,7 +148,8 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     in_world = log_map.velocity is None or log_map.velocity.axes == "world"
     v = v @ W.T if in_world else np.einsum("nij,nj->ni", R, v @ B.T)
     if log_map.position is None:
-        p = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1]), axis=0)])
+        steps = np.diff(grid.elapsed)[:, None]
+        p = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * steps * (v[1:] + v[:-1]), axis=0)])
     else:
         p = maps.METRES[log_map.position.unit] * interpolate(of["position"], t) @ W.T
     spin = B * np.linalg.det(B)  # a rate is a pseudovector
