@@ -53,7 +53,7 @@ def test_file_has_delay_lags_and_damping_of_vehicle(sample_flight, tmp_path):
     flight, setup = sample_flight
     path = tmp_path / "found.toml"
     faults = []
-    assert write_flight_vehicle(flight, setup, path, faults) == [path]
+    assert write_flight_vehicle(flight, setup, path, faults, tmp_path) == [path]
     assert not faults
     result = read_vehicle(path)
     assert result.command_delay == pytest.approx(0.03, abs=0.002)
@@ -69,10 +69,21 @@ def test_file_has_limits_of_vehicle_flown(sample_flight, tmp_path):
     usual = dataclasses.replace(flight, spec=dataclasses.replace(flight.spec, scenario=Scenario()))
     for each, expected in ((flight, VEHICLE.build()), (usual, setup.vehicle)):
         path = tmp_path / "found.toml"
-        assert write_flight_vehicle(each, setup, path, []) == [path]
+        assert write_flight_vehicle(each, setup, path, [], tmp_path) == [path]
         result = read_vehicle(path)
         assert (result.mass, result.thrust_max) == pytest.approx((float(expected.mass), float(expected.thrust_max)))
         assert result.rates_max == pytest.approx(expected.omega_max.tolist())
+
+
+@pytest.mark.usefixtures("known_path")
+def test_file_states_policy_and_results_of_flight(sample_flight, tmp_path):
+    """The names come from the flight, and cannot add a line to the file."""
+    flight, setup = sample_flight
+    spec = dataclasses.replace(flight.spec, start=3, seed=7)
+    path, folder = tmp_path / "found.toml", tmp_path / "run\nmass = 9"
+    assert write_flight_vehicle(dataclasses.replace(flight, spec=spec), setup, path, [], folder) == [path]
+    source = "a flight of hover/retrim with geometric, seed 7, start 3, in the folder run.mass . 9"
+    assert path.read_text().splitlines()[0] == f"{MARK} {source}. Values without a remark are those of 'slow'."
 
 
 @pytest.mark.usefixtures("known_path")
@@ -82,14 +93,14 @@ def test_vehicle_that_cannot_be_flown_is_written_and_reported(sample_flight, tmp
     monkeypatch.setattr(
         flight_vehicle, "vehicle_toml", lambda found, *rest: write(dataclasses.replace(found, full_thrust=weak), *rest)
     )
-    assert write_flight_vehicle(*sample_flight, path, faults) == [path]
+    assert write_flight_vehicle(*sample_flight, path, faults, tmp_path) == [path]
     (fault,) = faults
     assert fault.startswith(f"--save-vehicle {path}: the vehicle is identified, but cannot fly: thrust_max = ")
     assert "\n" not in fault
 
 
-def test_no_file_is_written_without_option(sample_flight):
-    assert write_flight_vehicle(*sample_flight, None, []) == []
+def test_no_file_is_written_without_option(sample_flight, tmp_path):
+    assert write_flight_vehicle(*sample_flight, None, [], tmp_path) == []
     check_vehicle_file(None)
 
 
@@ -102,7 +113,7 @@ def test_too_short_flight_is_refused_in_one_line(sample_flight, tmp_path):
     )
     path = tmp_path / "found.toml"
     faults = []
-    assert write_flight_vehicle(dataclasses.replace(flight, log=short), setup, path, faults) == []
+    assert write_flight_vehicle(dataclasses.replace(flight, log=short), setup, path, faults, tmp_path) == []
     assert not path.exists()
     assert "must be at least 1 s long to identify its vehicle" in faults[0]
 

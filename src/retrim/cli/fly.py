@@ -117,7 +117,7 @@ def _fly(fleet: Fleet, scenario: Scenario, run: Run, vehicle_file: Path | None, 
     show_table(TableSection(("disturbance", "method", *figure_columns(fleet.seconds)), lines, title))
     for note in notes(flights, preset):
         console.print(note, soft_wrap=True)
-    vehicle_path = write_flight_vehicle(flights[-1], setup, vehicle_file, outlet.faults)
+    vehicle_path = write_flight_vehicle(flights[-1], setup, vehicle_file, outlet.faults, run.folder)
     show_paths([*pictures, *([] if results is None else [results]), *vehicle_path, *memories])
     return run.exit_code or max((refuse(fault) for fault in outlet.faults), default=0)
 

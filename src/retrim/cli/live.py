@@ -131,7 +131,7 @@ def _fly(request: LiveRequest, run: Run, vehicle_file: Path | None, memory: Flig
     flights, setup = [done.flight], done.request.setup
     pictures = done.outlet.write("the picture", lambda out: picture(flights, setup, request.scenario, out, stem="live"))
     show_table(TableSection(("figure", "unit", "value"), figures(done.rows), f"live, {done.flight.log.t[-1]:.1f} s"))
-    vehicle_path = write_flight_vehicle(done.flight, setup, vehicle_file, done.outlet.faults)
+    vehicle_path = write_flight_vehicle(done.flight, setup, vehicle_file, done.outlet.faults, run.folder)
     memories = write_memory(memory, flights, setup, done.outlet.faults)
     show_paths([*(pictures or [])[:1], *done.paths, *vehicle_path, *memories])
     codes = [refuse(fault) for fault in done.outlet.faults]

@@ -3,6 +3,7 @@
 from collections.abc import Collection
 from pathlib import Path
 
+from ..config.names import plain_from
 from ..config.setup import Setup
 from ..config.vehicle_file import read_vehicle
 from ..errors import ConfigError
@@ -42,7 +43,7 @@ def write_vehicle(
         log: Name of the log.
         remark: A further sentence for the comment at the beginning of the file.
     """
-    text = vehicle_toml(identification, setup.preset.vehicle, log, remark=remark)
+    text = vehicle_toml(identification, setup.preset.vehicle, plain_from(log), remark=remark)
     path = document.run.write_text("vehicle.toml", text)
     document.files.append(path)
     if reason := refusal_of(path):

@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from ..adapt.vehicles import estimate_path
+from ..config.names import plain_from
 from ..config.setup import Setup
 from ..config.vehicle_file import VehicleSpec
 from ..errors import ConfigError, LogError
 from ..estimation.command_path import Estimate as PathParameter
 from ..estimation.command_path import PathEstimator
 from ..io.files import check_writable, read_bounded, write_whole
-from ..runkit.flights import Flight
+from ..runkit.flights import Flight, FlightSpec
 from ..runtime.flight import Log
 from .files import refusal_of
 from .identification import Estimate, IdentifiedVehicle
@@ -47,7 +48,9 @@ def check_vehicle_file(path: Path | None, vehicle: str | None = None) -> None:
     check_writable(path.absolute().parent, "--save-vehicle")
 
 
-def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults: list[str]) -> list[Path]:
+def write_flight_vehicle(
+    flight: Flight, setup: Setup, path: Path | None, faults: list[str], folder: Path
+) -> list[Path]:
     """Write the vehicle identified from a flight, and return the written files.
 
     Args:
@@ -55,12 +58,13 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
         setup: Set-up of the policy; its vehicle is used if the flight's scenario has none.
         path: File to write, if any.
         faults: Receives a line if the vehicle cannot be identified or written, or cannot fly.
+        folder: Folder of the flight's results, which the file names.
     """
     if path is None:
         return []
     try:
         spec = flight.spec.scenario.vehicle or setup.preset.vehicle
-        write_whole(path, flight_vehicle_toml(flight.log, spec, path.stem).encode())
+        write_whole(path, flight_vehicle_toml(flight.log, spec, _source_of(flight.spec, setup, folder)).encode())
     except (LogError, OSError) as error:
         faults.append(f"--save-vehicle {path}: {error}")
         return []
@@ -69,7 +73,13 @@ def write_flight_vehicle(flight: Flight, setup: Setup, path: Path | None, faults
     return [path]
 
 
-def flight_vehicle_toml(log: Log, spec: str | VehicleSpec, name: str) -> str:
+def _source_of(spec: FlightSpec, setup: Setup, folder: Path) -> str:
+    """Return the policy, the method and the results from which a flight is found again."""
+    policy, method, place = map(plain_from, (setup.preset.name, spec.method, folder.resolve().name))
+    return f"a flight of {policy} with {method}, seed {spec.seed}, start {spec.start}, in the folder {place}"
+
+
+def flight_vehicle_toml(log: Log, spec: str | VehicleSpec, source: str) -> str:
     """Return a flight's vehicle as TOML, with the identified delay, lags and damping.
 
     All other values come from ``spec``.
@@ -77,7 +87,7 @@ def flight_vehicle_toml(log: Log, spec: str | VehicleSpec, name: str) -> str:
     Args:
         log: The flight.
         spec: Vehicle of the flight.
-        name: Name of the flight, for the comment.
+        source: Description of the flight, for the comment.
 
     Raises:
         LogError: The flight is too short, or the vehicle moves too little to be identified.
@@ -103,7 +113,7 @@ def flight_vehicle_toml(log: Log, spec: str | VehicleSpec, name: str) -> str:
     )
     if result.delay is None and result.rate_lag is None and result.thrust_lag is None:
         raise LogError("the flight moves too little to identify its vehicle: fly from farther away, or under a push")
-    return vehicle_toml(result, spec, name)
+    return vehicle_toml(result, spec, source)
 
 
 def _estimate_of(each: PathParameter) -> Estimate | None:

@@ -15,20 +15,20 @@ LONGEST_DELAY = 0.2  # longest delay in a vehicle file [s]
 DAMPINGS = (0.1, 10.0)  # limits for a damping ratio in a vehicle file
 
 
-def vehicle_toml(identification: IdentifiedVehicle, spec: str | VehicleSpec, log: str, *, remark: str = "") -> str:
+def vehicle_toml(identification: IdentifiedVehicle, spec: str | VehicleSpec, source: str, *, remark: str = "") -> str:
     """Return a vehicle file with the identified values; all other values come from ``spec``.
 
     Args:
         identification: The identified parameters.
         spec: Vehicle for the values that are not identified.
-        log: Name of the log.
+        source: Name of the log or description of the flight, in plain characters.
         remark: A further sentence for the comment at the beginning.
     """
     base = make_vehicle(spec)
     keep = spec if isinstance(spec, VehicleSpec) else None
     mass = float(base.mass)
     lines = [
-        f"{MARK} {plain_from(log)}. Values without a remark are those of {plain_from(name_of(spec))!r}.",
+        f"{MARK} {source}. Values without a remark are those of {plain_from(name_of(spec))!r}.",
         "# Intervals contain the true value with a probability of 90 %.",
         *([f"# {remark}"] if remark else []),
         *(
