@@ -163,6 +163,15 @@ def test_truncated_log_with_gaps_is_read(tmp_path):
     assert log.seconds > 5.0
 
 
+@pytest.mark.parametrize("extra", [0, 20])
+def test_cut_inside_a_message_is_reported_and_cut_between_messages_is_a_shorter_flight(extra, tmp_path):
+    at = LOG.index(HEAD + b"\x43", len(LOG) // 2)
+    log = read_flight_log(write(tmp_path, LOG[: at + extra]))
+    assert 2.5 < log.seconds < 3.5
+    notes = [note for note in log.notes if "of the file belong to no message" in note]
+    assert notes == [f"{extra} bytes of the file belong to no message, and are left out"] * bool(extra)
+
+
 def slow():
     return dataflash(flight_messages(fly_once(6.0, dt=0.1), every=1), without=("XKF1",))
 
