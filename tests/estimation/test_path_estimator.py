@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from path_flight import DT, LEVELS, Vehicles, doublets, fly, random_vehicles
+from path_flight import DT, LEVELS, H, Vehicles, doublets, fly, random_vehicles
 from retrim.control.excitation import Excitation
 from retrim.estimation.command_path import PathEstimator, describe_path, noise, posterior
 from retrim.estimation.command_path.channel import Sample
@@ -98,65 +98,70 @@ issue = jax.jit(CommandHistory.issue)
 
 
 @jax.jit
-def observe(channel, features, value, kinds):
+def observe(channel, features, value, kinds, model_error):
     zero = jnp.zeros(())
     sample = Sample(value[None], jnp.zeros((1, 0)), jnp.array(True), kinds, zero, zero)
-    return channel.observe(features, sample, jnp.ones(()), DT)
+    return channel.observe(features, sample, jnp.ones(()), DT, model_error=model_error)
 
 
-def _linear_channel(kind, kinds, sigma, n=60):
+def _linear_channel(kind, kinds, sigma, model_error, n=60):
     """Return a channel with the sums of a linear vehicle, and the data behind the sums."""
-    rng, prior = np.random.default_rng(3), dataclasses.replace(estimator().yaw, cells=(11, 11, 7))
+    rng, other_rng = np.random.default_rng(3), np.random.default_rng(4)
+    prior = dataclasses.replace(estimator().yaw, cells=(11, 11, 7))
     channel, history = channel_before(1, prior, DT), CommandHistory.at_hover(DT)
     cell = jnp.array([[0.03, np.log(0.07), ringing_of(0.8)]])
     h = np.asarray(responses(cell, prior.hover))[0]
     mu, wander, phi = kinds[kind]
-    rows, values, e_old, disturbance, step = [], [], rng.normal(), 0.2, 0.0
+    rows, values, extra, e_old, disturbance, step = [], [], [], rng.normal(), 0.2, 0.0
     for k in range(n):
         features = np.append(np.asarray(yaw_features(history)), 0.0)
         e = rng.normal()
-        value = 1.1 * features @ h + disturbance + sigma * (e - mu * e_old)
+        error = model_error * (k % 3 == 0)
+        value = 1.1 * features @ h + disturbance + sigma * (e - mu * e_old) + error * other_rng.normal()
         e_old, disturbance, step = e, disturbance + step, phi * step + sigma * np.sqrt(wander) * rng.normal()
         rows.append(features)
         values.append(value)
-        channel = observe(channel, jnp.array(features[None]), jnp.array(value), jnp.array(kinds))
+        extra.append(float(error / channel.noise) ** 2)
+        channel = observe(channel, jnp.array(features[None]), jnp.array(value), jnp.array(kinds), jnp.array(error))
         if k % 10 == 9:
             channel = predicted(channel, prior)
         u = np.array([0.0, 0.0, 0.0, rng.choice([-1.0, 1.0])])
         history = issue(history, jnp.array(u))
-    return channel, prior, np.array(rows), np.array(values)
+    return channel, prior, np.array(rows), np.array(values), np.array(extra)
 
 
-def _brute_force(cells, kind, channel, prior, rows, values):
+def _brute_force(cells, kind, channel, prior, rows, values, extra):
     """Return the log likelihood of each cell by the dense covariance of all measurements, in double precision."""
     n, (mu, wander, phi) = len(values), kind
     # The step s_k is a sum of w_j with the factor phi^(k-1-j), and the disturbance b_k is the sum of earlier steps.
     step = np.array([[sum(phi ** (i - 1 - j) for i in range(j + 1, k)) for j in range(n)] for k in range(n)])
     dense = noise.DIFFUSE + wander * step @ step.T + (1.0 + mu**2) * np.eye(n) - mu * (np.eye(n, k=1) + np.eye(n, k=-1))
+    dense += np.diag(extra)
     h = np.asarray(responses(cells, prior.hover))
     y = rows @ h.T
     left = values[:, None] - float(prior.gain) * y
     loading = y * float(prior.gain_spread) / float(channel.noise)
     solution = np.linalg.solve(dense, loading)
     # The covariance of each cell is ``dense`` and the square of its loading: Sherman and Morrison.
-    extra = 1.0 + np.sum(loading * solution, axis=0)
-    square = np.sum(left * np.linalg.solve(dense, left), axis=0) - np.sum(left * solution, axis=0) ** 2 / extra
+    factor = 1.0 + np.sum(loading * solution, axis=0)
+    square = np.sum(left * np.linalg.solve(dense, left), axis=0) - np.sum(left * solution, axis=0) ** 2 / factor
     square += n * float(prior.floor) ** 2 + posterior.FREEDOM * float(prior.noise) ** 2
-    half_log = 0.5 * (np.linalg.slogdet(dense)[1] + np.log(extra))
+    half_log = 0.5 * (np.linalg.slogdet(dense)[1] + np.log(factor))
     return -half_log - 0.5 * (n + posterior.FREEDOM) * np.log(square)
 
 
 @pytest.mark.parametrize(
-    ("kinds", "kind", "sigma"), [(noise.DIRECT, 0, 0.05), (noise.DIRECT, 5, 0.05), (noise.DIFFERENCE, 0, 0.1)]
+    ("kinds", "kind", "sigma", "model_error"),
+    [(noise.DIRECT, 0, 0.05, 0.0), (noise.DIRECT, 5, 0.05, 0.2), (noise.DIFFERENCE, 0, 0.1, 0.0)],
 )
-def test_posterior_of_linear_vehicle_is_exact(kinds, kind, sigma):
-    channel, prior, rows, values = _linear_channel(kind, kinds, sigma)
+def test_posterior_of_linear_vehicle_is_exact(kinds, kind, sigma, model_error):
+    channel, prior, rows, values, extra = _linear_channel(kind, kinds, sigma, model_error)
     result = path_posterior(channel, prior)
     choice = kinds[int(result.kind)]
     axes = np.linspace(0.0, 0.06, 49), np.log(np.geomspace(0.04, 0.14, 49)), np.linspace(0.01, 0.85, 29)
     grid = np.meshgrid(*axes, indexing="ij")
     cells = np.stack([x.ravel() for x in grid], axis=1)
-    exact = _brute_force(jnp.array(cells, float), choice, channel, prior, rows, values)
+    exact = _brute_force(jnp.array(cells, float), choice, channel, prior, rows, values, extra)
     log_prior = -0.5 * ((cells[:, 1] - np.log(float(prior.lag))) / float(prior.lag_spread)) ** 2
     weight = np.exp(exact + log_prior - np.max(exact + log_prior))
     weight /= weight.sum()
@@ -168,7 +173,7 @@ def test_posterior_of_linear_vehicle_is_exact(kinds, kind, sigma):
         assert abs(mine - mean) < 0.25 * deviation
         assert 0.75 < spread / deviation < 1.3
     likely = np.asarray(result.cells)[np.argsort(-np.asarray(result.weight))[:50]]
-    again = _brute_force(jnp.array(likely, float), choice, channel, prior, rows, values)
+    again = _brute_force(jnp.array(likely, float), choice, channel, prior, rows, values, extra)
     here = np.asarray(log_likelihood(channel, prior, jnp.array(likely), DT))[int(result.kind)]
     np.testing.assert_allclose(here - here[0], again - again[0], atol=0.1)
 
@@ -272,6 +277,24 @@ def test_push_does_not_change_thrust_gain(inertial, level, begin, force):
         )
         assert np.abs(mean / vehicles.thrust_gain - 1.0).max() < limit
         assert np.mean((low <= vehicles.thrust_gain) & (vehicles.thrust_gain <= high)) > 0.8
+
+
+def test_turbulence_does_not_change_thrust_gain():
+    """The commands react to the turbulence, and more such data do not improve the estimate of the launch."""
+    rng = np.random.default_rng(11)
+    vehicles, n, steps = random_vehicles(rng, 6), 6, round(6.0 / H)
+    turbulence, smooth = np.zeros((steps + 1, n, 3)), np.zeros((n, 3))
+    for k in range(steps):
+        smooth += H / 0.1 * (np.sqrt(2.0 * 0.1 / H) * rng.normal(size=(n, 3)) - smooth)
+        turbulence[k + 1] = turbulence[k] + H / 0.03 * (smooth - turbulence[k])
+    flights = fly(rng, vehicles, LEVELS["mocap"], 6.0, push=lambda t: turbulence[round(t / H)])
+    gains = jax.tree.map(lambda *each: np.stack(each), *(estimate(flights, i).thrust_gain for i in range(n)))
+    for k in (150, 299):
+        off = gains.mean[:, k] / vehicles.thrust_gain - 1.0
+        assert abs(np.mean(off)) < 0.15
+        assert np.mean(np.abs(off)) < 0.3
+        inside = (gains.low[:, k] <= vehicles.thrust_gain) & (vehicles.thrust_gain <= gains.high[:, k])
+        assert np.mean(inside) > 0.6
 
 
 def test_wrong_measurements_do_not_change_estimate():

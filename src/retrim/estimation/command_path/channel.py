@@ -139,6 +139,7 @@ class Channel(eqx.Module):
         *,
         jumping: int = 0,
         jumped: Bool[Array, ""] | bool = False,
+        model_error: Float[Array, ""] | float = 0.0,
     ) -> "Channel":
         """Return the channel after one tick.
 
@@ -150,9 +151,11 @@ class Channel(eqx.Module):
             jumping: Number of leading other features whose coefficients jump with the disturbance, as the components of
                 a push do; zero if the disturbance of the channel cannot jump.
             jumped: Whether other measurements show that the disturbance has jumped in this tick.
+            model_error: Standard deviation of the error of the model in this tick, beyond the noise.
         """
         row = jnp.concatenate([features, sample.other, sample.value[:, None]], axis=1)
-        innovation, variance = self.whitening.innovation(row, sample.kinds)
+        extra = (model_error / self.noise) ** 2
+        innovation, variance = self.whitening.innovation(row, sample.kinds, extra)
         m = self.response.shape[0]
         misfit = innovation[..., -1] - innovation[..., :m] @ self.response
         expected = variance[:, None] * self.noise**2 + jnp.einsum(
@@ -175,7 +178,7 @@ class Channel(eqx.Module):
             products = jnp.where(jumps, integrate_out(products, m + i, (self.noise / JUMP) ** 2), products)
             other_spread = other_spread.at[:, i, i].add(jnp.where(jumps, JUMP**2, 0.0))
         return Channel(
-            self.whitening.after(innovation, sample.kinds, counts, jumps),
+            self.whitening.after(innovation, sample.kinds, counts, jumps, extra),
             products + column[..., :, None] * column[..., None, :],
             keep * self.half_log + weight * 0.5 * axes * jnp.log(variance),
             keep * self.count + weight * axes,

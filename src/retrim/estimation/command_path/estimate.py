@@ -6,11 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ...physics.state import where
 from .channel import PathPosterior
 from .prior import LONGEST_DELAY, MOST_RINGING
 from .response import damping_of, first_order_equivalent
 
 NINETY = 1.645  # standard deviations on each side of a normal distribution that contain 90 %
+DEPENDENCE = 0.5  # correlation of the commands with a part of a disturbance that no kind of noise describes
 EXCITATION_SHARE = 0.6  # share of the prior deviation; a parameter with a larger deviation is not excited
 
 
@@ -26,6 +28,18 @@ class Estimate(eqx.Module):
     """Upper end of the 90 % interval."""
     excited: Bool[Array, ""]
     """Whether the flight was informative for the parameter: the deviation is below 60 % of that of the prior."""
+
+    def or_earlier(self, earlier: "Estimate", variance: Float[Array, ""]) -> "Estimate":
+        """Return the more certain of this estimate and an earlier one.
+
+        Args:
+            earlier: Earlier estimate.
+            variance: Variance of the change in the parameter since then.
+        """
+        growth = jnp.sqrt(1.0 + variance / earlier.deviation**2)
+        low, high = (earlier.mean + growth * (end - earlier.mean) for end in (earlier.low, earlier.high))
+        older = Estimate(earlier.mean, growth * earlier.deviation, low, high, earlier.excited)
+        return where(self.deviation <= older.deviation, self, older)
 
 
 class PathEstimate(eqx.Module):
@@ -94,6 +108,24 @@ def gain_estimate(posterior: PathPosterior, before: Float[Array, ""]) -> Estimat
     mean, deviation = _moments(posterior.gain, posterior.weight)
     deviation = jnp.sqrt(deviation**2 + posterior.weight @ posterior.gain_variance)
     return normal_estimate(mean, deviation, before)
+
+
+def closed_loop_estimate(
+    gain: Estimate, share: Float[Array, ""], count: Float[Array, ""], before: Float[Array, ""]
+) -> Estimate:
+    """Return the estimate of a gain from commands that react to the disturbance.
+
+    If a part of the disturbance is predictable but not described by the kind of noise, it is correlated with the
+    commands and biases the gain, and more data do not reduce this bias (Ljung, System Identification, 1999, section
+    13.4).
+
+    Args:
+        gain: Estimate for the kind of noise.
+        share: Share of the innovations' variance that the disturbance causes.
+        count: Number of measurements.
+        before: Standard deviation of the prior.
+    """
+    return normal_estimate(gain.mean, gain.deviation * jnp.sqrt(1.0 + DEPENDENCE**2 * share * count), before)
 
 
 def _moments(values: Float[Array, " cells"], weight: Float[Array, " cells"]) -> tuple[Array, Array]:

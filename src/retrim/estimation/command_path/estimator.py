@@ -13,21 +13,30 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ...physics import so3
 from ...physics.state import STANDARD_GRAVITY, Command, State
 from ..consistency import ACCELERATION, RATE, Consistency
 from ..latency import follows
 from .channel import Channel, Sample
-from .estimate import PathEstimate, damping_estimate, delay_estimate, gain_estimate, lag_estimate
+from .estimate import (
+    PathEstimate,
+    closed_loop_estimate,
+    damping_estimate,
+    delay_estimate,
+    gain_estimate,
+    lag_estimate,
+)
 from .history import CommandHistory
 from .lateral import LateralPush
-from .noise import DIFFERENCE, DIRECT
+from .noise import DIFFERENCE, DIRECT, predictable_share
 from .posterior import channel_before, path_posterior
 from .prior import Prior, coefficients_before, delay_belief, full_belief
+from .reading import Reading
 
 SETTLING = 0.1  # [s], beginning of a flight, during which the thrust depends on earlier commands
+DRIFT = 0.015  # [1/sqrt(s)], standard deviation of the change in the thrust gain in one second
 FADING = (0.03, 0.08)  # [s], time constants with which the remaining effect of these commands fades
 
 
@@ -41,26 +50,6 @@ class Channels(NamedTuple):
     """Thrust from differences of velocities."""
     force: Channel
     """Thrust from accelerations."""
-
-
-class Reading(NamedTuple):
-    """Reading of one sensor in a tick."""
-
-    value: Float[Array, " axes"]
-    usable: Bool[Array, ""]
-    kinds: tuple[tuple[float, float, float], ...]
-    """Possible kinds of noise."""
-    age: Float[Array, ""]
-    """Age of the reading [s]."""
-    width: float
-    """Length of the averaging interval [s]."""
-
-    def sample(self, axes: slice, other: Float[Array, "axes n"]) -> Sample:
-        """Return the sample for some axes, with their further features."""
-        value, dtype = self.value[axes], self.age.dtype
-        width = jnp.full((), self.width, dtype)
-        usable = self.usable & jnp.all(jnp.isfinite(value))
-        return Sample(value, other, usable, jnp.array(self.kinds, dtype), self.age, width)
 
 
 class PathState(eqx.Module):
@@ -77,6 +66,8 @@ class PathState(eqx.Module):
     channels: Channels
     lateral: LateralPush
     estimate: PathEstimate
+    estimated: Float[Array, ""]
+    """Value of ``elapsed`` at the last estimate [s]."""
 
 
 class PathEstimator(eqx.Module):
@@ -115,7 +106,7 @@ class PathEstimator(eqx.Module):
         x = jax.tree.map(lambda leaf: leaf.astype(self.memory.dtype), x)
         zero, (channels, estimate) = jnp.zeros(()), self.start
         history, lateral = CommandHistory.at_hover(self.dt), LateralPush.start()
-        return PathState(history, x, zero - jnp.inf, zero, Consistency.start(x), channels, lateral, estimate)
+        return PathState(history, x, zero - jnp.inf, zero, Consistency.start(x), channels, lateral, estimate, zero)
 
     def update(
         self,
@@ -162,6 +153,7 @@ class PathEstimator(eqx.Module):
         keep = jnp.exp(-dt / self.memory)
 
         turning = so3.log(so3.mul(s.x.R.T, x.R)) / dt
+        model_error = history.saturation(turning, s.estimate.delay.mean, s.estimate.rate_lag.mean, dt)
         if omega is None:
             turn_reading = Reading(turning, certain, DIFFERENCE, age, dt)
         else:
@@ -193,22 +185,30 @@ class PathEstimator(eqx.Module):
             R = 0.5 * (so3.mul(s.x.R, turn) + so3.mul(x.R, turn))
             is_plausible = jnp.all(jnp.abs(a) < ACCELERATION)
             lateral = s.lateral.observe(R, v, a + up, certain & is_plausible, keep)
-        jumped = lateral.jumped
-        thrust = now.thrust.observe(features[:1], lift_sample, keep, dt, jumping=3, jumped=jumped)
+
+        def observe(channel: Channel, sample: Sample) -> Channel:
+            return channel.observe(
+                features[:1], sample, keep, dt, jumping=3, jumped=lateral.jumped, model_error=model_error
+            )
+
+        thrust = observe(now.thrust, lift_sample)
         force = now.force
         if a is not None:
             value, other = lift(R, a)
             sample = Reading(value, has_settled & is_plausible, DIRECT, jnp.zeros_like(age), dt).sample(
                 slice(0, 1), other
             )
-            force = force.observe(features[:1], sample, keep, dt, jumping=3, jumped=jumped)
+            force = observe(force, sample)
         channels = Channels(rates, yaw, thrust, force)
-        return PathState(history, x, t, s.elapsed + dt, consistency, channels, lateral, s.estimate)
+        return PathState(history, x, t, s.elapsed + dt, consistency, channels, lateral, s.estimate, s.estimated)
 
     def estimate_path(self, s: PathState) -> PathState:
         """Return the memory with a new estimate."""
-        channels, estimate = _estimate(s.channels, s.lateral, self.rates, self.yaw, self.thrust, self.dt)
-        return dataclasses.replace(s, channels=channels, estimate=estimate)
+        channels, new = _estimate(s.channels, s.lateral, self.rates, self.yaw, self.thrust, self.dt)
+        # A launch reveals the gain, but hovering in turbulence does not.
+        gain = new.thrust_gain.or_earlier(s.estimate.thrust_gain, DRIFT**2 * (s.elapsed - s.estimated))
+        estimate = dataclasses.replace(new, thrust_gain=gain)
+        return dataclasses.replace(s, channels=channels, estimate=estimate, estimated=s.elapsed)
 
     def issue(self, s: PathState, u: Command) -> PathState:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""
@@ -264,6 +264,9 @@ def _estimate(
     of_yaw = path_posterior(channels.yaw, yaw, delay_belief(of_rates, yaw), dt)
     of_force = path_posterior(channels.force, thrust, delay_belief(of_rates, thrust), dt, others)
     of_thrust = path_posterior(channels.thrust, thrust, full_belief(of_force), dt, others)
+    gain = closed_loop_estimate(
+        gain_estimate(of_thrust, thrust.gain_spread), *_dependence(channels), thrust.gain_spread
+    )
     estimate = PathEstimate(
         delay_estimate(of_rates),
         lag_estimate(of_rates, rates.lag_spread),
@@ -272,7 +275,7 @@ def _estimate(
         lag_estimate(of_yaw, yaw.lag_spread),
         gain_estimate(of_yaw, yaw.gain_spread),
         lag_estimate(of_thrust, thrust.lag_spread),
-        gain_estimate(of_thrust, thrust.gain_spread),
+        gain,
     )
     result = Channels(
         channels.rates.predict(of_rates, coefficients_before(rates)),
@@ -281,6 +284,15 @@ def _estimate(
         channels.force.predict(of_force, others),
     )
     return result, estimate
+
+
+def _dependence(channels: Channels) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the share of the disturbance in the innovations of the better sensor, and its number of measurements."""
+    force, thrust = channels.force, channels.thrust
+    direct, difference = (jnp.asarray(predictable_share(kinds), force.noise.dtype) for kinds in (DIRECT, DIFFERENCE))
+    has_force = force.count > 0.0
+    count = jnp.where(has_force, force.temper * force.count, thrust.temper * thrust.count)
+    return jnp.where(has_force, direct[force.kind], difference[thrust.kind]), count
 
 
 def _from_hover(u: Command) -> Float[Array, "4"]:

@@ -10,8 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...physics.state import STANDARD_GRAVITY
+
 SPAN = 1.2  # [s], time span of the stored commands; the response to older commands is complete
 SINGLE = 12  # the spacing of ages is 1/SINGLE of the age, and at least one tick
+LEVER = 0.034  # [m], difference between the thrusts of rotors per mass and angular acceleration
+SATURATION = 0.1  # error of the thrust, as a share of the squared difference per thrust
+LEAST_THRUST = 1.0  # [m/s^2], smallest thrust of that comparison
+ACTING = 3  # commands that may act in one tick
 
 
 class CommandHistory(eqx.Module):
@@ -38,6 +44,27 @@ class CommandHistory(eqx.Module):
         n = self.commands.shape[0]
         source = jnp.minimum(jnp.arange(n) + jnp.clip(ticks, 0, n).astype(int), n - 1)
         return CommandHistory(self.commands[source])
+
+    def saturation(
+        self, turning: Float[Array, "3"], delay: Float[Array, ""], lag: Float[Array, ""], dt: float
+    ) -> Float[Array, ""]:
+        """Return the typical error of the thrust because the rate loop turns the vehicle [m/s^2].
+
+        The rate loop demands different thrusts of the rotors on both sides. A rotor cannot push downwards, so the
+        thrust is not the commanded one if the difference is large and the thrust is small.
+
+        Args:
+            turning: Measured body rates [rad/s].
+            delay: Delay of the commands [s].
+            lag: Lag of the body rates [s].
+            dt: Control tick [s].
+        """
+        last = self.commands.shape[0] - 1
+        acting = self.commands[jnp.clip(last - jnp.round(delay / dt).astype(int) - jnp.arange(ACTING), 0, last)]
+        demand = LEVER / lag * jnp.sqrt(jnp.sum((acting[:, 1:] - turning[None]) ** 2, axis=1))
+        thrust = jnp.maximum(STANDARD_GRAVITY + acting[:, 0], LEAST_THRUST)
+        error = SATURATION * jnp.max(demand**2 / thrust)
+        return jnp.where(jnp.isfinite(error), error, 0.0)
 
     def features(self, dt: float) -> Float[Array, "4 m"]:
         """Return, for each command entry, the steps at each of the :func:`ages` and the command before these steps."""

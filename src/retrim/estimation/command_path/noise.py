@@ -11,8 +11,11 @@ For the filter and for trends with damped slopes, see Harvey, Forecasting, Struc
 Filter (1989), chapter 2 and sections 3.2 and 4.2.
 """
 
+from functools import cache
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 DIFFUSE = 1e4  # variance of the first disturbance, in units of the white noise: a diffuse prior
@@ -36,6 +39,7 @@ DIFFERENCE = (
 )
 """Kinds of noise of a difference of measured values; white process noise makes mu smaller than 1."""
 KINDS = len(DIRECT)
+SETTLED = 2000  # steps after which the covariance of a filter no longer changes
 
 
 class Whitening(eqx.Module):
@@ -54,17 +58,18 @@ class Whitening(eqx.Module):
         )
 
     def innovation(
-        self, row: Float[Array, "axes columns"], kinds: Float[Array, "kinds 3"]
+        self, row: Float[Array, "axes columns"], kinds: Float[Array, "kinds 3"], extra: Float[Array, ""] | float = 0.0
     ) -> tuple[Float[Array, "kinds axes columns"], Float[Array, " kinds"]]:
         """Return the innovation of each column, and its variance in units of the white noise.
 
         Args:
             row: Commands, other features and the measurement of each axis.
             kinds: :data:`DIRECT` or :data:`DIFFERENCE`.
+            extra: Variance of the model error in this row, in units of the white noise.
         """
         reading = _reading(kinds)
         expected = jnp.einsum("kacs,ks->kac", self.mean, reading)
-        return row[None] - expected, 1.0 + jnp.einsum("ks,kst,kt->k", reading, self.covariance, reading)
+        return row[None] - expected, 1.0 + extra + jnp.einsum("ks,kst,kt->k", reading, self.covariance, reading)
 
     def after(
         self,
@@ -72,6 +77,7 @@ class Whitening(eqx.Module):
         kinds: Float[Array, "kinds 3"],
         counts: Bool[Array, ""],
         jumps: Bool[Array, ""],
+        extra: Float[Array, ""] | float = 0.0,
     ) -> "Whitening":
         """Return the memory after a row with this innovation.
 
@@ -80,15 +86,16 @@ class Whitening(eqx.Module):
             kinds: :data:`DIRECT` or :data:`DIFFERENCE`.
             counts: Whether the row counts; otherwise only the time advances.
             jumps: Whether the disturbance has jumped, and is therefore unknown.
+            extra: Variance of the model error in this row, in units of the white noise.
         """
         reading = _reading(kinds)
         across = jnp.einsum("kst,kt->ks", self.covariance, reading)
-        total = 1.0 + jnp.einsum("ks,ks->k", reading, across)
+        total = 1.0 + extra + jnp.einsum("ks,ks->k", reading, across)
         gain = across / total[:, None]
         # Joseph's form avoids the difference of large numbers. The last entry becomes e_k, whose gain is 1 / total and
         # whose covariance with the others is minus their gain.
         keep = jnp.eye(3)[None] - gain[:, :, None] * reading[:, None, :]
-        left = keep @ self.covariance @ keep.mT + gain[:, :, None] * gain[:, None, :]
+        left = keep @ self.covariance @ keep.mT + (1.0 + extra) * gain[:, :, None] * gain[:, None, :]
         left = _with_last(left, -gain[:, :2], 1.0 - 1.0 / total)
         gain = jnp.concatenate([gain[:, :2], 1.0 / total[:, None]], axis=1)
         carry = _with_last(self.covariance, jnp.zeros_like(gain[:, :2]), jnp.ones_like(total))
@@ -101,6 +108,28 @@ class Whitening(eqx.Module):
         motion = jnp.tile(jnp.eye(3), (kinds.shape[0], 1, 1)).at[:, 0, 1].set(1.0).at[:, 1, 1].set(kinds[:, 2])
         covariance = (motion @ covariance @ motion.mT).at[:, 1, 1].add(kinds[:, 1])
         return Whitening(jnp.einsum("kst,kact->kacs", motion, mean), covariance)
+
+
+@cache
+def predictable_share(kinds: tuple[tuple[float, float, float], ...]) -> np.ndarray:
+    """Return the share of the variance of an innovation that the disturbance causes, for each kind of noise.
+
+    Args:
+        kinds: :data:`DIRECT` or :data:`DIFFERENCE`.
+    """
+    return np.array([_share(*kind) for kind in kinds])
+
+
+def _share(mu: float, q: float, phi: float) -> float:
+    motion, moved = np.array([[1.0, 1.0, 0.0], [0.0, phi, 0.0], [0.0, 0.0, 0.0]]), np.diag([0.0, q, 0.0])
+    reading, own = np.array([1.0, 0.0, -mu]), np.array([0.0, 0.0, 1.0])
+    covariance = np.diag([1.0, q, 1.0])
+    for _ in range(SETTLED):
+        across, total = covariance @ reading, reading @ covariance @ reading + 1.0
+        # The new e is correlated with the innovation.
+        gain = (motion @ across + own) / total
+        covariance = motion @ covariance @ motion.T + moved + np.outer(own, own) - total * np.outer(gain, gain)
+    return float(covariance[0, 0] / (reading @ covariance @ reading + 1.0))
 
 
 def _reading(kinds: Float[Array, "kinds 3"]) -> Float[Array, "kinds 3"]:
