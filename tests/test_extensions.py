@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from commands import results, retrim
+from retrim.testing import check_plant
 
 SOURCE = Path(__file__).parents[1] / "examples" / "extensions"
 FILES = sorted(SOURCE.glob("*.*"))
@@ -63,6 +64,12 @@ def folder(tmp_path_factory, as_a_user):
     for name in set(sys.modules) - before[1]:
         if str(folder) in (getattr(sys.modules[name], "__file__", "") or ""):
             del sys.modules[name]
+
+
+def test_plant_obeys_laws(folder):
+    import plant
+
+    check_plant(lambda: plant.Toy(0.02))
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

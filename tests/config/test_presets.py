@@ -61,6 +61,10 @@ def test_100_hz_preset_has_same_times():
         ({"pretrain": {"hidden_sizes": []}}, r"pretrain\.hidden_sizes: "),
         ({"pretrain": {"max_grad_norm": 0.0}}, r"pretrain\.max_grad_norm: Input should be greater than 0"),
         ({"actuator_tau": -0.1}, r"actuator_tau: Input should be greater than 0"),
+        (
+            {"adapt": {"task_starts": 50, "num_envs": 10}},
+            r"adapt\.task_starts must be at most adapt\.num_envs = 10, got",
+        ),
         ({"reward": "sharp"}, r"reward = 'sharp' is for task = 'track', not for 'hover'"),
         ({"reward": "view"}, r"reward = 'view' is for task = 'vision', not for 'hover'"),
         ({"reward": "l3"}, r"reward: Input should be 'paper', 'l2', 'stiff', 'sharp', 'exact' or 'view'"),

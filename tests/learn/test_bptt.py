@@ -85,6 +85,25 @@ def test_perturbations_equal_plain_gradient(which, delay, jump_cost, key):
     assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(gradient)) > 1e-4
 
 
+def test_second_derivative_equals_finite_differences(key):
+    """Meta-learning differentiates through the gradient."""
+    env, policy = shared_env(), random_policy(key)
+    x0 = draw_starts(env.task, key, 2)
+    flat, unravel = ravel_pytree(policy.layers)
+    way = np.random.default_rng(1).normal(size=flat.size)
+    way, step = jnp.asarray(way / np.linalg.norm(way)), 1e-5
+
+    @jax.jit
+    def gradient(w):
+        value, by_layer = policy_gradient(eqx.tree_at(lambda p: p.layers, policy, unravel(w)), env, x0)
+        return value, ravel_pytree(by_layer)[0]
+
+    (_, here), (slope, curvature) = jax.jit(lambda w: jax.jvp(gradient, (w,), (way,)))(flat)
+    ahead, behind = (gradient(flat + sign * step * way) for sign in (1.0, -1.0))
+    assert float(slope) == pytest.approx(float(here @ way), rel=1e-9)
+    np.testing.assert_allclose(curvature, (ahead[1] - behind[1]) / (2.0 * step), rtol=1e-4, atol=1e-7)
+
+
 def test_gradient_equals_finite_differences(key):
     """Without a residual, along random directions in weight space."""
     env, policy = shared_env(), random_policy(key)

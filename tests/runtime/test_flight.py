@@ -243,3 +243,20 @@ def test_pilot_resets_memory_at_time_zero(key):
         pilot.act(plant.step(Command.hover())[0])
     pilot.reset(start._replace(t=50.0))
     np.testing.assert_array_equal(pilot.act(start._replace(t=50.0)).vector(), first)
+
+
+@pytest.mark.parametrize("ticks", [0, 3])
+def test_command_that_is_not_finite_ends_flight(ticks):
+    """The plant never receives it, and is stopped."""
+    plant = OddPlant()
+    count = iter(range(10))
+    pilot = FunctionPilot(
+        lambda measurement: Command(jnp.array(9.81 if next(count) < ticks else jnp.nan), jnp.zeros(3))
+    )
+    log = fly(plant, pilot, START, ticks=8)
+    assert log.terminated
+    assert len(log.t) == ticks + 1
+    assert [event.kind for event in log.events] == ["terminated"]
+    assert "nan" in log.events[0].note
+    with pytest.raises(PlantError):
+        plant.step(Command.hover())

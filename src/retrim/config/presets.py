@@ -238,6 +238,9 @@ class Preset:
             raise ValueError(
                 "adapt.trim = 'rest' needs adapt.frame = 'gravity': only in that frame is a push part of hover"
             )
+        starts, most = self.adapt.task_starts, self.adapt.num_envs
+        if starts is not None and starts > most:
+            raise ValueError(f"adapt.task_starts must be at most adapt.num_envs = {most}, got {starts}")
         if self.options and self.task in BUILT_IN_TASKS:
             raise ValueError(f"a table [options] is for a custom task, not for {self.task!r}")
         if abs(1000 * self.dt - round(1000 * self.dt)) > 1e-6:

@@ -143,14 +143,14 @@ class Policy(AbstractPolicy):
         return self.layers[-1](h)
 
     def perturb(self, observation: Float[Array, " o"], perturbations: Perturbations) -> tuple[Command, Inputs]:
-        """Return the command with ``perturbations[l]`` added to the output of layer l, without weight gradients.
+        """Return the command with ``perturbations[l]`` added to the output of layer l.
 
         Also return the input of each layer; with the cotangents of the perturbations, these give every weight gradient.
         """
         h, inputs = observation, []
         for i, (layer, perturbation) in enumerate(zip(self.layers, perturbations, strict=True)):
             inputs.append(h)
-            y = lax.stop_gradient(layer)(h) + perturbation
+            y = layer(h) + perturbation
             h = jax.nn.relu(y) if i < len(self.layers) - 1 else y
         return self.limit(h), tuple(inputs)
 

@@ -172,7 +172,7 @@ def score_flight(setup: Setup, spec: FlightSpec, log: Log, learner_state: Learne
     """Return a flight with its errors and, if it was terminated, the reason."""
     task = setup.flight_task
     error, cross, target = _errors(task, log.task_time, log.true.as_state())
-    if log.terminated:
+    if log.terminated and not any(event.kind == "terminated" for event in log.events):
         why = Event(float(log.t[-1]), "terminated", _why(log, float(error[-1])))
         log = log._replace(events=(*log.events, why))
     return Flight(

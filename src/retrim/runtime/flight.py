@@ -164,7 +164,7 @@ class Recorder:
         Args:
             dt: Control tick [s].
             phase: Time along the reference in each row [s].
-            terminated: Whether the vehicle left the bounds of the task.
+            terminated: Whether the vehicle left the bounds of the task, or received a command that is not finite.
         """
         times, true, measurement, commands, ages = zip(*self._rows, strict=True)
         t = np.array(times)
@@ -201,7 +201,7 @@ def fly(
         progress: Display of the progress; by default a bar in a notebook or a terminal, and nothing elsewhere.
 
     Returns:
-        The log, with one more row than ticks.
+        The log, with one more row than ticks. A command that is not finite ends the flight like a crash.
 
     Raises:
         ConfigError: Pilot and plant have different control periods.
@@ -224,6 +224,12 @@ def fly(
             if stop is not None and stop.is_set():
                 raise FlightStopped("the flight was aborted")
             u = pilot.act(measurement)
+            if not np.isfinite(as_numpy(u)).all():
+                is_over = True
+                t = measurement.t - start
+                for observer in everyone:
+                    observer.event(Event(t, "terminated", f"the command {as_numpy(u).tolist()} is not finite"))
+                break
             measurement, accepted_command = plant.step(u)
             if accepted_command is not u:
                 pilot.accept(accepted_command)
