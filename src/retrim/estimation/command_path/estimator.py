@@ -66,7 +66,7 @@ class PathState(eqx.Module):
     channels: Channels
     lateral: LateralPush
     estimate: PathEstimate
-    estimated: Float[Array, ""]
+    estimate_time: Float[Array, ""]
     """Value of ``elapsed`` at the last estimate [s]."""
 
 
@@ -200,15 +200,15 @@ class PathEstimator(eqx.Module):
             )
             force = observe(force, sample)
         channels = Channels(rates, yaw, thrust, force)
-        return PathState(history, x, t, s.elapsed + dt, consistency, channels, lateral, s.estimate, s.estimated)
+        return PathState(history, x, t, s.elapsed + dt, consistency, channels, lateral, s.estimate, s.estimate_time)
 
     def estimate_path(self, s: PathState) -> PathState:
         """Return the memory with a new estimate."""
         channels, new = _estimate(s.channels, s.lateral, self.rates, self.yaw, self.thrust, self.dt)
         # A launch reveals the gain, but hovering in turbulence does not.
-        gain = new.thrust_gain.or_earlier(s.estimate.thrust_gain, DRIFT**2 * (s.elapsed - s.estimated))
+        gain = new.thrust_gain.or_earlier(s.estimate.thrust_gain, DRIFT**2 * (s.elapsed - s.estimate_time))
         estimate = dataclasses.replace(new, thrust_gain=gain)
-        return dataclasses.replace(s, channels=channels, estimate=estimate, estimated=s.elapsed)
+        return dataclasses.replace(s, channels=channels, estimate=estimate, estimate_time=s.elapsed)
 
     def issue(self, s: PathState, u: Command) -> PathState:
         """Return the memory after the command ``u`` was issued for the tick that begins now."""

@@ -60,9 +60,9 @@ class CommandHistory(eqx.Module):
             dt: Control tick [s].
         """
         last = self.commands.shape[0] - 1
-        acting = self.commands[jnp.clip(last - jnp.round(delay / dt).astype(int) - jnp.arange(ACTING), 0, last)]
-        demand = LEVER / lag * jnp.sqrt(jnp.sum((acting[:, 1:] - turning[None]) ** 2, axis=1))
-        thrust = jnp.maximum(STANDARD_GRAVITY + acting[:, 0], LEAST_THRUST)
+        commands = self.commands[jnp.clip(last - jnp.round(delay / dt).astype(int) - jnp.arange(ACTING), 0, last)]
+        demand = LEVER / lag * jnp.sqrt(jnp.sum((commands[:, 1:] - turning[None]) ** 2, axis=1))
+        thrust = jnp.maximum(STANDARD_GRAVITY + commands[:, 0], LEAST_THRUST)
         error = SATURATION * jnp.max(demand**2 / thrust)
         return jnp.where(jnp.isfinite(error), error, 0.0)
 

@@ -121,14 +121,14 @@ def predictable_share(kinds: tuple[tuple[float, float, float], ...]) -> np.ndarr
 
 
 def _share(mu: float, q: float, phi: float) -> float:
-    motion, moved = np.array([[1.0, 1.0, 0.0], [0.0, phi, 0.0], [0.0, 0.0, 0.0]]), np.diag([0.0, q, 0.0])
+    motion, process_noise = np.array([[1.0, 1.0, 0.0], [0.0, phi, 0.0], [0.0, 0.0, 0.0]]), np.diag([0.0, q, 0.0])
     reading, own = np.array([1.0, 0.0, -mu]), np.array([0.0, 0.0, 1.0])
     covariance = np.diag([1.0, q, 1.0])
     for _ in range(SETTLED):
         across, total = covariance @ reading, reading @ covariance @ reading + 1.0
         # The new e is correlated with the innovation.
         gain = (motion @ across + own) / total
-        covariance = motion @ covariance @ motion.T + moved + np.outer(own, own) - total * np.outer(gain, gain)
+        covariance = motion @ covariance @ motion.T + process_noise + np.outer(own, own) - total * np.outer(gain, gain)
     return float(covariance[0, 0] / (reading @ covariance @ reading + 1.0))
 
 
