@@ -45,15 +45,14 @@ def test_only_disturbances_widen_gain():
 
 
 def test_share_of_disturbance_solves_riccati_equation():
-    """For a random walk in white noise, p = (q + sqrt(q^2 + 4 q)) / 2 is the variance of the prediction."""
+    """The variance of the prediction of a random walk in white noise is p = (q + sqrt(q^2 + 4 q)) / 2."""
     for shares, kinds in ((noise.predictable_share(kinds), kinds) for kinds in (noise.DIRECT, noise.DIFFERENCE)):
         for share, (mu, q, phi) in zip(shares, kinds, strict=True):
             p = (q + np.sqrt(q**2 + 4.0 * q)) / 2.0
             if mu == phi == 0.0 and q > 0.0:
                 assert share == pytest.approx(p / (1.0 + p), rel=1e-3)
-            if q == 0.0:
-                assert share < 1e-3
-            assert 0.0 <= share < 1.0
+            assert (share == 0.0) == (q == 0.0)
+            assert share < 1.0
 
 
 def test_saturation_grows_with_demand_and_with_small_thrust():

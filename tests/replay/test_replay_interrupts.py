@@ -51,10 +51,10 @@ def test_interrupted_replay_is_recorded(tmp_path, monkeypatch, stage, sections):
     if stage != "predict_log":
         monkeypatch.setattr(replays, "_score_predictions", lambda *_: [])
     monkeypatch.setattr(replays, stage, interrupt)
-    calls = Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True, adapt="full",
-                   policy=tmp_path / "p.safetensors")  # fmt: skip
+    request = Replay(map=str(choice), buffer=2.0, horizon=1.0, identify=True, adapt="full",
+                     policy=tmp_path / "p.safetensors")  # fmt: skip
     run = Run("replay", tmp_path / "out")
-    replay(path, calls, run, Silent())
+    replay(path, request, run, Silent())
     assert_is_recorded(run, sections=sections)
 
 

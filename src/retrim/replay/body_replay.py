@@ -43,8 +43,8 @@ def replay_body(
         reporter: Receives the tables and the progress.
         identify: Whether a vehicle file is written.
         seed: Seed for the bootstrap.
-        adapt: Method that adapts a policy; only ``none`` is possible.
-        keep: Files that are read, which stay in the folder.
+        adapt: Method that adapts a policy; it must be ``none``, since the log has no states.
+        keep: Input files, which stay in the folder.
 
     Raises:
         LogError: The log is too short, or a policy is to be adapted to it.

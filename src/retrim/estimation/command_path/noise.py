@@ -39,7 +39,7 @@ DIFFERENCE = (
 )
 """Kinds of noise of a difference of measured values; white process noise makes mu smaller than 1."""
 KINDS = len(DIRECT)
-SETTLED = 2000  # steps after which the covariance of a filter no longer changes
+SETTLED = 300  # steps after which the covariance of a filter no longer changes
 
 
 class Whitening(eqx.Module):
@@ -121,6 +121,8 @@ def predictable_share(kinds: tuple[tuple[float, float, float], ...]) -> np.ndarr
 
 
 def _share(mu: float, q: float, phi: float) -> float:
+    if q == 0.0:
+        return 0.0
     motion, process_noise = np.array([[1.0, 1.0, 0.0], [0.0, phi, 0.0], [0.0, 0.0, 0.0]]), np.diag([0.0, q, 0.0])
     reading, own = np.array([1.0, 0.0, -mu]), np.array([0.0, 0.0, 1.0])
     covariance = np.diag([1.0, q, 1.0])

@@ -205,14 +205,14 @@ def _boots(data: np.ndarray, contents: Contents) -> Iterator[tuple[np.ndarray, n
         return
     order = np.argsort(np.concatenate([at for at, _ in parts]))
     at, t = (np.concatenate(each)[order] for each in zip(*parts, strict=True))
-    out = _damaged(t)
-    at, t = at[~out], t[~out]
+    damage = _mark_damage(t)
+    at, t = at[~damage], t[~damage]
     starts = np.flatnonzero(np.diff(t) < -RESTART_US) + 1
     for first, last in zip([0, *starts], [*starts, len(t)], strict=True):
         yield at[first:last], t[first:last]
 
 
-def _damaged(t: np.ndarray) -> np.ndarray:
+def _mark_damage(t: np.ndarray) -> np.ndarray:
     """Return a mask of the times that are later, or earlier, than those of the messages before and after them."""
     from scipy.ndimage import median_filter  # local, because it takes as long to import as all of retrim
 

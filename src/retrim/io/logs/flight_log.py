@@ -118,8 +118,8 @@ def _flight_log_of(path: Path, used_map: LogMap, series: dict[str, Series], note
     scores, warnings = check_plausible(path, used_map, ticks, read, valid)
     c, full, more = normalise_thrust(path, used_map.thrust, ticks, valid)
     notes += more
-    elapsed = grid.elapsed
-    pauses = float(grid.t[-1] - grid.t[0] - elapsed[-1])
+    log_time = grid.log_time
+    pauses = float(grid.t[-1] - grid.t[0] - log_time[-1])
     if gaps := float(np.sum(~ticks.known[ENDS:-ENDS]) * ticks.dt) + pauses:
         notes.append(f"{gaps:.2f} s have gaps in the samples, and are left out")
     if pauses:
@@ -129,6 +129,6 @@ def _flight_log_of(path: Path, used_map: LogMap, series: dict[str, Series], note
     if len(warnings) and np.ptp(ticks.thrust[valid]) == 0.0:
         notes.insert(0, f"thrust is {ticks.thrust[valid][0]:g} throughout")
     return FlightLog(
-        elapsed, ticks.p, ticks.R, ticks.v, ticks.a, c, ticks.rates, ticks.command, valid, ticks.dt, full,
+        log_time, ticks.p, ticks.R, ticks.v, ticks.a, c, ticks.rates, ticks.command, valid, ticks.dt, full,
         (*warnings, *notes), scores, warnings,
     )  # fmt: skip

@@ -39,7 +39,9 @@ def on_ground(ticks: Ticks) -> np.ndarray:
 
 
 def mark_idle(thrust: np.ndarray, known: np.ndarray, rows: int) -> np.ndarray:
-    """Return where the mean thrust over ``rows`` rows is below that of a flight, whatever single samples are.
+    """Return where the mean thrust over ``rows`` rows is below that of a flight.
+
+    A few damaged samples do not change the result.
 
     Args:
         thrust: Upward thrust in any unit, (n,).
@@ -47,7 +49,7 @@ def mark_idle(thrust: np.ndarray, known: np.ndarray, rows: int) -> np.ndarray:
         rows: Number of rows.
     """
     positive = thrust[known & (thrust > 0.0)]
-    largest = np.percentile(positive, 95) if positive.size else 0.0  # a few damaged samples must not decide
+    largest = np.percentile(positive, 95) if positive.size else 0.0
     mean = smooth(np.clip(np.nan_to_num(thrust), 0.0, largest), rows)
     return np.asarray(mean <= FLIGHT_THRUST * np.percentile(mean[known], 95))
 

@@ -68,7 +68,7 @@ class Grid:
     """Whether the grid's times are the original times of the states."""
 
     @property
-    def elapsed(self) -> np.ndarray:
+    def log_time(self) -> np.ndarray:
         """Times from the first tick [s], in which the part of a pause without ticks lasts one tick."""
         steps = np.diff(self.t)
         pauses = np.where(steps > 2.0 * self.dt, steps - self.dt, 0.0)
@@ -148,7 +148,7 @@ def on_one_clock(path: Path, log_map: LogMap, series: dict[str, Series], grid: G
     in_world = log_map.velocity is None or log_map.velocity.axes == "world"
     v = v @ W.T if in_world else np.einsum("nij,nj->ni", R, v @ B.T)
     if log_map.position is None:
-        steps = np.diff(grid.elapsed)[:, None]
+        steps = np.diff(grid.log_time)[:, None]
         p = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * steps * (v[1:] + v[:-1]), axis=0)])
     else:
         p = maps.METRES[log_map.position.unit] * interpolate(of["position"], t) @ W.T

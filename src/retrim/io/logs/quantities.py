@@ -54,11 +54,11 @@ def read_quantities(
 
     Args:
         path: The log.
-        log_map: The map; None for the first one that fits.
+        log_map: The map; by default, the first map that fits the log.
         flight: Number of the flight in a file with several, from 1.
 
-    In addition to the quantities, the series include ``<quantity> valid <k>``, ``<quantity> resets <k>`` and
-    ``landed <k>``, and a derived velocity if the log contains none.
+    The series also include ``<quantity> valid <k>``, ``<quantity> resets <k>`` and ``landed <k>``. If the log has no
+    velocity, they include a derived one.
 
     Raises:
         LogError: The file cannot be read, or a field is missing.

@@ -1,4 +1,4 @@
-"""Leaves out short spikes in commands and inertial measurements that no vehicle can follow."""
+"""Leave out short spikes in commands and inertial measurements that no vehicle can follow."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def leave_out_spikes(
 ) -> tuple[Series, list[str]]:
     """Return a series without spikes, and a note on them.
 
-    A spike exceeds what a vehicle can do and is far beyond the other samples, but only for a moment.
+    A spike exceeds the limits of a vehicle and is much larger than the other samples, but lasts only for a moment.
 
     Args:
         series: The samples of a command or an inertial measurement, in the log's unit.
